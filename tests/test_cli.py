@@ -293,8 +293,8 @@ def test_no_number_is_cut_however_narrow_the_terminal_and_nothing_is_folded_with
 @pytest.mark.parametrize(
     "processing, alarms, warned",
     [
-        ("tnr: 7", "any in a shot with probability 0.359, in both chirps 0.0397", "0.359"),
-        ("tnr: 9", "any in a shot with probability 0.000462, in both chirps 5.35e-08", ""),
+        ("tnr: 7", "in either chirp with probability 0.359, in both chirps 0.0397", "0.359"),
+        ("tnr: 9", "in either chirp with probability 0.000462, in both chirps 5.35e-08", ""),
         ("bins_counted: all, tnr: 7", "probability 0.589, in both chirps 0.129", "0.589"),
     ],
 )
@@ -302,7 +302,9 @@ def test_a_plan_and_a_run_tell_how_often_noise_raises_an_alarm(here, processing,
     (here / "small.yaml").write_text(STUDY.replace("tnr: 8", processing))
     for result in (sweep("plan", "small.yaml"), sweep("run", "small.yaml", "--scheduler", "none")):
         assert alarms in result.stdout
-        warning = f"warning: noise alone raises a false alarm in a shot with probability {warned}"
+        warning = (
+            f"warning: noise alone raises a false alarm in either chirp with probability {warned}"
+        )
         assert (warning in result.stderr) == bool(warned)
 
 

@@ -34,7 +34,7 @@ NOT_IN_THE_MODEL = {
 """Pure physics: arrays in, arrays out."""
 
 LARGEST_HOUSE = {
-    "lines": 49_919, "modules": 183, "lines of the model": 18_982, "modules of the model": 71,
+    "lines": 50_040, "modules": 183, "lines of the model": 18_982, "modules of the model": 71,
     "compiled functions": 129, "arguments of a compiled function": 10,
 }  # fmt: skip
 """Upper limits on the size of sweep/."""

@@ -417,7 +417,7 @@ def _noise(shot: Shot) -> Block:
 
 def _segments(shot: Shot) -> Block:
     columns = (
-        "segment", "beat (MHz)", "seen at (MHz)", "peak bin", "level (dBV)", "SNR (dB)", "pd",
+        "segment", "beat (MHz)", "seen (MHz)", "peak bin", "level (dBV)", "SNR (dB)", "pd",
         "groups",
     )  # fmt: skip
     heading = (

@@ -51,6 +51,11 @@ UNUSABLE = {
 class Commands(click.Group):
     """Commands whose users' mistakes end in plain words and exit code 2."""
 
+    def add_command(self, cmd: click.Command, name: str | None = None) -> None:
+        """Add a command, listed with the whole first paragraph of its help."""
+        cmd.short_help = " ".join((cmd.help or "").split("\n\n")[0].split())
+        super().add_command(cmd, name)
+
     def invoke(self, ctx: click.Context) -> Any:
         """Run a command; what is not a mistake of the user's keeps its traceback."""
         try:

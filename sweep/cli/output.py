@@ -270,9 +270,9 @@ def _scene_lines(study: SceneSpec, plan: Plan) -> Iterator[tuple[str, str]]:
     for s in plan.scanners:
         yield s.name, f"{s.cycles:,} cycles, {s.shots:,} shots, " + (
             "eyepoints are there already" if s.is_cast
-            else f"{s.rays:,} rays at {1e6 * s.seconds_a_ray:.3g} us on one core"
+            else f"{s.rays:,} rays at {1e6 * s.seconds_a_ray:,.0f} us on one core"
         )  # fmt: skip
-        yield "", f"{1e6 * s.seconds_a_draw:.3g} us a shot and draw on one core"
+        yield "", f"{1e6 * s.seconds_a_draw:,.0f} us a shot and draw on one core"
     places = math.prod(int(axis.size) for axis in study.axes)
     yield "draws", f"{study.draws.number:,}, at {places:,} place(s) along the axes"
 
@@ -336,7 +336,7 @@ def alarms_told(study: Spec | SceneSpec) -> str:
         " to ".join(dict.fromkeys(f"{chance:.3g}" for chance in (min(each), max(each))))
         for each in zip(*found, strict=True)
     )
-    return f"any in a shot with probability {any_}, in both chirps {both}"
+    return f"in either chirp with probability {any_}, in both chirps {both}"
 
 
 def warn_of_alarms(study: Spec | SceneSpec) -> None:
@@ -346,8 +346,8 @@ def warn_of_alarms(study: Spec | SceneSpec) -> None:
     most = max((any_ for any_, _ in alarms_of_study(study)), default=0.0)
     if most > MANY_ALARMS:
         click.echo(
-            f"warning: noise alone raises a false alarm in a shot with probability {most:.3g} "
-            f"(more than {MANY_ALARMS:g}): raise the threshold, or lower detector.pfa",
+            "warning: noise alone raises a false alarm in either chirp with probability "
+            f"{most:.3g} (more than {MANY_ALARMS:g}): raise the threshold, or lower detector.pfa",
             err=True,
         )
 

@@ -31,6 +31,7 @@ def status(store: Location) -> None:
 
     With draws, a table has the number of points within accuracy.tolerance.
     """
+    from sweep.analysis.labels import counted
     from sweep.tasks.progress import amount, duration
     from sweep.tasks.summary import status as read
 
@@ -43,7 +44,7 @@ def status(store: Location) -> None:
         f"{f', {s.draws_done:,} draws' if s.draws_done else ''}, {in_bytes(s.bytes)} stored"
     )
     if s.rate:
-        click.echo(f"{s.rate:,.3g} {s.unit}/s in the last run, by {s.workers:,} workers")
+        click.echo(f"{s.rate:,.0f} {s.unit}/s in the last run, by {counted(s.workers, 'worker')}")
     if s.holder_lives and s.holder:
         click.echo(
             f"running: process {s.holder.pid} on {s.holder.host}, {left} left, "

@@ -318,6 +318,30 @@ def maximum_range(study: Study) -> Chart | Table | None:
     return _reach_chart(reaches, x, words, fewer) if x else _reach_table(reaches, words)
 
 
+def reached(found: Chart | Table | None) -> list[str]:
+    """Maximum range in a sentence, as a chart or table of :func:`maximum_range` has it."""
+    kept = next(iter(ANSWERS))
+    if isinstance(found, Chart):
+        words, own = found.panels[0].y.words, [p for p in found.panels if p.when["answer"] == kept]
+        values = np.concatenate([line.y for panel in own for line in panel.lines])
+    elif found is not None:
+        words = next(name for name in found.frame if name.startswith("maximum range"))
+        values = found.frame[words][found.frame[f"a pd of {PD:g}"] == kept].to_numpy(float)
+    else:
+        return []
+    there = values[np.isfinite(values)]
+    told = []
+    if there.size:
+        ends = " to ".join(dict.fromkeys(f"{end:.3g}" for end in (there.min(), there.max())))
+        told = [f"{words.capitalize()} with a probability of {PD:g} or more all the way: {ends}."]
+    if lacking := values.size - there.size:
+        told.append(
+            f"There is no such range at {lacking:,} of {values.size:,} places: detection is less "
+            "probable from the first range on, or is not up to the last."
+        )
+    return told
+
+
 def _reach(piece: Points, name: str, factor: float) -> Points:
     """Return the maximum range in the units shown, and its coordinates; lazy."""
     dim = piece.dim_of(name)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pandas
 import plotly.graph_objects as go
+import xarray as xr
 
 from sweep.analysis import canvas, labels
 from sweep.analysis.charts import CHANCE, Axis, Chart, Line, Panel, not_shown
@@ -33,6 +34,8 @@ from sweep.analysis.scenes.recording import (
 from sweep.analysis.selection import parameters_at
 from sweep.model.effects.catalogue import names_of
 from sweep.model.eyepoints import prepare_eyepoints
+from sweep.model.navigation import EXCLUDED
+from sweep.model.pairing import TRUE
 from sweep.report.detector import PLACES, budget_chart, budget_panel
 from sweep.report.page import COLOUR_BAR, Control, Plot, Table, layout, sentences, title, when
 from sweep.spec import SceneSpec
@@ -262,6 +265,9 @@ def _layout() -> dict[str, Any]:
 SHOTS = ("pd_shot", "snr_up", "beam_range", "beam_radial_velocity", "pfa_up")
 """Quantities of shots that are shown over time."""
 
+MEASURED = ("range", "radial_velocity")
+"""Quantities of a point that have a truth."""
+
 MOST_SHOTS = 12_000
 """Shots of all charts over time of a page together."""
 
@@ -297,6 +303,35 @@ def along(found: Sequence[Seen]) -> Chart | None:
     )
 
 
+def errors(found: Sequence[Seen]) -> Chart | None:
+    """Errors of range and velocity of true points against truth; none where there are none."""
+    panels, every = [], 1
+    for seen in found:
+        names = ["time", "beam", "flags", *MEASURED, *(f"true_{name}" for name in MEASURED)]
+        rows = seen.recording.rows(names, MOST_SHOTS // len(found), ranges=INTERPOLATED)
+        every = max(every, rows.every)
+        table = rows.rows()
+        true = (table["flags"].astype(int) & TRUE) > 0 if table else np.zeros(0, bool)
+        for name in MEASURED if true.any() else ():
+            error = {"error": table[name] - table[f"true_{name}"]}
+            own = {key: values[true] for key, values in (table | error).items()}
+            words = label(name).replace(" (", " error (")
+            spread = labels.number(float(f"{np.sqrt(np.mean(own['error'] ** 2)):.3g}"))
+            when = {"cloud": seen.words, "quantity": f"{words}, rms {spread}"}
+            panels.append(Panel(when, Axis("time (s)"), Axis(words), _by_beam(own, "error")))
+    if not panels:
+        return None
+    return Chart(
+        "Errors against truth",
+        "Marks of the error of each true point over time. "
+        + "; ".join(panel.when["quantity"] for panel in panels[: len(MEASURED)]) + ".",
+        ["Measured less true, of true points, interpolated between bins",
+         f"One point in {every} shown: reduced for this page" if every > 1 else ""],
+        panels,
+        {"cloud": "Shown for", "quantity": "Quantity"},
+    )  # fmt: skip
+
+
 def _by_beam(table: dict[str, np.ndarray], name: str) -> list[Line]:
     """Return marks of each beam; of all together where there are more than colours."""
     values = shown(name, table[name])
@@ -323,6 +358,18 @@ def returns(found: Sequence[Seen]) -> Table:
         rows.append({"what": seen.words or "all", "shots": shots} | named)
     caption = ["Shots times draws, and points by kind."]
     return Table("What came back", caption, pandas.DataFrame(rows), "returns")
+
+
+def came_back(returned: pandas.DataFrame, groups: Sequence[xr.Dataset]) -> list[str]:
+    """Points and solved velocities in sentences; `returned` as :func:`returns` has it."""
+    shots, true = (int(returned[name].sum()) for name in ("shots", "true"))
+    false = int(returned.iloc[:, 2:].sum(axis=None)) - true
+    told = [f"{shots:,} shots brought back {true:,} true points and {false:,} false ones."]
+    status = [group["velocity_status"] for group in groups if "velocity_status" in group]
+    if known := sum(int((own >= 0).sum()) for own in status):
+        solved = sum(int(((own >= 0) & (own <= EXCLUDED)).sum()) for own in status)
+        told.append(f"Velocity was solved in {solved:,} of {known:,} cycles.")
+    return told
 
 
 def navigation(spec: SceneSpec, found: Sequence[Seen]) -> Chart | None:

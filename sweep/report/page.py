@@ -56,13 +56,18 @@ COLOUR_BAR: dict[str, Any] = {
 class Control:
     """A choice that a plot offers: its name as traces call it, and the text next to it.
 
-    The first option is chosen at the start; `relayout` is what each changes of the layout.
+    `relayout` is what each option changes of the layout.
     """
 
     name: str
     label: str
     options: Sequence[str]
     relayout: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+    @property
+    def start(self) -> int:
+        """The option chosen at the start: the middle one of a study's parts, else the first."""
+        return (len(self.options) - 1) // 2 if self.name == "part" else 0
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import pandas
 import xarray as xr
 import yaml
 
-from sweep.analysis import labels
+from sweep.analysis import labels, noise_only
 from sweep.analysis.charts import Chart, Room
 from sweep.analysis.figures import Study, held
 from sweep.analysis.opening import ACCURACY, GRID, SCENE, NotAStoreError, read_attributes
@@ -100,7 +100,8 @@ def _grid_page(store: Location, say: Say) -> Page:
     figures: list[Made] = list(_figures(study, say))
     tables = list(_tables(study, say))
     say("the maximum range")
-    figures.append(detector.maximum_range(study))
+    reach = detector.maximum_range(study)
+    figures.append(reach)
     say("the detector")
     found = detector.tracks(study)
     trades: list[Made] = [detector.noise_budget(study, *found)]
@@ -113,12 +114,43 @@ def _grid_page(store: Location, say: Say) -> Page:
     facts = [("points", f"{dataset.attrs['points']:,}"),
              ("grid", " x ".join(sizes) or "a single point")]  # fmt: skip
     sections = [
+        _answer(spec, [dataset], "points", detector.reached(reach)),
         _section("figures", "Figures", figures),
         _section("detector", "Detection and noise", trades),
         asked,
         _section("tables", "Tables", [*tables, _grid_points(study)]),
     ]
     return _page(spec, dataset.attrs, "points", facts, sections, store)
+
+
+def _answer(
+    spec: Declared, groups: Sequence[xr.Dataset], unit: str, further: Sequence[str]
+) -> Section:
+    """Section that opens the page: detection, false alarms, and whether the tolerance is kept."""
+    tolerance, level = spec.accuracy.tolerance, detector.PD
+    limits = {"effects_error": tolerance, "beamlets_error": tolerance, "accuracy_missed": 0.0}
+    found = []
+    for group in groups:
+        pd = group["pd_shot"]
+        over = [group[name] > most for name, most in limits.items() if name in group]
+        missed = sum(over, xr.DataArray(0)) > 0
+        found.append((pd.count(), (pd >= level).sum(), pd.sum(), pd.min(), missed.sum()))
+    columns = np.array(dask.compute(found)[0], float).T  # a column a group
+    count, often, total, _, missed = columns.sum(axis=1)
+    told = ["No result is there yet."]
+    if count:
+        told = [
+            f"The probability of detection of a shot is {level:g} or more at {often:,.0f} of "
+            f"{count:,.0f} {unit}; its mean is {total / count:.3g}, its lowest "
+            f"{np.nanmin(columns[3]):.3g}.",
+            *further,
+        ]
+    if alarms := noise_only.alarms_of_study(spec):
+        most = max(any_ for any_, _ in alarms)
+        chance = f"{most:.3g}" + " at the most" * (len(alarms) > 1)
+        told.append(f"Noise alone raises a false alarm in either chirp with probability {chance}.")
+    kept = f"missed at {missed:,.0f} {unit}" if missed else f"kept at all of these {unit}"
+    return Section("answer", "Answer", [*told, f"The tolerance of {tolerance:g} is {kept}."])
 
 
 def _asked(spec: Declared, flags: Sequence[xr.DataArray], dataset: xr.Dataset) -> Section:
@@ -196,20 +228,25 @@ def _scene_page(store: Location, say: Say) -> Page:
     cloud = flights.solid(study, seen, fewer)
     say("the flight")
     flight: list[Made] = [
-        flights.along(seen), flights.navigation(spec, seen), flights.noise_budget(study, seen),
-    ]  # fmt: skip
+        flights.along(seen),
+        flights.errors(seen),
+        flights.navigation(spec, seen),
+        flights.noise_budget(study, seen),
+    ]
     say("effects and accuracy")
     groups = [study.tree[name].to_dataset() for name in study.scanners]
     asked = _asked(spec, [g["effects"].chunk() for g in groups], groups[0])
     say("points")
     facts = [("shots times draws", f"{attributes['points']:,}"),
              ("scanners", ", ".join(map(labels.coordinate, study.scanners)))]  # fmt: skip
+    came_back = flights.returns(seen)
     sections = [
+        _answer(spec, groups, "shots", flights.came_back(came_back.frame, groups)),
         _section("cloud", "Point cloud", [cloud],
                  [] if cloud else ["No shot has brought back a point."]),
         _section("flight", "Along the flight", flight),
         asked,
-        _section("tables", "Tables", [flights.returns(seen), _cloud_points(seen)]),
+        _section("tables", "Tables", [came_back, _cloud_points(seen)]),
     ]  # fmt: skip
     return _page(spec, attributes, "blocks", facts, sections, store)
 

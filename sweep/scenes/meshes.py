@@ -115,7 +115,7 @@ class Report:
         """One line for people: what was given, and of the rest what is not zero."""
         counts = [(each.metadata.get("words"), getattr(self, each.name)) for each in fields(self)]
         said = [words.format(count) for words, count in counts if words and count]
-        given = f"{self.faces} faces on {self.vertices} vertices"
+        given = f"{self.faces:,} faces on {self.vertices:,} vertices"
         return "; ".join([given, *(said or ["nothing to mend"])])
 
 

@@ -11,12 +11,16 @@ import yaml
 from click.testing import CliRunner
 from reported import EXPERIMENTS, GRID
 
+import sweep
 from sweep.analysis.figures import Study
 from sweep.analysis.opening import NotAStoreError
+from sweep.analysis.scenes.figures import SceneStudy
 from sweep.cli import main
+from sweep.model.pairing import TRUE
 from sweep.model.shot import evaluate
 from sweep.model.threshold import TNR
-from sweep.report import detector
+from sweep.report import detector, flights
+from sweep.report.page import Control
 from sweep.report.writing import write
 from sweep.spec import Spec
 from sweep.tasks import driver
@@ -122,6 +126,66 @@ def test_a_flight_s_page_names_the_floor_of_its_errors(scene_page):
     page = scene_page.read_text()
     assert "rrors that no echo lowers: clock error 1e-06, vibration 1 cm/s." in page
     assert all(f"error_floor.{name}" in page for name in ("pointing_error", "wavelength_error"))
+
+
+def _answer(page):
+    """The paragraphs that open a page."""
+    (text,) = re.findall('<section id="answer".*?</section>', page.read_text(), re.DOTALL)
+    return re.findall("<p>(.*?)</p>", text)
+
+
+def test_a_grid_s_page_opens_with_reach_alarms_and_tolerance(grid_page, grid_store):
+    dataset = sweep.open(grid_store)
+    pd, reach = dataset["pd_shot"], dataset.sweep.maximum_range(0.9)["unbroken"] / 1000
+    lacking = int(reach.isnull().sum())
+    assert 0 < lacking < reach.size
+    told = _answer(grid_page)
+    alarm, of_noise = (
+        told.pop(3),
+        "Noise alone raises a false alarm in either chirp with probability ",
+    )
+    both = 1 - (1 - float(dataset["pfa_segment"].max())) ** 2  # but for the few bins of the echo
+    assert float(alarm.removeprefix(of_noise).rstrip(".")) == pytest.approx(both, rel=1e-2)
+    assert told == [
+        "The probability of detection of a shot is 0.9 or more at "
+        f"{int((pd >= 0.9).sum()):,} of {pd.size:,} points; its mean is {float(pd.mean()):.3g}, "
+        f"its lowest {float(pd.min()):.3g}.",
+        "Maximum range (km) with a probability of 0.9 or more all the way: "
+        f"{float(reach.min()):.3g} to {float(reach.max()):.3g}.",
+        f"There is no such range at {lacking} of {reach.size} places: detection is less probable "
+        "from the first range on, or is not up to the last.",
+        "The tolerance of 0.001 is kept at all of these points.",
+    ]
+
+
+def test_a_flight_s_page_opens_with_its_points_and_velocities(scene_page, scene_store):
+    group = sweep.open_scene(scene_store)["four"].to_dataset()
+    flags, status = group["flags"].values, group["velocity_status"]
+    true = int(((flags & TRUE) > 0).sum())
+    shots = flags[..., 0].size
+    told = _answer(scene_page)
+    assert told[1] == (
+        f"{shots:,} shots brought back {true:,} true points and {int((flags > 0).sum()) - true:,} "
+        "false ones."
+    )
+    assert told[2].startswith(f"Velocity was solved in {int((status <= 1).sum())} of {status.size}")
+
+
+def test_errors_of_a_flight_are_measured_less_true(scene_store):
+    study = SceneStudy.of(scene_store)
+    seen, _ = flights.recordings(study)
+    chart = flights.errors(seen)
+    group = study.tree["four"].to_dataset().isel(draw=0, optical_efficiency=0)
+    true = (group["flags"].values & TRUE) > 0
+    expected = (group["range_interpolated"] - group["true_range"]).values[true]
+    drawn = np.concatenate([line.y for line in chart.panels[0].lines])
+    np.testing.assert_array_equal(np.sort(drawn), np.sort(expected))
+    assert f"rms {np.sqrt(np.mean(expected**2)):.3g}" in chart.panels[0].when["quantity"]
+
+
+def test_parts_of_a_study_open_in_their_middle():
+    assert [Control("part", "", list("abcdef")[:n]).start for n in (1, 2, 3, 6)] == [0, 0, 1, 2]
+    assert Control("answer", "", list("abc")).start == 0
 
 
 def test_what_is_no_study_is_refused_in_words(tmp_path, scene_store):

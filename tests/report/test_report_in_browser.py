@@ -176,6 +176,7 @@ def test_pages_fit_a_phone_in_both_schemes(opened, request, file, scheme):
     wide = page.evaluate("""[...document.querySelectorAll("select, button, .plot, input")]
         .filter((e) => !e.closest(".table") && e.getBoundingClientRect().right > 390).length""")
     assert wide == 0
+    page.get_by_text("Scroll the table sideways").first.wait_for(state="visible")
     ink, paper = page.evaluate("""["color", "backgroundColor"].map((name) =>
         getComputedStyle(document.body)[name].match(/[0-9]+/g).map(Number))""")
     assert (sum(ink) > sum(paper)) == (scheme == "dark")

@@ -139,4 +139,11 @@ const drawn = Promise.all(charts.map((chart) => chart.draw()));
 const mark = () => document.documentElement.classList.toggle("dark", DARK.matches);
 DARK.addEventListener("change", () => { mark(); charts.forEach((chart) => chart.draw()); });
 mark();
+// Says that a table is wider than its place, while it is.
+const wider = (element) => element.scrollWidth > element.clientWidth + 1;
+const widths = new ResizeObserver((changed) => {
+  for (const { target } of changed)
+    target.previousElementSibling.hidden = ![target, ...target.querySelectorAll("div")].some(wider);
+});
+for (const table of document.querySelectorAll(".table")) widths.observe(table);
 drawn.then(() => { document.documentElement.dataset.drawn = "all"; });
