@@ -270,7 +270,7 @@ def _scene_lines(study: SceneSpec, plan: Plan) -> Iterator[tuple[str, str]]:
     for s in plan.scanners:
         yield s.name, f"{s.cycles:,} cycles, {s.shots:,} shots, " + (
             "eyepoints are there already" if s.is_cast
-            else f"{s.rays:,} rays at {1e6 * s.seconds_a_ray:,.0f} us on one core"
+            else f"{s.rays:,} rays at {1e6 * s.seconds_a_ray:.3g} us on one core"
         )  # fmt: skip
         yield "", f"{1e6 * s.seconds_a_draw:,.0f} us a shot and draw on one core"
     places = math.prod(int(axis.size) for axis in study.axes)

@@ -44,7 +44,8 @@ def status(store: Location) -> None:
         f"{f', {s.draws_done:,} draws' if s.draws_done else ''}, {in_bytes(s.bytes)} stored"
     )
     if s.rate:
-        click.echo(f"{s.rate:,.0f} {s.unit}/s in the last run, by {counted(s.workers, 'worker')}")
+        rate = f"{float(f'{s.rate:.3g}'):,.12g} {s.unit}/s"
+        click.echo(f"{rate} in the last run, by {counted(s.workers, 'worker')}")
     if s.holder_lives and s.holder:
         click.echo(
             f"running: process {s.holder.pid} on {s.holder.host}, {left} left, "

@@ -137,14 +137,14 @@ def _answer(
         found.append((pd.count(), (pd >= level).sum(), pd.sum(), pd.min(), missed.sum()))
     columns = np.array(dask.compute(found)[0], float).T  # a column a group
     count, often, total, _, missed = columns.sum(axis=1)
-    told = ["No result is there yet."]
-    if count:
-        told = [
-            f"The probability of detection of a shot is {level:g} or more at {often:,.0f} of "
-            f"{count:,.0f} {unit}; its mean is {total / count:.3g}, its lowest "
-            f"{np.nanmin(columns[3]):.3g}.",
-            *further,
-        ]
+    if not count:
+        return Section("answer", "Answer", ["No result is there yet."])
+    told = [
+        f"The probability of detection of a shot is {level:g} or more at {often:,.0f} of "
+        f"{count:,.0f} {unit}; its mean is {total / count:.3g}, its lowest "
+        f"{np.nanmin(columns[3]):.3g}.",
+        *further,
+    ]
     if alarms := noise_only.alarms_of_study(spec):
         most = max(any_ for any_, _ in alarms)
         chance = f"{most:.3g}" + " at the most" * (len(alarms) > 1)
