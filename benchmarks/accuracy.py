@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from shared import DOCS, EXPERIMENTS, table
 
-from sweep.analysis import accuracy, accuracy_figure, canvas
+from sweep.analysis import accuracy, canvas
 from sweep.spec import load
 from sweep.tasks.accuracy.measure import measure
 from sweep.tasks.accuracy.rungs import WRITTEN, Rung
@@ -158,8 +158,8 @@ def section(name: str, study: Study, time_limit: float) -> str:
     with tempfile.TemporaryDirectory() as folder:
         store = Path(folder) / f"{name}.zarr"
         measure(spec, store_path=store, time_limit=time_limit)
-        dataset, settings = accuracy_figure.opened(store)
-    picture = canvas.save(accuracy_figure.sheet(dataset, settings), DOCS / f"accuracy_{name}.png")
+        dataset, settings = accuracy.opened(store)
+    picture = canvas.save(accuracy.sheet(dataset, settings), DOCS / f"accuracy_{name}.png")
     put = ", ".join(f"`{k}: {v}`" for k, v in study.overrides.items() if k != "title")
     source = f"`experiments/{study.experiment}.yaml`" + (f" with {put}" if put else "")
     parts = [

@@ -1,15 +1,26 @@
-"""Settings that `sweep accuracy` tried: errors and times, who beats whom, in tables and words."""
+"""Settings that `sweep accuracy` tried: who beats whom, in tables, words and a figure."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure as Sheet
+from matplotlib.patheffects import withStroke
+from matplotlib.text import Annotation
+from matplotlib.ticker import FuncFormatter, LogLocator
+from matplotlib.transforms import Bbox
 
+from sweep.analysis import canvas, labels
+from sweep.analysis.opening import ACCURACY, read_attributes
 from sweep.analysis.tables import Block, Page
+from sweep.storage.locations import Location, beside, zarr_store
+from sweep.storage.opening import CHECKED
 
 TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 
@@ -43,19 +54,13 @@ class Setting:
     name: str
     kind: str
     tolerance: float
-    rounds: np.ndarray
-    """Seconds a point by round."""
-    planning: float
-    """Seconds a point in the best round."""
-    pd_error: np.ndarray
-    """By point."""
-    log10_pfa_error: float
-    """Largest over the points; nan where it has none, as the next two."""
+    rounds: np.ndarray  # seconds a point by round
+    planning: float  # seconds a point in the best round
+    pd_error: np.ndarray  # by point
+    log10_pfa_error: float  # largest over the points; nan where it has none, as the next two
     magnitude_error: float
-    leakage_error: float
-    """No part of what is promised: it jumps where a bin comes to the threshold."""
-    likely: float
-    """Share of the points that :attr:`error` is of."""
+    leakage_error: float  # no part of what is promised: it jumps where a bin comes to the threshold
+    likely: float  # share of the points that :attr:`error` is of
 
     @property
     def seconds(self) -> float:
@@ -64,10 +69,7 @@ class Setting:
 
     @property
     def error(self) -> float:
-        """The error that counts is the largest over the points, of all that a tolerance promises.
-
-        If errors are random, it is that of pd at most of the points.
-        """
+        """Return the largest error of all promised; if random, that of pd at most points."""
         if self.likely < 1.0:
             return self.quantile(self.likely)
         promised = self.quantile(1.0), self.log10_pfa_error, self.magnitude_error
@@ -75,10 +77,7 @@ class Setting:
 
     @property
     def is_whole(self) -> bool:
-        """True where it simulates all that is asked for: the thesis's effects have no leakage.
-
-        They do where leaving it out is no larger an error than those promised.
-        """
+        """True where it simulates all that is asked for, or lacks what makes no larger an error."""
         return self.kind != CLOSED_FORM or self.leakage_error <= max(self.error, EXACT)
 
     def quantile(self, share: float) -> float:
@@ -86,7 +85,7 @@ class Setting:
         return float(np.nanquantile(self.pd_error, share))
 
     def times_faster(self, other: Setting, besides: float = 0.0) -> float:
-        """Time of another over that of this, round by round, in the median; of few, at best.
+        """Time of another over that of this, round by round, in the median; of few rounds, at best.
 
         Both with what a point takes besides [s].
         """
@@ -165,10 +164,7 @@ class Duel:
 
 
 def against_fixed(settings: Sequence[Setting]) -> list[Duel]:
-    """For each error that adaptive settings have: the fastest of them, the fastest fixed one.
-
-    A setting that skips leakage, if there is any, does less than they do, and is none of these.
-    """
+    """For each error that adaptive settings have: the fastest of them, the fastest fixed one."""
     adaptive = of_kinds(settings, ADAPTIVE)
     fixed = [setting for setting in of_kinds(settings, *FIXED) if setting.is_whole]
     errors = sorted({max(setting.error, EXACT) for setting in adaptive}, reverse=True)
@@ -177,10 +173,7 @@ def against_fixed(settings: Sequence[Setting]) -> list[Duel]:
 
 
 def against_thesis(settings: Sequence[Setting], kind: str = THESIS) -> list[Duel]:
-    """Return the fastest adaptive setting as accurate as each form of the thesis's way.
-
-    `kind`: as it is described, or improved.
-    """
+    """Return the fastest adaptive setting as accurate as each form of the thesis's way."""
     adaptive = of_kinds(settings, ADAPTIVE)
     best = ((cheapest(adaptive, each.error), each) for each in of_kinds(settings, kind))
     return [Duel(own, thesis) for own, thesis in best if own is not None]
@@ -242,7 +235,9 @@ def sentences(dataset: xr.Dataset, settings: Sequence[Setting]) -> list[str]:
     found += _thesis(settings, attributes["thesis_beamlets"]) + _like_for_like(settings)
     found.append(_reference(attributes))
     found += [note[0].upper() + note[1:] + "." for note in attributes["notes"]]
-    found += [_partial(attributes)] if attributes["stopped"] else []
+    if why := attributes["stopped"]:
+        points = f"{attributes['points']} {attributes['unit']}"
+        found.append(f"Not the whole sample ({why}): {points} of it.")
     return found
 
 
@@ -288,10 +283,7 @@ def _fixed(duels: Sequence[Duel], attributes: dict) -> list[str]:
 
 
 def _lost(worst: Duel, duels: Sequence[Duel], attributes: dict) -> str:
-    """By how much an adaptive setting is slower, and what that is of all that the study takes.
-
-    However few points a study has, its store is to be made, which is most of what it takes then.
-    """
+    """By how much an adaptive setting is slower, and what that is of all that the study takes."""
     points = attributes["study_points"]
     slower = worst.adaptive.seconds * (1 - worst.times_faster)
     lost, planning = (_time(points * each) for each in (slower, worst.adaptive.planning))
@@ -303,10 +295,7 @@ def _lost(worst: Duel, duels: Sequence[Duel], attributes: dict) -> str:
 
 
 def _thesis(settings: Sequence[Setting], beamlets: int) -> list[str]:
-    """Statement on adaptive settings against the thesis's way, as described and improved.
-
-    What they are held to is against its own number of beamlets.
-    """
+    """Statement on adaptive settings against the thesis's way, as described and improved."""
     duels = against_thesis(settings)
     if not duels:
         return []
@@ -363,11 +352,6 @@ def _reference(attributes: dict) -> str:
     )
 
 
-def _partial(attributes: dict) -> str:
-    reason = attributes["stopped"]
-    return f"Not the whole sample ({reason}): {attributes['points']} {attributes['unit']} of it."
-
-
 def _span(values: Sequence[float]) -> str:
     low, high = min(values), max(values)
     return f"{low:.2g}" if f"{low:.2g}" == f"{high:.2g}" else f"{low:.2g} to {high:.2g}"
@@ -390,3 +374,207 @@ def error(value: float) -> str:
     if math.isnan(value):
         return "-"
     return f"{value:.1e}" if value >= EXACT else f"<{EXACT:.0e}".replace("e-0", "e-")
+
+
+BY_NUMBER = (BEAMLETS, IN_A_LINE, MEANS, COUNTED, IN_NOISE)
+"""Kinds whose settings are told apart by the number that their names begin with."""
+
+JOINED = (ADAPTIVE, *BY_NUMBER)
+"""Kinds whose settings are one method, looked at more or less closely."""
+
+MARKS = {
+    ADAPTIVE: ("o", canvas.LINES[0], "adaptive, by tolerance"),
+    "fixed effects": ("s", canvas.LINES[2], "the same effects everywhere"),
+    BEAMLETS: ("^", canvas.LINES[1], "number of beamlets in a lattice"),
+    IN_A_LINE: ("<", canvas.LINES[7], "number of beamlets in a line"),
+    "all on": ("D", canvas.LINES[3], "all effects on"),
+    MEANS: ("P", canvas.LINES[5], "mean over so many draws"),
+    COUNTED: ("^", canvas.LINES[1], "detections in so many draws"),
+    IN_NOISE: ("<", canvas.LINES[7], "the same, noise in every bin"),
+    CLOSED_FORM: ("X", canvas.LINES[5], "in closed form what the thesis's way has"),
+    THESIS: ("v", canvas.LINES[4], "the thesis's way"),
+    IMPROVED: ("p", canvas.LINES[4], "the thesis's way, improved"),
+    WRITTEN: ("*", canvas.LINES[6], "as written"),
+}
+"""Marker, colour and words of each kind."""
+
+HALO = [withStroke(linewidth=2.5, foreground="white")]
+"""Halo that keeps a name readable upon lines; marks are drawn upon it."""
+
+
+PLACES = ((6, 5), (-6, -10), (6, -10), (-6, 5), (6, 15), (-6, -20), (6, -20), (-6, 15))
+"""Places that a name may take: right of its mark and above it, or left and below [points]."""
+
+MARK_SIZE = 7
+"""Width of most marks [points]."""
+
+
+def sheet(dataset: xr.Dataset, settings: Sequence[Setting]) -> Sheet:
+    """Return the figure of a store that `sweep accuracy` made."""
+    drawn = candidates(settings)
+    sheet, (axes,) = canvas.panels(10.0, 6.2, 1, 1)
+    axes.step(
+        *zip(*map(_place, front(drawn)), strict=True), where="post", color="0.35", linewidth=1.2,
+        linestyle="--", zorder=1, label="front of the best",
+    )  # fmt: skip
+    names: list[Annotation] = []
+    for kind, (marker, colour, words) in MARKS.items():
+        some = of_kinds(drawn, kind)
+        for i, setting in enumerate(some):
+            _mark(axes, setting, marker, colour, words if i == 0 else "")
+        if kind in JOINED and some:
+            line = zip(*map(_place, some), strict=True)
+            axes.plot(*line, color=colour, linewidth=0.8, alpha=0.5, zorder=1)
+        names += _names(axes, some, above=kind not in BY_NUMBER)
+    _finish(axes, min(setting.quantile(0.5) for setting in drawn))
+    canvas.title(sheet, f"{dataset.attrs['title']}: what accuracy costs")
+    canvas.caption(sheet, _note(dataset, drawn))
+    sheet.draw_without_rendering()
+    _keep_apart(axes, names, drawn)
+    return sheet
+
+
+def _mark(axes: Axes, setting: Setting, marker: str, colour: str, words: str) -> None:
+    """Draw a mark at the largest error, a line down to pd's of 90 %, a dot at its median."""
+    time, worst = _place(setting)
+    most, half = (max(setting.quantile(share), EXACT) for share in (0.9, 0.5))
+    if most > EXACT:
+        axes.plot([time, time], [most, worst], color=colour, linewidth=1.0, alpha=0.6, zorder=2)
+        axes.plot([time], [most], marker="_", color=colour, markersize=7, zorder=2)
+    if half > EXACT:
+        axes.plot([time], [half], marker=".", color=colour, markersize=4, zorder=2)
+    size = 11 if marker == "*" else MARK_SIZE
+    axes.plot(
+        [time], [worst], marker=marker, color=colour, markersize=size, linestyle="",
+        markeredgecolor="white", markeredgewidth=0.7, label=words or None, zorder=4,
+    )  # fmt: skip
+
+
+def _place(setting: Setting) -> tuple[float, float]:
+    """Time [us] and error at which a setting is drawn."""
+    return 1e6 * setting.seconds, max(setting.error, EXACT)
+
+
+def _names(axes: Axes, settings: Sequence[Setting], above: bool) -> list[Annotation]:
+    """Short names beside marks; settings whose marks are all but one have one name."""
+    found = []
+    for together in _clusters(settings):
+        ladder = [_short(setting) for setting in settings if setting in together]
+        names = list(dict.fromkeys(filter(None, ladder)))
+        if names:
+            words = names[0] if len(names) == 1 else f"{names[0]} … {names[-1]}"
+            beside = together[-1] if above else together[0]
+            name = axes.annotate(
+                words, _place(beside), xytext=PLACES[0], textcoords="offset points", fontsize=7.5,
+                color=MARKS[beside.kind][1], path_effects=HALO, zorder=3,
+            )  # fmt: skip
+            _put(name, PLACES[0 if above else 1])
+            found.append(name)
+    return found
+
+
+def _put(name: Annotation, place: tuple[float, float]) -> None:
+    """Draw a name so far to the right of its mark, and above it [points]."""
+    name.set_position(place)
+    name.set_horizontalalignment("left" if place[0] > 0 else "right")
+
+
+def _keep_apart(axes: Axes, names: Sequence[Annotation], settings: Sequence[Setting]) -> None:
+    """Move names off marks and off each other, where another place beside their marks is free."""
+    marks = [axes.transData.transform(_place(setting)) for setting in settings]
+    half = MARK_SIZE / 2 * canvas.DPI / 72
+    taken = [Bbox([mark - half, mark + half]) for mark in marks]
+    for name in names:
+        own = name.get_position()
+        for place in (own, *PLACES):
+            _put(name, place)
+            if not name.get_window_extent().count_overlaps(taken):
+                break
+        else:
+            _put(name, own)
+        taken.append(name.get_window_extent())
+
+
+def _clusters(settings: Sequence[Setting]) -> list[list[Setting]]:
+    """Group settings by time, if their marks are too close for names of their own."""
+    clusters: list[list[Setting]] = []
+    for setting in sorted(settings, key=lambda each: each.seconds):
+        near = (cluster for cluster in clusters if _alike(setting, cluster[-1]))
+        if (cluster := next(near, None)) is not None:
+            cluster.append(setting)
+        else:
+            clusters.append([setting])
+    return clusters
+
+
+def _alike(one: Setting, other: Setting) -> bool:
+    """Tell whether two marks are too close for a name each."""
+    apart = np.abs(np.log(_place(one)) - np.log(_place(other)))
+    return bool((apart < (0.25, 1.2)).all())
+
+
+def _short(setting: Setting) -> str:
+    """Short name that tells a setting from others of its kind."""
+    if setting.kind == ADAPTIVE:
+        return f"{setting.tolerance:.0e}".replace("e-0", "e-")
+    if setting.kind == THESIS:
+        return setting.name.removeprefix("thesis ")
+    if setting.kind in BY_NUMBER:
+        return setting.name.split()[0]
+    return ""
+
+
+def _finish(axes: Axes, least: float) -> None:
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_ylim(max(EXACT, least) / 2, 2.5)
+    axes.margins(x=0.16)
+    plain = FuncFormatter(lambda value, _: f"{value:g}")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_formatter(plain)
+    axes.xaxis.set_minor_formatter(FuncFormatter(lambda value, _: ""))
+    axes.set_xlabel("time a point on one core (µs)")
+    axes.set_ylabel("largest error of pd, log10 pfa and magnitudes")
+    axes.grid(True, which="major", color="0.9", linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+
+
+def _note(dataset: xr.Dataset, settings: Sequence[Setting]) -> str:
+    """Return the notes that explain the figure."""
+    attributes = dataset.attrs
+    likely = settings[0].likely
+    worst = "the largest" if likely == 1 else f"that of {100 * likely:.0f} %"
+    parts = [
+        f"mark: {worst} of {labels.counted(attributes['points'], attributes['unit'][:-1])}; "
+        f"bar and dot: 90 % and half of them, in pd alone; {EXACT:g} and less at the foot",
+        f"best of {labels.counted(dataset.sizes['round'], 'round')}; "
+        f"reference: {attributes['reference']}",
+    ]
+    if attributes["truth_points"]:
+        difference = error(attributes["truth_pd_difference"])
+        parts.append(
+            f"time domain at {labels.counted(attributes['truth_points'], 'point')}: within "
+            f"{difference} of it"
+        )
+    parts.append(f"study {attributes['study_id'][:8]}, model {attributes['model_version']}")
+    return labels.joined(parts)
+
+
+def opened(store: Location) -> tuple[xr.Dataset, list[Setting]]:
+    """Return the store as a dataset, read whole, and its settings; NotAStoreError if it is none."""
+    read_attributes(store, ACCURACY)
+    with xr.open_zarr(zarr_store(store), **CHECKED) as dataset:
+        whole = dataset.load()
+    return whole, settings_in(whole)
+
+
+def draw(store: Location, directory: Path | None = None, form: str = "png") -> list[Path]:
+    """Write the figure as NAME.png (pdf, svg) and the tables as NAME.txt."""
+    dataset, settings = opened(store)
+    stem = store.name.removesuffix(".zarr")
+    place = beside(store) if directory is None else directory
+    file = place / f"{stem}.txt"
+    drawn = canvas.save(sheet(dataset, settings), place / f"{stem}.{form}")
+    file.write_text(page(dataset, settings).text(), encoding="utf-8")
+    return [drawn, file]

@@ -1,12 +1,7 @@
 """Charts as data, and those of grids: a variable over two coordinates, or along one.
 
-Files of them are drawn by :mod:`sweep.analysis.canvas`, pages by :mod:`sweep.report.page`.
-
-A chart has panels, each for one choice of every facet: a sheet shows them side by side, a page one
-at a time::
-
-    facets   part: power 1 W           part: power 3 W
-    panel    axes, lines or map        axes, lines or map
+Files of them are drawn by :mod:`sweep.analysis.canvas`, pages by :mod:`sweep.report.page`: a sheet
+shows the panels side by side, a page one at a time, by the choice of each facet.
 """
 
 from __future__ import annotations
@@ -41,23 +36,12 @@ class Axis:
 
 @dataclass(frozen=True, eq=False)
 class Line:
-    """Values along an axis.
+    """Values along an axis; nan where there is none.
 
-    Attributes
-    ----------
-    x, y : (n,) ndarray
-        Places, and values there; nan where there is none.
-    name, number
-        Name in a legend, and number of its colour, dash and mark.
-    low, high : (n,) ndarray or None
-        Ends of a band about the line.
-    look
-        ``line``, ``stated`` (dashed), ``dots``, ``bars`` (with errors), ``level``, ``area`` (upon
-        the areas before it).
-    together
-        Points that each value stands for.
-    told
-        Words about each value.
+    A legend has its name; a number stands for its colour, dash and mark. A band may be about
+    it. Its look is ``line``, ``stated`` (dashed), ``dots``, ``bars`` (with errors), ``level``
+    or ``area`` (upon the areas before it). Each value stands for some points together, and may
+    have words told of it.
     """
 
     x: np.ndarray
@@ -110,8 +94,7 @@ class Panel:
 class Chart:
     """Contents of a figure: words over it, for those who do not see it, and under it; panels.
 
-    Panels are in the order of the choices; facets have the name of each choice. `rows` are numbers
-    of panels in the rows of a sheet, which decides by default.
+    Facets have the name of each choice. `rows` are numbers of panels in the rows of a sheet.
     """
 
     heading: str
@@ -362,10 +345,8 @@ def along(found: Sequence[tuple[Points, str]], x: str) -> tuple[list[Line], list
     """Variables along a coordinate, all in one reading, and remarks on how they are drawn.
 
     A line of many points is cut into intervals: their means, in a band from the lowest to the
-    highest of their points; else the band is the interval of each point.
-
-    Where coordinates beside `x` vary, their first place is taken. A variable has intervals where
-    it is a probability of detection that is drawn, or has ``.._low`` and ``.._high`` beside it.
+    highest of their points. Else the band is the interval of each point, where pd is drawn or
+    the dataset has ``.._low`` and ``.._high``. Of other coordinates the first place is taken.
     """
     lazy: list[list[Any]] = []
     made: list[tuple[Side, int, float, bool]] = []

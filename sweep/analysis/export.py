@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from sweep.analysis import labels
-from sweep.analysis.scenes.figures import SceneStudy
+from sweep.analysis.figures import SceneStudy
 from sweep.analysis.scenes.recording import (
     INTERPOLATED,
     QUANTISED,

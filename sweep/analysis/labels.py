@@ -18,10 +18,7 @@ _TAKE_PREFIXES = ("m", "s", "Hz", "W", "rad", "A", "ohm")
 
 
 def shown_in(values: np.ndarray, units: str) -> tuple[float, str]:
-    """Factor and units in which a reader wants values: long distances in km, angles in degrees.
-
-    Distances in even steps of their logarithm, most of them short, stay in metres.
-    """
+    """Factor and units in which a reader wants values: long distances in km, angles in degrees."""
     if units == "m" and values.size and np.median(np.abs(values)) > LONG_RANGE:
         return 1e-3, "km"
     if units == "rad":

@@ -44,10 +44,7 @@ def bin_probability(tnr: float, looks: Looks = ONE) -> float:
 
 
 def bins_counted(parameters: Mapping[str, Any], bin_probability: ArrayLike) -> np.ndarray:
-    """Independent bins with the false alarms of a segment, from the probability of one in a bin.
-
-    From SI values by dotted path; :func:`sweep.model.threshold.segment_bins`.
-    """
+    """Independent bins with the false alarms of a segment, by the probability of one in a bin."""
     level = Looks.of(parameters).level(np.log(np.maximum(bin_probability, 1e-300)))
     return segment_bins(parameters, level)
 
@@ -58,16 +55,11 @@ def segment_probability(bin_probability: np.ndarray, bins: ArrayLike) -> np.ndar
         return np.asarray(-np.expm1(np.asarray(bins) * np.log1p(-np.asarray(bin_probability))))
 
 
-def shot_probability(tnr: float, bins: float) -> float:
-    """Probability that both of two segments of so many bins raise a false alarm, 0..1."""
-    return float(segment_probability(np.asarray(bin_probability(tnr)), bins)) ** 2
-
-
 def alarms_of_study(study: Spec | SceneSpec) -> list[tuple[float, float]]:
     """Probabilities that noise raises an alarm in any chirp of a shot, and in both, 0..1.
 
-    One pair for each of the thresholds, FFT sizes and detectors of a study, of which some hundreds
-    are looked at where axes have more; none for detectors of the user's own.
+    One pair for each of the thresholds, FFT sizes and detectors of a study, of which some
+    hundreds are looked at; none for detectors of the user's own.
     """
     axes = [
         axis for axis in study.axes
@@ -98,13 +90,8 @@ def shot_with_leakage(
 ) -> Chances:
     """Probability that noise or leakage raises an extra group in both chirp segments, 0..1.
 
-    Parameters
-    ----------
-    pfa_segment, pfa_both_chirps
-        Of noise alone: in the up-chirp, and in both. The latter is a product, as the segments'
-        numbers of bins differ.
-    p_leakage_up, p_leakage_down
-        Of leakage in each.
+    Of noise alone in the up-chirp, and in both, a product, as the segments' numbers of bins
+    differ; of leakage in each.
     """
     down = pfa_both_chirps / (pfa_segment + (pfa_segment == 0))  # both are 0 where one is
     up = pfa_segment + p_leakage_up * (1 - pfa_segment)
@@ -112,20 +99,14 @@ def shot_with_leakage(
 
 
 def variance_excess_of_bin(probability: float, tnr: float) -> float:
-    """Excess of the noise variance over the threshold's, from the probability in a bin.
-
-    exp(-x / (1 + e)) = probability, solved for e; nan where no e does.
-    """
+    """Solve exp(-x / (1 + e)) = probability in a bin for the excess e of noise variance; or nan."""
     if not 0.0 < probability < 1.0:
         return math.nan
     return -bin_exponent(tnr) / math.log(probability) - 1
 
 
 def variance_excess_of_shot(probability: float, tnr: float, bins: float) -> float:
-    """Return the noise from the probability of a false alarm in both segments of a shot.
-
-    (1 - (1 - exp(-x / (1 + e)))^N)^2 = probability, solved for e; nan where no e does.
-    """
+    """Solve (1 - (1 - exp(-x / (1 + e)))^N)^2 = probability for the excess e; or nan."""
     if not 0.0 < probability < 1.0:
         return math.nan
     of_bin = -math.expm1(math.log1p(-math.sqrt(probability)) / bins)

@@ -21,6 +21,7 @@ from sweep.model import waveform, window
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.catalogue import CORE, EFFECTS
 from sweep.model.eyepoints import Eyepoints
+from sweep.model.returns import beamlet_lines
 from sweep.model.segments import spectrum as segment_spectrum
 from sweep.model.shot import prepare
 from sweep.model.threshold import WAYS
@@ -45,20 +46,9 @@ class Group:
 class Segment:
     """Spectrum of a segment and what is found in it.
 
-    Attributes
-    ----------
-    name, sign
-        Up-chirp, Doppler or down-chirp; sign of the chirp rate.
-    frequency, signal, magnitude : (m,) ndarray
-        Of each bin [Hz]; |X| there of the signal alone, and with the noise where it is drawn [V].
-    beat : float
-        Signed beat frequency [Hz].
-    carrier : float
-        Optical frequency at the segment's start [Hz].
-    groups : tuple of Group
-        Bins above the threshold.
-    snr, pd : float
-        Of the strongest bin without noise; probability of its detection.
+    Frequencies and carrier are in Hz; |X| of each bin in V, of the signal alone, and with noise
+    where that is drawn. The SNR and the probability of detection are those of the strongest
+    bin.
     """
 
     name: str
@@ -189,9 +179,7 @@ def _segment(prepared: model.Shots, found: np.ndarray, k: int, seed: int | None)
 def drawn_noise(prepared: model.Shots, *, seed: int, segment: int, look: int = 0) -> np.ndarray:
     """Noise of a look's windowed record, spectrum (N/2 + 1,) [V]; (N,) of a complex record.
 
-    The bins' noise is complex Gaussian, and alike in neighbours as far as the window makes it.
-    It is added to the signal's |X|: a common phase changes nothing in a bin, and the signal's
-    phase from bin to bin is lost.
+    It is added to the signal's |X|, whose phase from bin to bin is lost.
     """
     shape = prepared.window
     key = (segment, look) if look else (segment,)
@@ -215,11 +203,7 @@ def groups(magnitude: np.ndarray, threshold: float) -> tuple[Group, ...]:
 
 
 def quantity_at(shot: Shot, segment: Segment, frequency: np.ndarray) -> np.ndarray:
-    """Range [m] or velocity [m/s] that a frequency seen in a segment stands for near its beat.
-
-    Range is that of a target of the shot's velocity; a fold at DC or Nyquist is undone as for
-    the shot's own beat.
-    """
+    """Range [m] or velocity [m/s] that a frequency seen in a segment stands for near its beat."""
     p = shot.prepared
     rate = float(p.sample_rate[0])
     fold = np.rint(segment.beat / rate) * rate
@@ -365,9 +349,10 @@ def scene_shot_sheet(
     """Spectra of a shot of a scene, and where its beamlets' lines are."""
     notes = [*remarks, "marks at the foot: where the beamlets' own lines are, by surface"]
     sheet = spectra_sheet([shot], title=title, note=labels.joined(notes), detections=True)
-    hit = eyepoints.surface[0] >= 0
+    hit, lines = eyepoints.surface[0] >= 0, beamlet_lines(shot.prepared)[0]
+    width = float(shot.prepared.sample_rate[0]) / shot.prepared.fft_size
     for i, segment in enumerate(shot.segments):
-        places = _beamlet_lines(shot, segment, eyepoints)[hit] / 1e6
+        places = lines[NAMES.index(segment.name), hit] * width / 1e6
         close = sheet.axes[2 * i + 1]
         marks = [
             close.plot(
@@ -381,25 +366,6 @@ def scene_shot_sheet(
         if i == 0:
             close.legend(handles=marks, fontsize=7.5, loc="upper left", framealpha=0.9)
     return sheet
-
-
-def _beamlet_lines(shot: Shot, segment: Segment, eyepoints: Eyepoints) -> np.ndarray:
-    """Frequency at which each beamlet's line appears in a segment (b,) [Hz]."""
-    rate = float(shot.prepared.sample_rate[0])
-    beat = waveform.beat_frequency(
-        segment.sign,
-        carrier=np.asarray(segment.carrier),
-        chirp_rate=np.asarray(shot.prepared.chirp_rate),
-        range=eyepoints.range[0] + eyepoints.offset[0],
-        radial_velocity=eyepoints.radial_velocity[0] + eyepoints.velocity_offset[0],
-    )
-    seen = (beat / rate - np.rint(beat / rate)) * rate
-    return np.asarray(seen if shot.prepared.complex_record else np.abs(seen))
-
-
-def blocks(shot: Shot) -> list[Block]:
-    """Tables of a shot."""
-    return [_noise(shot), _segments(shot), _report(shot), _false_alarms(shot)]
 
 
 def _noise(shot: Shot) -> Block:
@@ -482,33 +448,11 @@ def report(
     seed: int = 0,
     form: str = "png",
 ) -> tuple[str, list[Path]]:
-    """Spectra, threshold, noise level and detections of one shot, and what it reports.
+    """Spectra, threshold, noise level and detections of one shot: text, and the files written.
 
-    Parameters
-    ----------
-    spec
-        The study. Parameters on an axis take its first value; a study with a single axis of few
-        values is drawn at each of them.
-    at
-        Values to take instead, written with their units, by coordinate or dotted path.
-    directory
-        Where to put the figure and the text.
-    noise, seed
-        Whether to add noise to the spectra, and its seed.
-    form
-        ``png``, ``pdf`` or ``svg``.
-
-    Returns
-    -------
-    text : str
-        Noise budget, segments, range and velocity, false alarms.
-    files : list of Path
-        The figure and the text.
-
-    Raises
-    ------
-    SpecError
-        For names and values in `at` that cannot be read.
+    Parameters on an axis take the values in `at`, written with their units, or the first; a
+    study with a single axis of few values is drawn at each of them. SpecError for what can't be
+    read.
     """
     modes = spec.modes()
     effects = [e.name for e in EFFECTS if not e.is_random and modes[e.name] != "off"]
@@ -516,7 +460,8 @@ def report(
         simulated(parameters, effects, label=label, seed=seed if noise else None)
         for label, parameters in chosen(spec, at)
     ]
-    directory, stem = Path(directory), _stem(at)
+    asked = [re.sub(r"[^A-Za-z0-9.+-]+", "", f"{name.split('.')[-1]}{v}") for name, v in at.items()]
+    directory, stem = Path(directory), "_".join(["shot", *asked])[:120]
     remark = f"noise drawn with seed {seed}" if noise else "the signal alone, no noise drawn"
     with canvas.style():
         sheet = spectra_sheet(shots, title=spec.title, note=labels.joined([remark, _held(shots)]))
@@ -558,12 +503,6 @@ def _position(spec: Spec, index: list[int]) -> dict[str, object]:
     }
 
 
-def _stem(at: Mapping[str, str]) -> str:
-    """Name of the files: `shot`, and what was asked for."""
-    words = [re.sub(r"[^A-Za-z0-9.+-]+", "", f"{name.split('.')[-1]}{v}") for name, v in at.items()]
-    return "_".join(["shot", *words])[:120]
-
-
 def _told(shot: Shot, paths: tuple[str, ...]) -> list[tuple[str, str]]:
     """Parameters as a user would write them, by name."""
     rules = parameter_rules()
@@ -596,6 +535,6 @@ def _blocks(shots: list[Shot]) -> list[Block]:
     for shot in shots:
         prefix = f"{shot.label}: " if shot.label else ""
         parameters = Block(f"{prefix}Shot", ("parameter", "value"), _told(shot, _TOLD))
-        found += [parameters]
-        found += [Block(prefix + b.heading, b.columns, b.rows) for b in blocks(shot)]
+        every = [_noise(shot), _segments(shot), _report(shot), _false_alarms(shot)]
+        found += [parameters, *(Block(prefix + b.heading, b.columns, b.rows) for b in every)]
     return found

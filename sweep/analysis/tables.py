@@ -17,22 +17,20 @@ from sweep.analysis import labels, noise_only
 from sweep.analysis.selection import (
     NEAREST,
     Points,
+    Search,
+    Tally,
     bands,
     beyond,
     confined,
     cuts,
-    parameters_at,
-    si_value,
-    split,
-)
-from sweep.analysis.tallies import (
-    Search,
-    Tally,
     for_median,
     median,
     medians,
+    parameters_at,
     pieces,
     search,
+    si_value,
+    split,
     tallied,
 )
 from sweep.model.looks import Looks
@@ -288,11 +286,7 @@ class _Account:
 
 
 def leakage(groups: Sequence[tuple[Points, str]], spec: Spec) -> list[Leakage]:
-    """Mean, median and origin of the leakage of points.
-
-    A shot's figure is the probability that noise or leakage raises an extra group in the
-    up-chirp and in the down-chirp segment.
-    """
+    """Mean, median and origin of the leakage of points, and of noise or leakage in both chirps."""
     accounts = [_Account() for _ in groups]
     for number, values in _read(groups):
         accounts[number].add(values, spec, groups[number][1])

@@ -368,9 +368,9 @@ def certificates(directory: Path, days: int) -> None:
     whoever has no such certificate. Keep the directory to yourself, where all machines of the
     cluster see it.
     """
-    from sweep.tasks.clusters.certificates import make
+    from sweep.tasks.clusters.machines import make_certificates
 
-    files = make(directory.absolute(), days)
+    files = make_certificates(directory.absolute(), days)
     click.echo("security:")
     for name, file in files._asdict().items():
         click.echo(f"  {name}: {file}")

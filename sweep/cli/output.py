@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import click
+from rich.filesize import decimal
 
 from sweep.storage.locations import Location
 
@@ -244,7 +245,7 @@ def plan_lines(
         yield from _scene_lines(study, p)
         yield "blocks", f"{p.blocks:,}"
     yield "chunks", f"{p.chunks:,} files"
-    yield "bytes", f"{in_bytes(p.bytes)} before compression"
+    yield "bytes", f"{decimal(p.bytes)} before compression"
     if not p.scanners:
         yield "time a point", f"{1e6 * p.seconds_a_point:.3g} us on one core"
     bound = "at most about" if getattr(study.draws, "adaptive", False) else "about"
@@ -252,7 +253,7 @@ def plan_lines(
         yield "time", f"{bound} {duration(p.work)}, at once, without workers"
     else:
         yield "time", f"{bound} {duration(p.seconds)} on {p.workers} workers"
-    yield "memory", f"about {in_bytes(p.worker_memory)} a worker"
+    yield "memory", f"about {decimal(p.worker_memory)} a worker"
     if why := _excess(p.points, p.bytes, p.work):
         yield "question", f"sweep run asks first, or takes --yes: {why}"
 
@@ -321,7 +322,7 @@ def _excess(points: int, size: int, seconds: float) -> str:
     from sweep.tasks.progress import duration
 
     told = [f"{points:,} points"] if points > MOST_POINTS else []
-    told += [in_bytes(size)] if size > MOST_BYTES else []
+    told += [decimal(size)] if size > MOST_BYTES else []
     told += [f"about {duration(seconds)} of one core"] if seconds > MOST_SECONDS else []
     return ", ".join(told)
 
@@ -397,16 +398,6 @@ def _effect_cells(row: EffectRow) -> list[str]:
     ]
 
 
-def in_bytes(count: int) -> str:
-    """Format a number of bytes: `1.5 MB`."""
-    size, unit = float(count), "B"
-    for unit in ("B", "kB", "MB", "GB", "TB"):
-        if size < 1000 or unit == "TB":
-            break
-        size /= 1000
-    return f"{size:.3g} {unit}"
-
-
 def conclude_accuracy(store: Location, *, measured: bool) -> tuple[list[Location], bool]:
     """Print what settings came to, and draw it: the files, and whether it was not interrupted.
 
@@ -415,9 +406,9 @@ def conclude_accuracy(store: Location, *, measured: bool) -> tuple[list[Location
     if not measured:
         click.echo("Interrupted before any point was through: nothing is kept.", err=True)
         sys.exit(INCOMPLETE)
-    from sweep.analysis import accuracy, accuracy_figure
+    from sweep.analysis import accuracy
 
-    dataset, settings = accuracy_figure.opened(store)
+    dataset, settings = accuracy.opened(store)
     print_table(
         "Time a point; errors of pd (at 90 %, largest), log10 pfa, peak magnitude; leakage",
         list(accuracy.SHORT), accuracy.short_rows(settings), "setting",
@@ -430,4 +421,4 @@ def conclude_accuracy(store: Location, *, measured: bool) -> tuple[list[Location
     )
     for sentence in accuracy.sentences(dataset, settings):
         click.echo(sentence)
-    return [store, *accuracy_figure.draw(store)], dataset.attrs["stopped"] != "interrupted"
+    return [store, *accuracy.draw(store)], dataset.attrs["stopped"] != "interrupted"

@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from rich.filesize import decimal
 
 from sweep.cli.options import STORE, LocalPath, StorePath, shown
-from sweep.cli.output import INCOMPLETE, in_bytes, print_table, tell_accuracy
+from sweep.cli.output import INCOMPLETE, print_table, tell_accuracy
 from sweep.storage.locations import Location, beside, files_below
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ def status(store: Location) -> None:
     click.echo(
         f"{s.points_done:,} of {s.points:,} {s.unit}, {s.blocks_done:,} of {s.blocks:,} blocks"
         f"{f', {amount(s.points_begun)} more begun' if s.points_begun else ''}"
-        f"{f', {s.draws_done:,} draws' if s.draws_done else ''}, {in_bytes(s.bytes)} stored"
+        f"{f', {s.draws_done:,} draws' if s.draws_done else ''}, {decimal(s.bytes)} stored"
     )
     if s.rate:
         rate = f"{float(f'{s.rate:.3g}'):,.12g} {s.unit}/s"
@@ -144,7 +145,7 @@ def finalize(store: Location, output: Location | None) -> None:
 
     made = pack(store, output or store.with_name(f"{store.name.removesuffix('.zarr')}_final.zarr"))
     files = files_below(made)
-    click.echo(f"{shown(made)}: {len(files):,} files, {in_bytes(sum(files.values()))}")
+    click.echo(f"{shown(made)}: {len(files):,} files, {decimal(sum(files.values()))}")
 
 
 def _tell(report: Report) -> None:

@@ -5,5 +5,5 @@ often a function is optimised depends on what was compiled before and what came 
 liberties, so would its last bits. They would buy 5 % of speed.
 """
 
-VERSION = "36"
+VERSION = "37"
 """Version of the physics: part of a study's identity, raised when any result can change."""

@@ -177,15 +177,7 @@ class Interval(NamedTuple):
 
 
 def wilson(*, successes: ArrayLike, trials: ArrayLike, confidence: ArrayLike) -> Interval:
-    """Score interval of the probability of a success.
-
-    Parameters
-    ----------
-    successes, trials : array_like
-        Counts, 0..`trials`; >= 1.
-    confidence : array_like
-        Of both sides together, 0..1.
-    """
+    """Score interval of the probability of a success, from counts; both sides together."""
     k, n = np.asarray(successes, float), np.asarray(trials, float)
     z = _deviations(confidence)
     mean, square = k / n, z * z
@@ -196,13 +188,7 @@ def wilson(*, successes: ArrayLike, trials: ArrayLike, confidence: ArrayLike) ->
 
 
 def clopper_pearson(*, successes: ArrayLike, trials: ArrayLike, confidence: ArrayLike) -> Interval:
-    """Interval beyond whose ends the counts, or more extreme ones, have (1 - confidence) / 2 each.
-
-    Parameters
-    ----------
-    successes, trials, confidence : array_like
-        As of :func:`wilson`.
-    """
+    """Interval beyond whose ends counts, or more extreme ones, have (1 - confidence) / 2 each."""
     k, n, c = np.broadcast_arrays(
         np.asarray(successes, float), np.asarray(trials, float), np.asarray(confidence, float)
     )
@@ -224,16 +210,7 @@ def bounded_mean(
 ) -> Interval:
     """Interval of the expectation of values within 0..1, from the mean of independent ones.
 
-    Parameters
-    ----------
-    mean : array_like
-        0..1.
-    variance : array_like
-        Of a single value, unbiased (over n - 1); anything, where there is one value only.
-    number : array_like
-        Values, >= 1.
-    confidence : array_like
-        As of :func:`wilson`.
+    The variance is that of a single value, unbiased; anything, where there is one value only.
     """
     m, n = np.asarray(mean, float), np.asarray(number, float)
     z = _deviations(confidence)

@@ -110,28 +110,6 @@ class Beam(NamedTuple):
         return self.angle(range) * np.asarray(range, float) / 2
 
 
-def overlap(sent: Beam, received: Beam, range: ArrayLike, offset: ArrayLike = 0.0) -> np.ndarray:
-    """Integral of I_T I_L over a plane across two beams [1/m^2].
-
-    Parameters
-    ----------
-    sent, received : Beam
-        The sent beam and the local oscillator's.
-    range : array_like
-        Distance of the plane [m], above 0.
-    offset : array_like
-        Distance of their axes there [m].
-
-    Examples
-    --------
-    >>> beam = Beam.of(waist=5e-3, wavelength=1550e-9)
-    >>> float(round(overlap(beam, beam, 1e-3) * math.pi * beam.waist**2, 6))
-    1.0
-    """
-    both = sent.radius(range) ** 2 + received.radius(range) ** 2
-    return np.asarray(2 / (math.pi * both) * np.exp(-2 * np.asarray(offset) ** 2 / both))
-
-
 def is_single_mode(p: Parameters) -> bool:
     """Return true where the receiver of points of one category sees a single mode."""
     return str(p[COUPLING]) == SINGLE_MODE and str(p[ARCHITECTURE]) != "direct"
@@ -278,17 +256,9 @@ def truncation(fill: ArrayLike, defocus: ArrayLike = 0.0) -> np.ndarray:
     What is cut off is lost, and what is left spreads: far away, or in focus, 0.63 of the echo is
     left at w_a = 0.8 a, which makes 0.40 A / R^2, the most that any Gaussian beam has (Rye and
     Frehlich, Appl. Opt. 31, 1992, 2891). Near the telescope the beam's middle is as it was. Beams
-    of unequal radii take the geometric mean of two.
+    of unequal radii take the geometric mean of two. `fill` is w_a / a, 1/e^2 radius over the
+    aperture's radius, up to 1; `defocus` the phase [rad] at the rim, pi a^2 / lambda (1/R - 1/f).
 
-    Parameters
-    ----------
-    fill : array_like
-        w_a / a, 1/e^2 radius over the aperture's radius, up to 1.
-    defocus : array_like
-        pi a^2 / lambda (1/R - 1/f), phase [rad] at the rim of the aperture; 0 for the far field.
-
-    Examples
-    --------
     >>> f"{0.8**2 * truncation(0.8):.2f}"
     '0.40'
     """

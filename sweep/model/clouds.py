@@ -1,17 +1,12 @@
 """Point clouds: what an instrument reports of a flight's eyepoints, shot by shot and draw by draw.
 
-Eyepoints hold the geometry; here the radiometry is put to it. Every point comes with its position
-in the world, its standard errors and, beside them, the truth: surface, range and radial velocity
-of the beamlet that it has seen, and flags that say what it is.
+Every point comes with its position in the world, its standard errors and the truth: surface, range
+and radial velocity of the beamlet that it has seen, and flags that say what it is.
 
-A shot that sees nothing has noise alone in its record. It has no group of bins to be detected
-and none that could not raise a false alarm, so its false alarms are the largest of all bins that
-are counted: drawn like those of any other shot, from the same addresses.
-
-A shot sees the air once: all its draws have the scintillation of its own key, and so have its
-probabilities.
-
-Results of a shot do not depend on the shots and draws that are computed with it.
+A shot that sees nothing has noise alone in its record: its false alarms are the largest of all bins
+that are counted, drawn like those of any other shot, from the same addresses. A shot sees the air
+once: all its draws, and its probabilities, have the scintillation of its own key. Results of a shot
+do not depend on the shots and draws that are computed with it.
 """
 
 from collections.abc import Collection, Sequence
@@ -59,22 +54,16 @@ def cloud(
     ----------
     eyepoints : Eyepoints
         n shots, whether they see anything or not.
-    parameters : mapping
-        Of :func:`sweep.model.eyepoints.prepare_eyepoints`, SI scalars.
-    surfaces : sequence of Surface
-        What the surface numbers mean.
+    parameters, surfaces
+        As of :func:`sweep.model.eyepoints.seen_ground`.
     keys : (n, 2) uint64 ndarray
         Random key of each shot.
-    first_draw, draws : int
-        Number of the first draw, number of draws; any stretch of draws can be had alone.
-    method : str
-        ``probabilities`` or ``noise`` (:mod:`sweep.model.returns`).
+    first_draw, draws, method
+        As of :func:`sweep.model.returns.draw_returns`.
     returns : int
         Strongest groups of bins that are looked at in a segment, and points at the most of a
         shot and draw; at least 1.
-    effects : collection of str
-        Names of the effects that are simulated.
-    flags : (n,) uint32 ndarray, optional
+    effects, flags
         As of :func:`sweep.model.shot.prepare_cast`.
     estimates_rays : bool
         Whether ``beamlets_error`` is estimated, for which powers have to add (0 where not).
@@ -86,16 +75,10 @@ def cloud(
         :data:`sweep.model.outputs.POINTS`, (n, draws, returns[, 3]). ``surfaces_seen`` is
         `returns` at the most. ``surface``, ``true_range`` and ``true_radial_velocity`` are those
         of the beamlet that a true or a misread point has seen; the error of a misread one shows.
-
-    Raises
-    ------
-    ValueError
-        `method` is neither of the two.
     """
     n = len(eyepoints.time)
     sizes = {"shot": n, "draw": draws, "return_number": returns, "xyz": 3}
-    table = STATISTICS | POINTS
-    results = {name: output.empty(sizes) for name, output in table.items()}
+    results = {name: output.empty(sizes) for name, output in (STATISTICS | POINTS).items()}
     step = max(1, STRETCH // (12 * draws * returns + 12 * eyepoints.weight.size))
     for first in range(0, n, step):
         part = slice(first, first + step)

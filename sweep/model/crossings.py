@@ -55,18 +55,10 @@ def _terms(x, y):
 
 @njit(cache=True, error_model="numpy")
 def added_crossings(x, count, beta, series, out):
-    """Chances (Q_1 - e^-y) / (1 - e^-y) of ``count`` bins, 0..1.
+    """Chances (Q_1 - e^-y) / (1 - e^-y) of ``count`` bins, 0..1, into ``out``, (>= count + 7,).
 
-    Parameters
-    ----------
-    x : (>= count,) float64
-        a^2/2 of each bin, below y; used up, and so are up to seven elements more.
-    beta : float
-        Threshold over the noise per quadrature.
-    series : (MOST_TERMS,) float64
-        :func:`crossing_series`.
-    out : (>= count + 7,) float64
-        Result.
+    ``x`` is a^2/2 of each bin, below y; used up, and so are up to seven elements more. ``beta``:
+    threshold over the noise per quadrature; ``series``: :func:`crossing_series` of it.
     """
     y = 0.5 * beta * beta
     if y > LARGEST_SERIES:

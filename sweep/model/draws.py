@@ -20,7 +20,6 @@ from numba import njit
 
 from sweep.model import philox
 from sweep.model.alarms import TAPS, noise_filter
-from sweep.model.looks import NUMBER
 from sweep.model.marcum import at_least_one
 from sweep.model.philox import (
     STREAM_DETECTION,
@@ -30,8 +29,6 @@ from sweep.model.philox import (
 )
 from sweep.model.preparation import Shots
 from sweep.model.segments import runs_of
-
-METHODS = ("probabilities", "noise")
 
 _AT_ONCE = 256
 """Draws of a row whose random numbers are made together."""
@@ -50,19 +47,6 @@ class Rows(NamedTuple):
     """int64: number after the last."""
 
 
-def is_noisy(method: str) -> bool:
-    """Return true if a method of drawing adds noise.
-
-    Raises
-    ------
-    ValueError
-        There is no method of that name.
-    """
-    if method not in METHODS:
-        raise ValueError(f"no way to draw called {method!r}: choose from {', '.join(METHODS)}")
-    return method == "noise"
-
-
 def count_by_chance(
     rows: Rows, ends: np.ndarray, outputs: Mapping[str, np.ndarray], counts: np.ndarray
 ) -> None:
@@ -79,7 +63,6 @@ def count_by_chance(
 
 def count_in_noise(rows: Rows, ends: np.ndarray, shots: Shots, counts: np.ndarray) -> None:
     """Add the draws of some rows, in the noise of their shots, as :func:`count_by_chance` does."""
-    require_one_record(shots)
     levels = noise_levels(shots)
     mixing = np.empty((0, shots.size)) if shots.fading is None else shots.fading.mixing()
     one = np.exp(-0.5 * levels[0] ** 2)
@@ -90,21 +73,6 @@ def count_in_noise(rows: Rows, ends: np.ndarray, shots: Shots, counts: np.ndarra
         rule = echo_filter(shots, seen)
         own = levels[:, part].copy(), chances, (True, *rule), seen, mixing[:, part].copy()
         _count(some, ends, *own, counts)
-
-
-def require_one_record(shots: Shots) -> None:
-    """Refuse to add noise to bins that several records detect.
-
-    Raises
-    ------
-    ValueError
-        In several looks that are not added in amplitude.
-    """
-    if shots.looks.several:
-        raise ValueError(
-            f"draws.method: noise adds the noise of one record to bins, and {NUMBER} takes "
-            f"{shots.looks.number}: take probabilities or spectra, or combine: coherent"
-        )
 
 
 def echo_filter(shots: Shots, seen: "Seen") -> tuple[np.ndarray, np.ndarray, int]:
@@ -127,9 +95,7 @@ def _chances(outputs: Mapping[str, np.ndarray]) -> np.ndarray:
     By segment (up, Doppler, down), (3, 3, n).
     """
     up, down, both = (np.nan_to_num(outputs[f"pd_{name}"]) for name in ("up", "down", "shot"))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        beside = np.where(up > 0, np.minimum(both / up, 1.0), down)
-        alone = np.where(up < 1, np.clip((down - both) / (1 - up), 0.0, 1.0), down)
+    alone, beside = down_given_up(up, down, both)
     doppler = np.nan_to_num(outputs["pd_doppler"])
     noise_up = outputs["pfa_segment"]
     both, one = outputs["log10_pfa_both_chirps"], outputs["log10_pfa_segment"]
@@ -139,6 +105,16 @@ def _chances(outputs: Mapping[str, np.ndarray]) -> np.ndarray:
     alarm_down = 1 - (1 - noise_down) * (1 - outputs["p_leakage_down"])
     alarms = alarm_up, np.zeros_like(alarm_up), alarm_down
     return np.array([alarms, (up, doppler, alone), (up, doppler, beside)])
+
+
+def down_given_up(up: np.ndarray, down: np.ndarray, both: np.ndarray) -> np.ndarray:
+    """Chances of a detection in the down segment without and with one in the up segment, (2, ...).
+
+    From those of either segment and of both.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        alone = np.where(up < 1, np.clip((down - both) / (1 - up), 0.0, 1.0), down)
+        return np.stack([alone, np.where(up > 0, np.minimum(both / up, 1.0), down)])
 
 
 def noise_levels(shots: Shots) -> np.ndarray:
@@ -228,11 +204,10 @@ def seen_spectra(shots: Shots) -> Iterator[tuple[np.ndarray, Seen]]:
 def _count(rows, ends, levels, chances, how, seen, mixing, counts):
     """Add the draws of each row to the counts.
 
-    ``how``: whether in noise; filter of an echo's noise, as of :func:`echo_filter`.
-    ``levels`` (2, m) are threshold and noise under the lines, over the noise of any other bin;
-    ``chances`` (3, 3, m) those of a false alarm in bins that are not looked at one by one, and, of
-    no meaning in noise, of a detection without and with one in the up segment; ``mixing`` (6, m)
-    that of :meth:`sweep.model.detection.Fading.mixing`, or nothing.
+    ``how``: whether in noise; filter of an echo's noise, as of :func:`echo_filter`. ``levels`` (2,
+    m): :func:`noise_levels`. ``chances`` (3, 3, m): those of a false alarm in bins that are not
+    looked at one by one, and, of no meaning in noise, of a detection without and with one in the up
+    segment. ``mixing`` (6, m): :meth:`sweep.model.detection.Fading.mixing`, or nothing.
     """
     noisy, weights, start, real_ends = how
     noise_of_bins = np.empty((4, weights.shape[0] + weights.shape[1]))
@@ -345,18 +320,9 @@ def _cross_any(address, at, seen, rule, levels, factors, room, found):
 def draw_noise(draw, number, low, count, rule, room):
     """Noise of adjacent bins over sigma, in phase with the signal and across, to rows 0 and 1.
 
-    Parameters
-    ----------
-    draw : (uint64, uint64, int, int)
-        Key of the point, number of the draw, stream.
-    number : int
-        From which on the independent numbers count.
-    low, count : int
-        First bin; number of bins.
-    rule : tuple
-        :func:`echo_filter`.
-    room : (4, >= count + TAPS) float64
-        Result, and the independent numbers.
+    ``draw``: key of the point, number of the draw, stream; independent numbers count from
+    ``number``. ``low``, ``count``: first bin, number of bins. ``rule``: :func:`echo_filter`.
+    ``room`` (4, >= count + TAPS): result, and the independent numbers.
     """
     weights, start, ends = rule
     taps = weights.shape[1]
@@ -383,13 +349,8 @@ def draw_noise(draw, number, low, count, rule, room):
 def _cross(address, stream, index, line, words, found):
     """Mark the draws in which a bin, with its noise, reaches the threshold.
 
-    Parameters
-    ----------
-    line : tuple
-        |X| / sigma; the noise's deviations in its phase and across; the threshold, a power;
-        factors on |X|, draw by draw.
-    index : int
-        Pair of the stream that the noise is.
+    ``index``: pair of the stream that the noise is. ``line``: |X| / sigma; the noise's deviations
+    in its phase and across; the threshold, a power; factors on |X|, draw by draw.
     """
     ratio, deviation, threshold, factors = line
     philox.fill_words(address[:3], stream, index >> 1, philox.BY_DRAW, address[3], words)
@@ -435,16 +396,9 @@ def gamma_exceeded(order, chance):
 def faded_ratio(ratio, levels, chances, looks, apart):
     """|X| / sigma of a detected bin that fades: of some looks the root of their mean power.
 
-    Parameters
-    ----------
-    ratio : float
-        |X| / sigma without noise.
-    levels : (float, float)
-        Threshold, and noise of bins that hold lines, over sigma.
-    chances : (float, float)
-        Share of detections in which the power is as large, uniform; chance of a detection.
-    looks, apart : int, bool
-        Records, and whether each has its own speckle.
+    ``ratio`` is |X| / sigma without noise; ``levels`` are the threshold and the noise of bins that
+    hold lines, over sigma; ``chances`` the share of detections in which the power is as large,
+    uniform, and the chance of a detection. ``apart``: each look has its own speckle.
     """
     noise = 2.0 * levels[1] * levels[1]
     if looks > 1 and apart:

@@ -68,10 +68,6 @@ class ErrorFloor(NamedTuple):
         """Relative standard deviation that all velocities share."""
         return float(np.hypot(self.clock, self.wavelength))
 
-    def range_error(self, range: np.ndarray) -> np.ndarray:
-        """Return the standard error of ranges [m]."""
-        return np.asarray(self.clock * np.abs(range))
-
     def velocity_error(self, radial_velocity: np.ndarray, across: np.ndarray) -> np.ndarray:
         """Return the standard error of radial velocities [m/s] at a speed across the beam [m/s].
 
@@ -97,26 +93,10 @@ def stray(
 ) -> dict[str, np.ndarray]:
     """Points with the instrument's errors in their values, places and standard errors.
 
-    Parameters
-    ----------
-    points : mapping
-        Results of :func:`sweep.model.clouds.cloud`, of n shots and some draws.
-    eyepoints : Eyepoints
-        The n shots that they were made of.
-    floor : ErrorFloor
-        Standard deviations.
-    keys : (n, 2) uint64 ndarray
-        Random key of each shot.
-    seed : int
-        The study's, for errors that shots share.
-    first_draw : int
-        Number of the first draw.
-
-    Returns
-    -------
-    dict of ndarray
-        All of `points`; what strays is new: range, radial velocity and their standard errors, by
-        whole bins and interpolated, and position. The truth stays.
+    `points` are results of :func:`sweep.model.clouds.cloud`, of the n shots of `eyepoints` and some
+    draws, from `first_draw` on; `keys` (n, 2) the random key of each shot; `seed` the study's, for
+    errors that shots share. New are range, radial velocity and their standard errors, by whole bins
+    and interpolated, and position. The truth stays.
     """
     n, draws = points["flags"].shape[:2]
     number = np.arange(first_draw, first_draw + draws)
@@ -138,11 +118,8 @@ def stray(
         far, closing = f"range{suffix}", f"radial_velocity{suffix}"
         new[far] = points[far] * stretched
         new[closing] = points[closing] * scaled + moved
-        floors = (
-            (far, floor.range_error(new[far])),
-            (closing, floor.velocity_error(new[closing], across)),
-        )
-        for name, error in floors:
+        errors = floor.clock * np.abs(new[far]), floor.velocity_error(new[closing], across)
+        for name, error in zip((far, closing), errors, strict=True):
             stated = f"{name}_standard_error"
             new[stated] = np.hypot(points[stated], error)
     known = direction + off

@@ -106,10 +106,8 @@ def observe(
     ----------
     index : (n,) int array
         Numbers of the shots, from 0; any stretch of a flight can be had without the rest.
-    flight, scanner
-        What carries the instrument, and where its beams point in the body frame, and when.
-    caster : Caster
-        The scene.
+    flight, scanner, caster
+        What carries the instrument; where its beams point in the body frame, and when; the scene.
     beam_divergence : float
         Full angle between the 1/e^2 intensity points [rad].
     number, pattern
@@ -165,9 +163,9 @@ def _radial_velocity(
 ) -> np.ndarray:
     """Compute closing speeds of instrument and surface along beamlets [m/s], (n, b); nan: a miss.
 
-    The first of the rays find the places; the second hold the directions of light there.
-    A surface on a body that turns moves with V + omega x (P - X) at the point P that is hit. A
-    turn of the instrument about itself moves no light: it shows in the lever arm's velocity.
+    Rays find the places, and hold the directions of light there. A surface on a body that turns
+    moves with V + omega x (P - X) at the point P that is hit. A turn of the instrument about itself
+    moves no light: it shows in the lever arm's velocity.
     """
     places, seen = rays
     closing = seen[..., 0] * state.velocity[:, :1]
@@ -237,15 +235,7 @@ def prepare_eyepoints(
     surfaces: Sequence[Surface],
     effects: Collection[str] = CORE,
 ) -> Shots:
-    """Radiometry's shots of eyepoints that all see something.
-
-    Parameters
-    ----------
-    eyepoints, parameters, surfaces
-        As of :func:`seen_ground`.
-    effects : collection of str
-        Names of the effects that are simulated.
-    """
+    """Radiometry's shots of eyepoints that all see something; arguments of :func:`seen_ground`."""
     return prepare_cast(*seen_ground(eyepoints, parameters, surfaces), effects)
 
 
@@ -263,17 +253,8 @@ def seen_ground(
         Range, velocity, reflectance and law come from the eyepoints and their surfaces.
     surfaces : sequence of Surface
         What the surface numbers mean.
-
-    Raises
-    ------
-    ValueError
-        Where a shot sees nothing, or a surface that is not given.
     """
-    if not eyepoints.seen.all():
-        raise ValueError("a shot that sees nothing has no radiometry: leave it out")
     surface = eyepoints.surface
-    if surface.max(initial=-1) >= len(surfaces):
-        raise ValueError(f"beamlets hit surfaces beyond the {len(surfaces)} given")
     hit = surface >= 0
     relative = np.where(hit, eyepoints.offset / eyepoints.range[:, None], 0.0)
     doppler = np.where(hit, 2 * eyepoints.velocity_offset / SPEED_OF_LIGHT, 0.0)

@@ -146,7 +146,7 @@ def plane_footprint(
     transverse: ArrayLike = 0.0,
     directions: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Beamlets of a beam on a flat plane, per unit of range along the beam's axis.
+    """Beamlets of a beam on a flat plane, per unit of range along its axis, (n, number) each.
 
     A plane's footprint scales with range, so one row serves every range. A beamlet y off the axis
     towards the plane's near side, and x across, sees the velocity (v_r + v_t y) / |d| with
@@ -154,10 +154,8 @@ def plane_footprint(
 
     Parameters
     ----------
-    grazing_angle : (n,) ndarray
-        Angle between axis and plane [rad], 0 < . <= pi/2.
-    beam_divergence : (n,) ndarray
-        Full 1/e^2 angle [rad].
+    grazing_angle, beam_divergence : (n,) ndarray
+        Angle between axis and plane, 0 < . <= pi/2; full 1/e^2 angle [rad].
     number, pattern
         Of :func:`beamlets`.
     radial, transverse : (n,) array_like
@@ -168,13 +166,11 @@ def plane_footprint(
 
     Returns
     -------
-    offset : (n, number) ndarray
-        (R_b - R_0) / R_0, formed without subtracting the two ranges.
-    cos_incidence : (n, number) ndarray
-        Cosine of each beamlet's incidence angle.
-    weights : (n, number) ndarray
+    offset, cos_incidence
+        (R_b - R_0) / R_0, formed without subtracting the two ranges; cosine of the incidence angle.
+    weights
         Power fractions; 0, with offset 0, for a beamlet that passes over the horizon.
-    closing : (n, number) ndarray
+    closing
         Closing speed of each beamlet less that of the beam's axis [m/s].
     """
     (across, along), share = beamlets(number, pattern)
@@ -195,45 +191,6 @@ def plane_footprint(
     along_beam, across_beam = (np.asarray(v, float)[..., None] for v in (radial, transverse))
     closing = (across_beam * y - along_beam * stretch) / (1 + stretch)
     return offset, cos_incidence, np.where(hits, share, 0.0), closing
-
-
-def plane_turned(
-    *,
-    turn: ArrayLike,
-    grazing_angle: ArrayLike,
-    beam_divergence: ArrayLike,
-    radial: ArrayLike,
-    transverse: ArrayLike,
-    directions: ArrayLike,
-    power: int,
-) -> np.ndarray:
-    """Mean of exp(2 pi i turn (beta_b - beta_0)) over the power of a beam on a flat plane.
-
-    To second order a beamlet x across and y along the slope, in standard deviations, has the phase
-    t y + c (x^2 + y^2), and its echo goes as 1 + k y, so that with Gaussian x and y the mean is
-
-        (1 + i k t / (1 - 2 i c)) exp(-t^2 / 2 / (1 - 2 i c)) / (1 - 2 i c)
-
-    Parameters
-    ----------
-    turn : array_like
-        [cycles per beta].
-    grazing_angle, beam_divergence, radial, transverse, directions : array_like
-        As of :func:`plane_footprint`.
-    power : int
-        Of the sine of the angle to the plane that echoes go with.
-
-    Returns
-    -------
-    complex ndarray
-        Within the unit circle.
-    """
-    phase = (4 * np.pi / SPEED_OF_LIGHT) * np.asarray(turn, float)  # by 1 m/s
-    sigma = np.asarray(directions, float) / 4
-    t = phase * np.asarray(transverse, float) * sigma
-    bent = 1 / (1 + 1j * phase * np.asarray(radial, float) * sigma**2)
-    lean = power * (np.asarray(beam_divergence, float) / 4) / np.tan(grazing_angle)
-    return np.asarray((1 + 1j * lean * t * bent) * np.exp(-0.5 * t * t * bent) * bent)
 
 
 class Moments(NamedTuple):

@@ -32,29 +32,16 @@ LAWS = ("thesis", "lambert", "lommel_seeliger")
 def backscatter(law: str, cos_incidence: np.ndarray) -> np.ndarray:
     """Backscattered fraction per steradian of a surface of reflectance 1 [1/sr].
 
-    Parameters
-    ----------
-    law : str
-        ``thesis``: the diffuse law of [T 4.4], 1/(2 pi) whatever the incidence.
-        ``lambert``: cos(incidence)/pi.
-        ``lommel_seeliger``: 1/pi whatever the incidence; the reflectance is the normal albedo
-        w p(0) (1 + B(0)) / 8 (single-scattering albedo, phase function, opposition surge), which
-        at normal incidence is what Lambert's law means by it.
-    cos_incidence : ndarray
-        Cosine of the incidence angle, 0..1.
-
-    Raises
-    ------
-    ValueError
-        `law` is none of these.
+    ``thesis`` is the diffuse law of [T 4.4], 1/(2 pi) whatever the incidence, ``lambert``
+    cos(incidence)/pi, ``lommel_seeliger`` 1/pi whatever the incidence; its reflectance is the
+    normal albedo w p(0) (1 + B(0)) / 8 (single-scattering albedo, phase function, opposition
+    surge), which at normal incidence is what Lambert's law means by it.
     """
     if law == "thesis":
         return np.full_like(cos_incidence, 0.5 / math.pi)
     if law == "lambert":
         return cos_incidence / math.pi
-    if law == "lommel_seeliger":
-        return np.full_like(cos_incidence, 1 / math.pi)
-    raise ValueError(f"no reflectance law {law!r}: choose from {', '.join(LAWS)}")
+    return np.full_like(cos_incidence, 1 / math.pi)
 
 
 class Footprints(NamedTuple):
@@ -71,17 +58,10 @@ class Footprints(NamedTuple):
 
 
 class Plane:
-    """A flat plane, for points of one category.
+    """A flat plane, for `size` points of one category, parameters as arrays.
 
-    Parameters
-    ----------
-    p : mapping
-        Parameters as arrays, of :func:`sweep.model.preparation.categories`.
-    size : int
-        Points n.
-    moving : bool
-        Whether beamlets see velocities of their own. Where not, points that differ in velocity
-        alone share their rows.
+    Where beamlets see no velocities of their own (`moving`), points that differ in velocity alone
+    share their rows.
     """
 
     beside = None
@@ -91,30 +71,29 @@ class Plane:
         self._number = int(p["footprint.beamlets"])
         self._pattern = pattern(p)
         places, directions = beam.angles(p)
-        columns = np.broadcast_arrays(
-            p["target.grazing_angle"],
-            places,
-            p["target.radial_velocity"] if moving else 0.0,
-            p["target.transverse_velocity"] if moving else 0.0,
-            *(() if beam.is_thesis(p) else (directions, *beam.dimming(p))),
-        )
+        names = "target.radial_velocity", "target.transverse_velocity"
+        velocities = [p[name] if moving else 0.0 for name in names]
+        further = () if beam.is_thesis(p) else (directions, *beam.dimming(p))
+        columns = np.broadcast_arrays(p["target.grazing_angle"], places, *velocities, *further)
         self._columns, self._size = [np.atleast_1d(column) for column in columns], size
 
     def turned(self, turn: np.ndarray) -> np.ndarray:
         """Mean over the beam's power of exp(2 pi i turn (beta_b - beta_0)), (n,) complex.
 
-        ``turn`` [cycles per beta] is (n,) or a scalar; see :func:`footprint.plane_turned`.
+        ``turn`` [cycles per beta] is (n,) or a scalar. To second order a beamlet x across and y
+        along the slope, in standard deviations, has the phase t y + c (x^2 + y^2), and its echo
+        goes as 1 + k y, so that with Gaussian x and y the mean is
+
+            (1 + i k t / (1 - 2 i c)) exp(-t^2 / 2 / (1 - 2 i c)) / (1 - 2 i c)
         """
         angle, places, radial, transverse, *further = self._columns
-        found = footprint.plane_turned(
-            turn=turn,
-            grazing_angle=angle,
-            beam_divergence=places,
-            radial=radial,
-            transverse=transverse,
-            directions=further[0] if further else places,
-            power=3 if self._law == "lambert" else 2,
-        )
+        phase = (4 * np.pi / SPEED_OF_LIGHT) * np.asarray(turn, float)  # by 1 m/s
+        sigma = (further[0] if further else places) / 4
+        t = phase * transverse * sigma
+        bent = 1 / (1 + 1j * phase * radial * sigma**2)
+        power = 3 if self._law == "lambert" else 2
+        lean = power * (places / 4) / np.tan(angle)
+        found = (1 + 1j * lean * t * bent) * np.exp(-0.5 * t * t * bent) * bent
         return np.asarray(found + np.zeros(self._size))
 
     def axis(self, size: int) -> Footprints:
@@ -148,15 +127,7 @@ class Plane:
 
 
 class Cast:
-    """Footprints that rays have found.
-
-    Parameters
-    ----------
-    footprints : Footprints
-        Of the n points.
-    beside : (rows, beamlets) bool ndarray, optional
-        Beamlets that lie on another surface than the beam's axis.
-    """
+    """Footprints that rays have found; `beside` (rows, beamlets): not on the axis's surface."""
 
     def __init__(self, footprints: Footprints, beside: np.ndarray | None = None) -> None:
         self.beamlets, self.beside = footprints, beside

@@ -147,8 +147,8 @@ def _least_squares(
     """Weights (3, m) on the bins that give a small change of delta, and their error (m,).
 
     Of all weights that a change of amplitude leaves at zero and a change of delta moves as much,
-    those of least variance: u = C^-1 G (G' C^-1 G)^-1 (0, 1)' with G = (tone, its slope). For a
-    centre bin of 1.
+    those of least variance, for a centre bin of 1: u = C^-1 G (G' C^-1 G)^-1 (0, 1)', G = (tone,
+    its slope).
     """
     slope = np.gradient(tone, delta, axis=1)
     used = slice(1 if two_bins else 0, 3)
@@ -214,10 +214,7 @@ def _at(values, place):
 
 @njit(cache=True, error_model="numpy")
 def sub_bin_error(delta, ratio, tables):
-    """Compute the standard error [bins] of :func:`sub_bin`, at most 1/2.
-
-    ``ratio`` is the centre bin's magnitude over the noise sigma per quadrature.
-    """
+    """Compute the standard error [bins] of :func:`sub_bin`, <= 1/2, by the centre over sigma."""
     if not ratio > 0.0:
         return 0.5
     return min(_at(tables.error, abs(delta) * (tables.error.size - 1)) / ratio, 0.5)

@@ -73,20 +73,9 @@ for _n in range(1, _LARGEST_ORDER + 1):
 def inspect(origin, lines, noise, table, form, sizes, tangent, room, exempt, series):
     """Run of bins, detection and leakage of a segment's lines; all bins are accounted for.
 
-    Parameters
-    ----------
-    origin, lines, table, form, sizes, tangent, room, exempt
-        As of :func:`sweep.model.spectrum.detect`.
-    noise : (float, float, float)
-        sigma per quadrature; threshold; chance of leakage that may be left out.
-    series : (MOST_TERMS,) float64
-        :func:`sweep.model.crossings.crossing_series` of the threshold.
-
-    Returns
-    -------
-    low, count, peak, exempted : int
-        As of :func:`sweep.model.spectrum.detect`.
-    leakage : float
+    Arguments and results as of :func:`sweep.model.spectrum.detect`, and the leakage last.
+    ``noise``: sigma per quadrature; threshold; chance of leakage that may be left out. ``series``:
+    :func:`sweep.model.crossings.crossing_series` of the threshold.
     """
     n, lowest, highest, total, faint = lines
     half, beside = sizes[0] // 2, sizes[6]

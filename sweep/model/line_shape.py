@@ -127,24 +127,15 @@ def shapes(window: Window, fft_size: int, power: bool, tier: int, *, shared: boo
     edges = taylor[0, 0] * np.array([np.cos(np.pi * ratio * y), np.sin(np.pi * ratio * y)])
     if not power:
         modes, edges = (np.hstack([one, _in_table(one, CELLS[power])]) for one in (modes, edges))
-    return Shapes(
-        np.array([fft_size, length, bins, CELLS[power], power, False, math.ceil(clear / ratio)]),
-        modes,
-        edges,
-        _ends(taylor, length),
-        _distances(bins, fft_size),
-        np.empty((0, 2, 0)),
-        np.empty((0, 2, 0)),
-    )
+    sizes = [fft_size, length, bins, CELLS[power], power, False, math.ceil(clear / ratio)]
+    ends, reach, none = _ends(taylor, length), _distances(bins, fft_size), np.empty((0, 2, 0))
+    return Shapes(np.array(sizes), modes, edges, ends, reach, none, none)
 
 
 def has_modes(window: Window, fft_size: int) -> bool:
     """Return true if a window's shapes are made of modes; else they have tables of all bins."""
-    return (
-        window.name in COSINE_SUMS
-        and window.length >= _SHORTEST
-        and window.length * _MOST_PADDED >= fft_size
-    )
+    long = window.length >= _SHORTEST and window.length * _MOST_PADDED >= fft_size
+    return long and window.name in COSINE_SUMS
 
 
 def whole_shapes(window: Window, fft_size: int, power: bool, phase: np.ndarray) -> Shapes:
@@ -170,15 +161,9 @@ def whole_shapes(window: Window, fft_size: int, power: bool, phase: np.ndarray) 
             record /= kernel_transform(np.pi * (length / fft_size / cells) * x)
             found = (np.fft.fft(record, number)[place % number] * turn).ravel()
             table[0], table[1] = found.real, found.imag
-    return Shapes(
-        np.array([fft_size, length, half, cells, power, True, half]),
-        np.empty((0, 0)),
-        np.empty((2, 0)),
-        np.empty((0, 4, 1)),
-        reach,
-        whole,
-        outlines,
-    )
+    sizes = np.array([fft_size, length, half, cells, power, True, half])
+    none = np.empty((0, 0)), np.empty((2, 0)), np.empty((0, 4, 1))
+    return Shapes(sizes, *none, reach, whole, outlines)
 
 
 def _outline_of_all(square: np.ndarray, cells: int, outline: np.ndarray) -> None:
@@ -320,18 +305,10 @@ def _ends(taylor: np.ndarray, length: int) -> np.ndarray:
 def find_modes(phase, matrix, centre, found, number):
     """Take phase errors apart.
 
-    Parameters
-    ----------
-    phase : (segments, n, nodes) float64
-        Phase errors [cycles] at :func:`record_places`.
-    matrix : (nodes, nodes) float64
-        :func:`to_modes`.
-    centre : (segments, n) float64
-        Result: shift of the line [bins of fs/L].
-    found : (segments, n, 2, >= nodes // 2) float64
-        Result: real and imaginary parts of the modes.
-    number : (segments, n) int64
-        Result: modes that count; 0 where half as many as there are nodes are too few.
+    ``phase`` (segments, n, nodes) [cycles] is at :func:`record_places`, ``matrix`` is
+    :func:`to_modes`. Results: ``centre`` (segments, n), shift of the line [bins of fs/L]; ``found``
+    (segments, n, 2, >= nodes // 2), real and imaginary parts of the modes; ``number`` (segments,
+    n), modes that count, 0 where half as many as there are nodes are too few.
     """
     nodes = matrix.shape[0]
     one, other = np.empty(nodes), np.empty(nodes)
@@ -361,20 +338,11 @@ def find_modes(phase, matrix, centre, found, number):
 def build(segment, numbers, parts, shapes, table, form):
     """Build a shape from its modes, or take it from a table that holds all bins.
 
-    Parameters
-    ----------
-    segment : int
-    numbers : (int, int)
-        The shape's number, and that of the one that stands in the results, or -1.
-    parts : tuple
-        Modes (segments, shapes, 2, modes) second, and third how many count (segments, shapes).
-    shapes : Shapes
-        Tables to build from, as a tuple.
-    table : (2, cells * columns) float64
-        Result: G, or |G|^2 in the first row.
-    form : (7, >= m) float64
-        Result: in rows 1 and 2 the most that |G| comes to from each of m distances on, and the
-        integral of its square; in the others A and B of DERIVATIVES + 2 terms.
+    ``numbers``: the shape's, and that of the one that stands in the results, or -1. ``parts``:
+    modes (segments, shapes, 2, modes) second, and third how many count (segments, shapes).
+    ``shapes``: tables to build from. Results: ``table`` (2, cells * columns), G, or |G|^2 in the
+    first row; ``form`` (7, >= m), in rows 1 and 2 the most that |G| comes to from each of m
+    distances on, and the integral of its square; in the others A and B of DERIVATIVES + 2 terms.
     """
     sizes, modes, edges, mode_ends, reach = shapes[0], shapes[1], shapes[2], shapes[3], shapes[4]
     which, before = numbers

@@ -64,20 +64,10 @@ for _n in range(1, MOST_NODES + 1):
 
 @lru_cache(maxsize=32)
 def node_limits(weights: tuple[float, ...], tolerances: tuple[float, ...]) -> np.ndarray:
-    """Largest pi h that J equivalent lines serve to each tolerance, from J = 1.
+    """Largest pi h that J equivalent lines serve to each tolerance, (tolerances, MOST_NODES + 1).
 
-    Parameters
-    ----------
-    weights
-        Of places evenly spaced from the middle of the band to its end, both included; their sum
-        is 1.
-    tolerances
-        Rising.
-
-    Returns
-    -------
-    (tolerances, MOST_NODES + 1) ndarray
-        With the tolerances themselves at J = 0.
+    From J = 1; the tolerances, rising, at J = 0. The weights, of sum 1, are those of places evenly
+    spaced from the middle of the band to its end, both included.
     """
     nodes, wanted = np.arange(1, MOST_NODES + 1), np.array(tolerances)[:, None]
     low, high = np.full((len(tolerances), nodes.size), -60.0), np.log(2.0 * nodes) + 0 * wanted
@@ -105,24 +95,19 @@ def place_lines(p, segment, footprint, row, sizes, room):
     """Lines of a segment: places and complex weights C_b, into rows PLACE, RE and IM.
 
     C_b is half the amplitude, with the receiver's gain and the phase in the record's middle, in a
-    spectrum whose noise is white.
+    spectrum whose noise is white. Returns the origin: the bin nearest to the beam's centre, -N/2 ..
+    N/2.
 
     Parameters
     ----------
     p : (COMMON + OWN segments,) float64
         The point (:meth:`sweep.model.preparation.Shots.point_table`).
-    segment : int
     footprint : (3 or 3 + segments, rows, beamlets) float64
         (R_b - R_0)/R_0, beta_b - beta_0, relative amplitude; phases [cycles] by segment.
     row : int
         The point's row there.
     sizes : (6,) int64
         Of :class:`sweep.model.line_shape.Shapes`.
-
-    Returns
-    -------
-    int
-        Origin: the bin nearest to the beam's centre, -N/2 .. N/2.
     """
     power, fft_size, length = sizes[4] != 0, sizes[0], sizes[1]
     own, start = COMMON + OWN * segment, p[7]
@@ -243,14 +228,10 @@ def relative_error(total, squares, n, power, window_sum, allowed, level):
     beam's profile. Amplitudes add as their phases have it: three times the root of their squares
     is exceeded by one random sum of 10^4, and lines in phase stay within a tenth of their sum.
 
-    Parameters
-    ----------
-    total, squares : float
-        :func:`survey`.
-    allowed, level : float
-        Error of a bin; threshold. Powers of bins at the threshold, or of half the largest there
-        can be where that is less, are as far off as makes this much of the bin: those of larger
-        bins may be further off, and in smaller ones nothing is decided.
+    ``total`` and ``squares`` are of :func:`survey`; ``allowed`` is the error of a bin, ``level``
+    the threshold. Powers of bins at the threshold, or of half the largest there can be where that
+    is less, are as far off as makes this much of the bin: those of larger bins may be further off,
+    and in smaller ones nothing is decided.
     """
     in_phase = math.sqrt(n)
     weight = total
@@ -282,17 +263,8 @@ def nodes_for(turn, tolerance, limits):
 def put_on_nodes(room, re_row, im_row, n, nodes, span, out_re, out_im):
     """Move n weights onto Chebyshev nodes ``middle`` +- ``half`` (``span``), if these are fewer.
 
-    Parameters
-    ----------
-    room : (rows, width) float64
-        Scratch; places in row PLACE, weights in rows ``re_row`` and ``im_row``.
-    out_re, out_im : int
-        Rows of the nodes' weights; row X then holds their places.
-
-    Returns
-    -------
-    int
-        Number of nodes, or n with the weights themselves.
+    Places are in row PLACE, weights in rows ``re_row`` and ``im_row``; the nodes' go to row X,
+    ``out_re`` and ``out_im``. Returns the number of nodes, or n with the weights themselves.
     """
     if nodes >= n or nodes > MOST_NODES:
         for b in range(n):

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -111,12 +110,9 @@ def receiver_noise(
     altogether, each one's own noise twice as much, and that of currents which go with the light,
     a quarter of the variance each, half as much.
     """
-    if any(value.ndim for value in values.values()):
-        noise = _noise(architecture, values)
-    else:
-        noise = _of_one(architecture, *(values[name].item() for name in NOISY))
+    noise = _noise(architecture, values)
     if not in_quadrature:
-        return noise._replace(sources=dict(noise.sources))
+        return noise
     sources = {
         name: value if name == "local_oscillator_shot" else 2 * value
         for name, value in noise.sources.items()
@@ -124,16 +120,8 @@ def receiver_noise(
     return ReceiverNoise(noise.per_ampere / 2, noise.per_watt, sources)
 
 
-@lru_cache(maxsize=64, typed=True)
-def _of_one(architecture: str, *values: float) -> ReceiverNoise:
-    given = {name: np.asarray(value) for name, value in zip(NOISY, values, strict=True)}
-    return _noise(architecture, given)
-
-
 def _noise(architecture: str, v: Mapping[str, np.ndarray]) -> ReceiverNoise:
-    bandwidth = electrical_bandwidth(
-        detector_bandwidth=v["detector_bandwidth"], amplifier_bandwidth=v["amplifier_bandwidth"]
-    )
+    bandwidth = electrical_bandwidth(v)
     light = {name: v[name] for name in ("apd_gain", "excess_noise_factor", "responsivity")}
     detector = (v["apd_gain"] * v["responsivity"] * v["noise_equivalent_power"]) ** 2 * bandwidth
     own = {"detector": detector, "amplifier": np.asarray(v["amplifier_noise_current"]) ** 2}
@@ -172,14 +160,12 @@ def transfer(
     return transimpedance / poles
 
 
-def electrical_bandwidth(
-    *, detector_bandwidth: np.ndarray, amplifier_bandwidth: np.ndarray
-) -> np.ndarray:
-    """Bandwidth B_e [Hz] over which noise is counted: the narrower of the two stages.
+def electrical_bandwidth(values: Mapping[str, np.ndarray], prefix: str = "") -> np.ndarray:
+    """Bandwidth B_e [Hz] over which noise is counted: the narrower of detector and amplifier.
 
     [T] states one figure for both and uses it as the noise bandwidth; so does this.
     """
-    return np.minimum(detector_bandwidth, amplifier_bandwidth)
+    return np.minimum(values[f"{prefix}detector_bandwidth"], values[f"{prefix}amplifier_bandwidth"])
 
 
 def noise_density(
@@ -209,8 +195,7 @@ def noise_density(
     total = np.where(alike, first - slope, apart)
     folded = np.arccos(np.clip(cosine, -1, 1)) * sample_rate / (2 * np.pi)
     direct = 1 / ((1 + (folded / one) ** 2) * (1 + (folded / other) ** 2))  # where all else rounds
-    both = electrical_bandwidth(detector_bandwidth=one, amplifier_bandwidth=other)
-    return np.asarray(np.maximum(total, direct) * sample_rate / (2 * both))
+    return np.asarray(np.maximum(total, direct) * sample_rate / (2 * np.minimum(one, other)))
 
 
 def _pole(a: np.ndarray, cosine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -55,31 +55,13 @@ class MarcumQ(NamedTuple):
 
 
 def marcum_q1(a: ArrayLike, b: ArrayLike) -> MarcumQ:
-    """First-order Marcum Q function and its complement [T 3.3].
+    """First-order Marcum Q function and its complement [T 3.3], of the broadcast shape.
 
-    Parameters
-    ----------
-    a : array_like
-        Signal magnitude over the noise per quadrature [1], >= 0. Broadcast against `b`.
-    b : array_like
-        Threshold over the noise per quadrature [1], >= 0.
-
-    Returns
-    -------
-    MarcumQ
-        Arrays of the broadcast shape. Relative error at most 2e-15 while they stay above
-        float64's smallest normal number.
-
-    Raises
-    ------
-    ValueError
-        An argument is negative or nan, or both are infinite, where no limit exists.
+    `a` and `b`, >= 0, are signal and threshold over the noise per quadrature; nan outside the
+    domain and where both are infinite. Relative error at most 2e-15 while results stay above
+    float64's smallest normal number.
     """
     a, b = np.broadcast_arrays(np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64))
-    if not (np.all(a >= 0.0) and np.all(b >= 0.0)):
-        raise ValueError("the Marcum Q function needs a >= 0 and b >= 0, and no nan")
-    if np.any(np.isinf(a) & np.isinf(b)):
-        raise ValueError("the Marcum Q function has no limit where both a and b are infinite")
     tails = np.empty((2, a.size))
     _each(a.ravel(), b.ravel(), tails)
     return MarcumQ(*tails.reshape(2, *a.shape))
@@ -180,58 +162,23 @@ def excess_crossing(a, b):
 
 
 def at_least_one(p: ArrayLike, n: ArrayLike) -> np.ndarray:
-    """Probability 1 - (1-p)^n of at least one success in n independent tries [T 3.7].
+    """Probability 1 - (1-p)^n of at least one success in n independent tries [T 3.7], 0..1.
 
-    Parameters
-    ----------
-    p : array_like
-        Probability of one try, 0..1. Broadcast against `n`.
-    n : array_like
-        Number of tries, >= 0; need not be whole (a mean number of independent bins).
-
-    Returns
-    -------
-    ndarray
-        Probability, 0..1, of the broadcast shape; relative error at most 1e-15.
-
-    Raises
-    ------
-    ValueError
-        `p` is outside 0..1 or nan, or `n` is negative, infinite or nan.
+    `n` >= 0 need not be whole (a mean number of independent bins). Relative error at most 1e-15.
     """
-    p, n = np.asarray(p, float), _tries(n)
-    if not np.all((p >= 0.0) & (p <= 1.0)):
-        raise ValueError("a probability lies within 0..1")
+    p, n = np.asarray(p, float), np.asarray(n, float)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(n > 0.0, -np.expm1(n * np.log1p(-p)), 0.0)
 
 
 def log_at_least_one(log_p: ArrayLike, n: ArrayLike) -> np.ndarray:
-    """Natural logarithm of 1 - (1-p)^n, from ln p.
+    """Natural logarithm of 1 - (1-p)^n, from ln p <= 0 and n, 0..1e240; -inf where p or n is 0.
 
-    Parameters
-    ----------
-    log_p : array_like
-        ln p <= 0; -inf is p = 0. Broadcast against `n`. Divide by ln 10 for decades.
-    n : array_like
-        Number of tries, 0..1e240; need not be whole.
-
-    Returns
-    -------
-    ndarray
-        ln(1 - (1-p)^n) <= 0, of the broadcast shape; -inf where p or n is 0. Relative error at
-        most 1e-15 while n p < 1, at any ln p. Near certainty the result is minus the chance
-        (1-p)^n of none; the rounding of ln p alone moves that by up to n p / (1-p) parts in
-        1e16, and the error stays within 2 + n p / (1-p) parts in 2e15.
-
-    Raises
-    ------
-    ValueError
-        `log_p` is positive or nan, or `n` is negative, infinite or nan.
+    Relative error at most 1e-15 while n p < 1, at any ln p. Near certainty the result is minus the
+    chance (1-p)^n of none; the rounding of ln p alone moves that by up to n p / (1-p) parts in
+    1e16, and the error stays within 2 + n p / (1-p) parts in 2e15.
     """
-    log_p, n = np.asarray(log_p, float), _tries(n)
-    if not np.all(log_p <= 0.0):
-        raise ValueError("the logarithm of a probability is at most 0")
+    log_p, n = np.asarray(log_p, float), np.asarray(n, float)
     with np.errstate(divide="ignore", invalid="ignore", under="ignore"):
         none, likely = -np.expm1(log_p), log_p > -_LN2
         exponent = n * np.where(likely, np.log(none), np.log1p(-np.exp(log_p)))
@@ -251,11 +198,3 @@ def log_any(log_p: np.ndarray, log_q: np.ndarray) -> np.ndarray:
     """
     with np.errstate(divide="ignore"):
         return np.minimum(np.logaddexp(log_p, log_q + np.log(-np.expm1(log_p))), 0.0)
-
-
-def _tries(n: ArrayLike) -> np.ndarray:
-    """Numbers of tries as float64; refuses impossible ones."""
-    n = np.asarray(n, float)
-    if not np.all((n >= 0.0) & np.isfinite(n)):
-        raise ValueError("the number of tries is finite and not negative")
-    return n

@@ -5,15 +5,11 @@ and a point of the ground, ``R u``. Weighted least squares over the beams that r
 velocity; a plane through the ground points gives the altitude. Standard errors are those of
 single beams, uncorrelated; covariances follow by linear propagation.
 
-The instrument does not know which of its points are true. Of each shot it takes the first that a
-Doppler peak confirms (:mod:`sweep.model.pairing`), which is the strongest of these, and nothing
-of a shot without one: range and velocity of an unconfirmed point may be exchanged, in which case
-neither is of use. False alarms that pass as confirmed, mispaired and misread points are used as
-if they were true; the test for one false beam is there to find them.
-
-Values are the interpolated ones with their standard errors. A point whose standard error is not a
-number is left out; one under a millionth of a bin counts as that, to which the interpolation
-itself is good.
+The instrument does not know which of its points are true. Of each shot it takes the first, and
+strongest, that a Doppler peak confirms (:mod:`sweep.model.pairing`). False alarms that pass as
+confirmed, mispaired and misread points are used as if they were true; the test for one false beam
+is there to find them. A point whose standard error is not a number is left out; one under a
+millionth of a bin counts as that, to which the interpolation itself is good.
 
 The instrument is taken to know, from inertial sensors, how it is turned and how its place and
 velocity have changed within a cycle: so the altitude is that at the cycle's first shot, over the
@@ -24,20 +20,18 @@ each of the two angles across it adds sigma |v_perp| to the standard error of it
 v_perp the velocity across it (by a first solution without jitter), and sigma R tan(angle from
 nadir) to that of its range, on level ground.
 
-Of the floor of its errors (:mod:`sweep.model.error_floor`) it knows the standard deviations too,
-which stand in those of the points. Those of pointing and vibration are independent from beam to
-beam: they weigh, and they show in the residuals. Clock and wavelength scale all beams alike, which
-no residual shows: they are taken out of the weights, and of a relative error of s the solution's
-covariance has s^2 v v^T more, the altitude's variance s^2 h^2. The altitude is that of the points
-where pointing has put them, and its variance counts the pointing as it counts jitter.
+Of the floor of its errors (:mod:`sweep.model.error_floor`) it knows the standard deviations too.
+Those of pointing and vibration are independent from beam to beam: they weigh, and they show in the
+residuals. Clock and wavelength scale all beams alike, which no residual shows: they are taken out
+of the weights, and of a relative error of s the solution's covariance has s^2 v v^T more, the
+altitude's variance s^2 h^2. The altitude is that of the points where pointing has put them, and its
+variance counts the pointing as it counts jitter.
 """
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from scipy.special import chdtri
 
 from sweep.model.error_floor import NO_FLOOR, ErrorFloor
@@ -51,15 +45,10 @@ LEAST_SINE = 0.05
 """A beam that grazes the ground at less than about 3 deg is weighted as if at that angle."""
 
 _LARGEST_CONDITION = 1e6
-"""Condition number above which beams count as lying in a plane: it only refuses what rounding
-would spoil; the covariance tells a weak geometry."""
+"""Condition number above which beams count as in a plane; covariances tell weak geometries."""
 
 _INTERPOLATION = 1e-6
 """Least error of a place between bins, over that of a place by whole bins."""
-
-_ORTHOGONAL = 1e-15
-_MOST_SWEEPS = 40
-"""Some 5 are needed; a sweep that rounding keeps alive must end."""
 
 SOLVED = 0
 """All valid beams are in the solution."""
@@ -121,12 +110,6 @@ def velocity(
     level : float or None
         Level of the test for one false beam (:func:`_screened`), which needs
         five beams to find it; with four it withholds the solution. None: no test.
-
-    Raises
-    ------
-    ValueError
-        Shapes do not fit; a valid beam has no positive standard error or a direction whose length
-        is not 1; `level` is out of range.
     """
     u, closing, error, shape = _flat_cycles(direction, radial_velocity, standard_error)
 
@@ -166,10 +149,8 @@ def altitude(
 
     Parameters
     ----------
-    direction : (..., b, 3) array_like
-        Unit vectors from the instrument, z up.
-    range, standard_error : (..., b) array_like
-        Range along each beam, not finite where it has not returned, and its standard error [m].
+    direction, range, standard_error, level
+        As of :func:`velocity`, z up [m].
     slope : float
         Standard deviation of the ground's slope along any horizontal [1], >= 0, finite.
     offset : (..., b, 3) array_like or None
@@ -177,16 +158,7 @@ def altitude(
     relief : float
         Standard deviation of heights about the plane [m], which adds to the errors of range. Real
         ground fails the test for a false beam without it.
-    level : float or None
-        Level of the test for one false beam (:func:`_screened`); None: no test.
-
-    Raises
-    ------
-    ValueError
-        As for :func:`velocity`; `slope` or `relief` is negative or not finite.
     """
-    if not (0 <= slope < math.inf and 0 <= relief < math.inf):
-        raise ValueError("the ground's slope and relief are finite and not negative")
     u, distance, error, shape = _flat_cycles(direction, range, standard_error)
     points = u * distance[..., None]
     if offset is not None:
@@ -213,19 +185,18 @@ def _plane(
 ) -> Fit:  # fmt: skip
     """Altitudes, variances, chi-squares and gradients of planes through n cycles' ground points.
 
-    The plane is z = -altitude + gradient . (x, y) with the platform at the zero. Heights are
-    fitted at the points' measured places. An error of range moves a point off the plane by
-    the error times ``gradient . (u_x, u_y) - u_z``, so the weights need a gradient beforehand.
-
-    About the weighted centre of the points, height and slopes do not correlate. Slopes known
-    beforehand are two more observations of 0. Points and beams are (3, b, n), gradients (2, n).
+    The plane is z = -altitude + gradient . (x, y) with the platform at the zero. An error of range
+    moves a point off the plane by the error times ``gradient . (u_x, u_y) - u_z``, so the weights
+    need a gradient beforehand. Slopes known beforehand are two more observations of 0. Points and
+    beams are (3, b, n), gradients (2, n).
     """
     b, n = used.shape
     sine = gradient[0] * beams[0] + gradient[1] * beams[1] - beams[2]
     moved = errors * np.maximum(sine, LEAST_SINE)
     weight = np.where(used, 1.0 / np.hypot(moved, relief), 0.0)
-    total = sum(weight**2)  # one beam after the other: NumPy's order would go by n
-    centre = sum((points * (weight**2 / total)).swapaxes(0, 1))
+    total = np.asarray(sum(weight**2))  # one beam after the other: NumPy's order would go by n
+    share = weight**2 / np.where(total > 0, total, 1.0)
+    centre = np.asarray(sum((points * share).swapaxes(0, 1)))
     apart = weight * (points - centre[:, None])
     residual = np.zeros((n, b + 2))
     residual[:, :b] = apart[2].T
@@ -249,16 +220,9 @@ def _flat_cycles(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[int, ...]]:
     """Directions (n, b, 3), values and errors (n, b), and the shape that n stands for."""
     u, value, error = (np.asarray(a, float) for a in (direction, value, standard_error))
-    if u.shape[-1:] != (3,):
-        raise ValueError(f"directions have three components: (..., b, 3), not {u.shape}")
     shape = np.broadcast_shapes(u.shape[:-1], value.shape, error.shape)
     u = np.broadcast_to(u, (*shape, 3)).reshape(-1, shape[-1], 3)
     value, error = (np.broadcast_to(a, shape).reshape(-1, shape[-1]) for a in (value, error))
-    valid = np.isfinite(value)
-    if not (np.isfinite(error[valid]) & (error[valid] > 0)).all():
-        raise ValueError("a valid beam has a standard error that is not positive and finite")
-    if not (np.abs(np.linalg.norm(u[valid], axis=-1) - 1) < 1e-6).all():
-        raise ValueError("a valid beam has a direction whose length is not 1")
     return u, value, error, shape[:-1]
 
 
@@ -268,59 +232,18 @@ def _least_squares(
     """Right singular vectors (n, m, m), squares of singular values and coordinates (n, m).
 
     The unknowns of problem i are ``turn[i] @ coordinate[i]``; `residual` (n, b) becomes what they
-    leave, and columns (n, b, m) are turned until they are orthogonal.
+    leave of itself by columns (n, b, m). Normal equations would square the condition number.
     """
-    n, _, m = columns.shape
-    turn, square, coordinate = np.empty((n, m, m)), np.empty((n, m)), np.empty((n, m))
-    _orthogonalise(columns, residual, turn, square, coordinate)
-    return turn, square, coordinate
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _orthogonalise(every, residuals, turns, squares, coordinates):
-    """Least squares by Jacobi's rotations, as of :func:`_least_squares`.
-
-    This gives the singular values of even a nearly degenerate geometry to full relative accuracy;
-    normal equations would square its condition number.
-    """
-    n, b, m = every.shape
-    for i in range(n):
-        columns, turn, residual = every[i], turns[i], residuals[i]
-        for p in range(m):
-            for q in range(m):
-                turn[p, q] = 1.0 if p == q else 0.0
-        done = False
-        for _ in range(_MOST_SWEEPS):
-            if done:
-                break
-            done = True
-            for pair in range(m * (m - 1) // 2):  # first and second, first and third, the others
-                p, q = (0, pair + 1) if pair < m - 1 else (1, 2)
-                alpha = beta = gamma = 0.0
-                for j in range(b):
-                    alpha += columns[j, p] * columns[j, p]
-                    beta += columns[j, q] * columns[j, q]
-                    gamma += columns[j, p] * columns[j, q]
-                if abs(gamma) <= _ORTHOGONAL * math.sqrt(alpha) * math.sqrt(beta):
-                    continue
-                done = False
-                zeta = (beta - alpha) / (2.0 * gamma)
-                tangent = math.copysign(1.0 / (abs(zeta) + math.hypot(1.0, zeta)), zeta)
-                cosine = 1.0 / math.hypot(1.0, tangent)
-                sine = cosine * tangent
-                for matrix in (columns, turn):
-                    for j in range(matrix.shape[0]):
-                        x, y = matrix[j, p], matrix[j, q]
-                        matrix[j, p], matrix[j, q] = cosine * x - sine * y, sine * x + cosine * y
-        for k in range(m):
-            square = coordinate = 0.0
-            for j in range(b):
-                square += columns[j, k] * columns[j, k]
-            for j in range(b):
-                coordinate += columns[j, k] * residual[j] / square
-            for j in range(b):
-                residual[j] -= coordinate * columns[j, k]
-            squares[i, k], coordinates[i, k] = square, coordinate
+    n, b, m = columns.shape
+    wide = np.pad(columns, ((0, 0), (0, max(m - b, 0)), (0, 0)))
+    left, size, right = np.linalg.svd(wide, full_matrices=False)
+    coordinate = np.empty((n, m))
+    for k in range(m):
+        each = left[:, :b, k]
+        along = np.asarray(sum((each * residual).T))  # one beam after the other, as above
+        residual -= along[:, None] * each
+        coordinate[:, k] = along / size[:, k]
+    return right.mT, size**2, coordinate
 
 
 def _screened(
@@ -329,33 +252,19 @@ def _screened(
 ) -> Solution:  # fmt: skip
     """Solutions of n cycles of b beams, with a beam that contradicts the others left out.
 
-    A cycle is suspect where its chi-square exceeds the value that it exceeds with probability
-    `level` when all beams are true. Then each beam is left out in turn. Where exactly one such
-    fit passes the same test, that beam is false and that fit is the solution. Where several do,
-    the false one can not be told and the solution is withheld, as where none does (two false
-    beams, or a true one past the test). With one degree of freedom, as for the velocity from
-    four beams, every exclusion leaves an exact fit: a false alarm can be noticed there but
-    never found.
+    A cycle is suspect where its chi-square is larger than it is with probability `level` when all
+    beams are true. Then each beam is left out in turn: where exactly one such fit passes the same
+    test, that beam is false and that fit is the solution; else the solution is withheld. With one
+    degree of freedom every exclusion leaves an exact fit: a false alarm is noticed, never found.
 
-    Parameters
-    ----------
-    fit : callable
-        Fit of the cycles of index (k,) by the beams of a mask (k, b); a chi-square of nan without
-        a solution.
-    valid : (n, b) bool ndarray
-        Beams that returned anything.
-    level : float or None
-        Probability that a cycle of true beams is suspect, 0 < . < 1; None: no test.
-    shape : tuple of int
-        Dimensions that n stands for.
+    `fit` takes the cycles' index (k,) and a mask of beams (k, b); its chi-square is nan without a
+    solution. `valid` (n, b) beams have returned; n stands for `shape`.
     """
     used, b = valid.copy(), valid.shape[1]
     fitted = fit(np.arange(len(valid)), used)
     value, covariance, chi, degrees = fitted
     status = np.where(np.isnan(chi), UNDETERMINED, SOLVED).astype(np.int8)
     if level is not None:
-        if not 0 < level < 1:
-            raise ValueError(f"the test's level lies between 0 and 1, not {level}")
         most = np.concatenate([[np.inf], chdtri(np.arange(1, b + 1), level)])
         suspect = np.flatnonzero(chi > most[degrees])
         passes = np.zeros((suspect.size, b), bool)
@@ -396,10 +305,8 @@ def solve(
         the floor has an error of pointing.
     shots_a_cycle : int
         Shots of a cycle, in the order of the arrays; n is a multiple of it.
-    ground_slope, relief : float
-        Of :func:`altitude` [1], [m].
-    test_level : float or None
-        Level of the test for one false beam, of :func:`velocity`; None or 0: no test.
+    ground_slope, relief, test_level
+        Of :func:`altitude` [1], [m]; None or 0: no test.
     jitter : float
         Standard deviation of the pointing jitter, of each angle [rad].
     floor : ErrorFloor
@@ -411,15 +318,8 @@ def solve(
     dict of ndarray
         By the names, units and types of :data:`sweep.model.outputs.NAVIGATION`, (cycles,
         draws[, 3[, 3]]); the numbers of beams are 0 where there is no solution.
-
-    Raises
-    ------
-    ValueError
-        n is no multiple of `shots_a_cycle`; a level, slope or relief is out of range.
     """
     n, draws = points["flags"].shape[:2]
-    if shots_a_cycle < 1 or n % shots_a_cycle:
-        raise ValueError(f"{n} shots are not whole cycles of {shots_a_cycle}")
     cycles = n // shots_a_cycle
     room = {"cycle": cycles, "draw": draws, "xyz": 3, "xyz_again": 3}
     results = {name: output.empty(room) for name, output in NAVIGATION.items()}
@@ -445,10 +345,9 @@ def solve(
 
 
 def _beams(points: Arrays, part: slice, each: int, floor: ErrorFloor) -> dict[str, np.ndarray]:
-    """Values and standard errors of trusted points, (cycles, draws, each); nan without one.
+    """Values and errors of trusted points, (cycles, draws, each), nan without one; positions too.
 
-    Standard errors without what all beams have in common. Positions, (..., 3), where pointing has
-    an error.
+    The errors are without what all beams have in common.
     """
     flags = points["flags"][part]
     pairs: dict[str, np.ndarray] = {}
@@ -514,10 +413,7 @@ def _solved(
 def _jittered(
     direction: np.ndarray, beams: Arrays, jitter: float, pointing: float
 ) -> dict[str, np.ndarray]:
-    """Add the pointing's error to the standard errors of beams, (cycles, draws, each).
-
-    Those of velocities already include `pointing`, the error floor's.
-    """
+    """Add the pointing's error to standard errors (cycles, draws, each); velocities have it."""
     closing, error = beams["radial_velocity"], beams["radial_velocity_standard_error"]
     first = velocity(
         direction=direction[:, None], radial_velocity=closing, standard_error=error

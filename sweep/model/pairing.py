@@ -76,20 +76,10 @@ _reading = njit(cache=True, error_model="numpy")(reading)
 def pair_peaks(up, doppler, down, at_start, fft_size, signed, tolerance, pairs):
     """Pairs of peaks, one to one: confirmed ones first, in the order of the up peaks.
 
-    Parameters
-    ----------
-    up, doppler, down : (any,) float64
-        Positions of the peaks [bins], strongest first.
-    at_start, fft_size, signed, tolerance
-        As of :func:`confirm`; N; whether peaks have signs; mismatch [bins] up to which a Doppler
-        peak confirms a pair.
-    pairs : (>= min(ups, downs), 4) int64
-        Result: index of up, Doppler (-1 where unconfirmed) and down peak, and reading.
-
-    Returns
-    -------
-    confirmed, number : int
-        Confirmed pairs; all pairs.
+    Peaks are positions [bins], strongest first, with signs if ``signed``; the rest as of
+    :func:`confirm`. ``pairs`` (>= min(ups, downs), 4) int64 takes the index of up, Doppler (-1
+    where unconfirmed) and down peak, and the reading. Returns the numbers of confirmed pairs, and
+    of all.
     """
     cost, via = np.empty((up.size, down.size)), np.empty((up.size, down.size, 2), np.int64)
     for i in range(up.size):
@@ -131,13 +121,8 @@ def confirm(up, doppler, down, at_start, fft_size, signed, tolerance):
     """Doppler peak and reading of an up and a down peak that fit best, within a tolerance [bins].
 
     ``at_start`` is the Doppler segment's carrier over that at mid-chirp, which the chirps see.
-
-    Returns
-    -------
-    cost : float
-        Mismatch and penalties [bins]; inf where none comes within the tolerance.
-    peak, code : int
-        The Doppler peak and the reading; -1 for none.
+    Returns mismatch and penalties [bins], inf where none comes within the tolerance; the Doppler
+    peak and the reading, -1 for none.
     """
     least, peak, best = np.inf, -1, -1
     for k in range(doppler.size):
@@ -197,14 +182,9 @@ def _match(cost):
 def judge(group, centres, bins, lines, amplitude):
     """Flag of a return, but for its reading; and the beamlet next to its peaks that all hold.
 
-    Parameters
-    ----------
-    group, centres : (3,)
-        Groups and positions [bins] of the peaks of the three segments.
-    bins : (3, 3, most) int64
-        As of :class:`sweep.model.returns.Known`, at one point; and so are the last two.
-    lines, amplitude : (3, beamlets), (beamlets,)
-        Beamlets of amplitude 0 do not count.
+    ``group`` and ``centres`` (3,) are groups and positions [bins] of the peaks of the segments; the
+    rest as of :class:`sweep.model.returns.Known`, at one point. Beamlets of amplitude 0 do not
+    count.
     """
     if group[0] == FALSE or group[1] == FALSE or group[2] == FALSE:
         return FALSE_ALARM, -1

@@ -78,15 +78,9 @@ def ray_error(
     That of the probabilities of detection, summed over the segments, or that of a peak's magnitude
     relative to itself, or to sigma where that is larger: whichever is most.
 
-    Parameters
-    ----------
-    shots : Shots
-        n shots whose powers add.
-    footprints : Footprints
-        What their rays have hit: a hexagonal lattice of whole shells. All of it is looked at, even
-        where the effect of its spread on the lines is left out.
-    bins, magnitude : (n, 3) ndarray
-        Bin of each segment's peak, -1 or nan for none, and |X| there.
+    Powers of the shots add. The footprints are what their rays have hit, a hexagonal lattice of
+    whole shells, all of it even where the effect of its spread on the lines is left out. `bins` and
+    `magnitude` (n, 3) are each segment's peak, -1 or nan for none, and |X| there.
     """
     threshold, deviation = shots.threshold, shots.line_deviation
     change, largest = np.zeros((2, shots.size))
@@ -185,15 +179,10 @@ def folded(number: int) -> Rule:
 def _smooth(offsets: np.ndarray, share: np.ndarray, degree: int) -> np.ndarray:
     """Even polynomials up to a degree, orthonormal, (k, h)."""
     x, y = offsets
-    found: list[np.ndarray] = []
-    for total in range(0, degree + 1, 2):
-        for power in range(total + 1):
-            rest = x ** (total - power) * y**power
-            for _ in range(2):  # once more takes off what rounding has left
-                for other in found:
-                    rest = rest - (share * other * rest).sum() * other
-            found.append(rest / math.sqrt((share * rest * rest).sum()))
-    return np.array(found)
+    powers = [(total - k, k) for total in range(0, degree + 1, 2) for k in range(total + 1)]
+    root = np.sqrt(share)
+    orthogonal, _ = np.linalg.qr(np.stack([root * x**i * y**k for i, k in powers], axis=1))
+    return np.ascontiguousarray(orthogonal.T / root)
 
 
 @lru_cache(maxsize=32)

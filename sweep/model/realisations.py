@@ -57,14 +57,8 @@ def realise(
 ) -> Iterator[Stretch]:
     """Shots of every draw of n points on a flat plane.
 
-    Parameters
-    ----------
-    parameters, effects
-        As of :func:`sweep.model.shot.prepare`.
-    keys : (n, 2) uint64
-        Random key of each point.
-    first_draw, draws : int
-        Number of the first draw, number of draws.
+    Parameters as of :func:`sweep.model.shot.prepare`; `keys` (n, 2) are the points' random keys.
+    Any stretch of draws, from `first_draw` on, can be had alone.
     """
     everything = DEFAULTS | dict(parameters)
     # So that there are n points even where they differ in nothing.

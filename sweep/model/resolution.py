@@ -92,11 +92,8 @@ _FLOOR = 1e-10
 """Error of even steps, for what lies beyond their reach."""
 _SAMPLES, _LAGS = 1024, 4096
 _CURVES = np.geomspace(1e-6, 100.0, 97)
-_CURVED_LAGS, _CURVED_TURNS, _RATIOS = (
-    512,
-    np.geomspace(1e-6, 1e3, 512),
-    np.geomspace(1e-6, 1e3, 97),
-)
+_CURVED_LAGS, _CURVED_TURNS = 512, np.geomspace(1e-6, 1e3, 512)
+_RATIOS = np.geomspace(1e-6, 1e3, 97)
 _CHEBYSHEV = np.array([1.4, 1.8, 2.5, 4.0, 8.0])[:, None]
 
 
@@ -122,14 +119,10 @@ class Spread(NamedTuple):
 def resolved_categories(
     parameters: Parameters, effects: Collection[str], further: Collection[str] = ()
 ) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
-    """Points by category, their beamlets counted where that is left to the tolerance.
+    """Points by category, as of :func:`sweep.model.preparation.categories`, with beamlets counted.
 
-    Parameters
-    ----------
-    parameters, further
-        As of :func:`sweep.model.preparation.categories`, whose result this is like.
-    effects : collection of str
-        Names of the effects that are simulated; without a footprint one beamlet is all.
+    They are counted where their number is left to the tolerance; without the effect of a footprint
+    one beamlet is all.
     """
     for index, p in categories(parameters, further):
         if int(p[BEAMLETS]) > 0:
@@ -154,15 +147,7 @@ def finest(words: Mapping[str, Any]) -> tuple[int, str]:
 
 
 def rays_needed(words: Mapping[str, Any], accuracy: Accuracy) -> int:
-    """Rays that every shot of a flight has that leaves their number to the tolerance.
-
-    Parameters
-    ----------
-    words : mapping
-        Phases and pattern of the footprint, architecture of the receiver.
-    accuracy : Accuracy
-        Of the study.
-    """
+    """Rays that every shot of a flight has that leaves their number to the tolerance."""
     if not is_open(words):
         return accuracy.thesis_beamlets
     tolerance = float(np.asarray(accuracy.tolerance))
@@ -172,15 +157,9 @@ def rays_needed(words: Mapping[str, Any], accuracy: Accuracy) -> int:
 def more_rays(rays: int, error: np.ndarray, accuracy: Accuracy) -> np.ndarray:
     """Rays that shots are to be cast with again, (n,) int64; 0 where they have enough.
 
-    Parameters
-    ----------
-    rays : int
-        One of `accuracy.rays`, which shots have had.
-    error : (n,) ndarray
-        What these leave (:func:`sweep.model.ray_error.ray_error`), which falls about as one over
-        their number; nan where nothing is seen.
-    accuracy : Accuracy
-        Of the study.
+    They have had `rays`, one of `accuracy.rays`, which leave `error` (n,)
+    (:func:`sweep.model.ray_error.ray_error`), falling about as one over their number; nan where
+    nothing is seen.
     """
     further = np.array([n for n in accuracy.rays if n > _LEAST_STEP * rays], np.int64)
     over = np.asarray(error, float) / accuracy.for_rays
@@ -217,15 +196,11 @@ def beamlets_needed(
     """
     per_power, accuracy = _pd_for_power(p) + np.zeros(size), Accuracy.of(p)
     allowed = accuracy.for_beamlets / per_power
-    lines, number, error = nodes_needed(
-        _window(p), _spread(p, size, accuracy.most_beamlets), allowed, accuracy
-    )
-    several = np.char.add(lines.astype(str), " lines")
-    return (
-        lines * number,
-        np.where(lines == 1, "line", several),
-        np.minimum(error * per_power, 1.0),
-    )
+    name = canonical_name(str(p[PROCESSING + "window"]))
+    spread = _spread(p, size, accuracy.most_beamlets)
+    lines, number, error = nodes_needed(name, spread, allowed, accuracy)
+    pattern = np.where(lines == 1, "line", np.char.add(lines.astype(str), " lines"))
+    return lines * number, pattern, np.minimum(error * per_power, 1.0)
 
 
 def _pd_for_power(p: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -255,11 +230,9 @@ def _spread(p: Mapping[str, np.ndarray], size: int, most: int) -> Spread:
     rms = np.where(np.isfinite(ranges.rms), ranges.rms, slope)
     slopes = 2 / SPEED_OF_LIGHT * np.asarray(rate, float) * (1 + np.abs(doppler_ratio(along)))
     per_range = slopes * p["target.range"] / bins
+    carrier = SPEED_OF_LIGHT / p[LASER + "wavelength"] + p[CHIRP + "bandwidth"]
     per_speed = velocity_to_bins(
-        range=p["target.range"],
-        carrier=SPEED_OF_LIGHT / p[LASER + "wavelength"] + p[CHIRP + "bandwidth"],
-        chirp_rate=rate,
-        bin_width=bins,
+        range=p["target.range"], carrier=carrier, chirp_rate=rate, bin_width=bins
     )
     signs, nothing = np.array([[1.0], [0.0], [-1.0]]), np.zeros(size)  # of ranges in the beats
     spread = Spread(
@@ -276,15 +249,10 @@ def _spread(p: Mapping[str, np.ndarray], size: int, most: int) -> Spread:
         duration=p[CHIRP + "duration"], gap=p[waveform.GAP],
     )  # fmt: skip
     later = 2 * np.maximum.reduce(starts) * bins
-    slope, curve = (
-        np.vstack([rows, later * rows[1]]) for rows in (spread.slope, spread.curve)
-    )  # by twice as much, as sums over records hardly look at their ends
+    # by twice as much, as sums over records hardly look at their ends
+    slope, curve = (np.vstack([rows, later * rows[1]]) for rows in (spread.slope, spread.curve))
     moved = later * per_speed * velocities.rms + nothing
     return Spread(np.maximum(spread.deviation, moved), slope, curve)
-
-
-def _window(p: Mapping[str, np.ndarray]) -> str:
-    return canonical_name(str(p[PROCESSING + "window"]))
 
 
 def nodes_needed(
@@ -292,25 +260,9 @@ def nodes_needed(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Nodes with which the largest bin's power is within a tolerance, or as near as any are.
 
-    Parameters
-    ----------
-    window_name : str
-        Canonical name of the record's window.
-    spread : Spread
-        Of n points.
-    tolerance : (n,) ndarray
-        On the largest bin's power, over that power itself, wherever the lines lie.
-    accuracy : Accuracy
-        Says how many nodes all lines together may have, and when several lines are tried.
-
-    Returns
-    -------
-    lines : (n,) int64 ndarray
-        Parallel lines of nodes, 1 for most points.
-    number : (n,) int64 ndarray
-        Nodes of each line, 2 at least.
-    error : (n,) ndarray
-        What they may be off by; 1 where they say nothing.
+    The tolerance (n,) is on the largest bin's power, over that power itself, wherever the lines
+    lie. Returns, (n,) each: parallel lines of nodes, 1 for most points; nodes of each line, 2 at
+    least; what they may be off by, 1 where they say nothing.
     """
     spreads, errors, least = _errors(window_name)
     place = np.searchsorted(spreads, spread.deviation)  # of the next wider spread

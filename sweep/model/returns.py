@@ -6,13 +6,9 @@ bins and interpolated between them.
 
 The two ways to draw are those of :mod:`sweep.model.draws`, with the same random numbers: the
 strongest group is detected, and a false alarm raised, in the very draws that are counted there.
-
-- ``probabilities``: a uniform number against the pd of each group, one against the probability of
-  a false alarm (noise and leakage). Peaks stay in their noiseless bins; the interpolated position
-  has a normal error of the standard error that is reported.
-- ``noise``: complex Gaussian noise in all bins of each group's echo (of ``peak_bin`` in the
-  strongest and its two neighbours), alike as the window makes it, so that another may be the
-  largest, and in the bins of leaked signal; the largest of all other bins by its order statistic.
+Against ``probabilities`` peaks stay in their noiseless bins, and the interpolated position has a
+normal error of the standard error that is reported. ``noise`` is added to ``peak_bin`` and its two
+neighbours, so that another may be the largest, or to all bins of a group's echo.
 
 Ranges and velocities are those at the shot's start, the instant of the truth. What range walk moves
 the interpolated range by, v_r (T_w + 2 t_0), and what motion between segments moves both by, is put
@@ -23,11 +19,9 @@ segments, which share what their speckles do; against probabilities the down seg
 follows from the up segment's draw, and a detected peak's power is drawn for each segment alone.
 
 Standard errors are those of noise and, in quadrature, what the lines in a group make by their
-spread, of which the instrument is taken to know the size (:func:`interpolation.spread_error`).
-
-A segment and draw has one false peak at most, the largest; it is placed uniformly over bins
-1..N/2 outside the listed groups (a leaking bin in its own place). Groups beyond the ``most``
-strongest are neither detected nor false alarms.
+spread (:func:`interpolation.spread_error`). A segment and draw has one false peak at most, the
+largest, placed uniformly over bins 1..N/2 outside the listed groups (a leaking bin in its own
+place). Groups beyond the ``most`` strongest are neither detected nor false alarms.
 """
 
 import math
@@ -42,14 +36,13 @@ from sweep.model.detection import echo_of, is_end
 from sweep.model.draws import (
     ECHO,
     Seen,
+    down_given_up,
     draw_noise,
     echo_filter,
     faded_ratio,
     fading_factors,
-    is_noisy,
     largest_of,
     noise_levels,
-    require_one_record,
     seen_spectra,
 )
 from sweep.model.groups import BIN, FIRST, LAST, Groups
@@ -120,25 +113,16 @@ def draw_returns(
 
     Parameters
     ----------
-    shots : Shots
-        n prepared points.
-    found : Groups
-        Groups in their spectra, by :func:`groups`.
+    shots, found
+        n prepared points, and the groups in their spectra, by :func:`groups`.
     keys : (n, 2) uint64
         Random key of each.
     first_draw, draws : int
         Number of the first draw, number of draws; any range of draws can be computed alone.
     method : str
         ``probabilities`` or ``noise``.
-
-    Raises
-    ------
-    ValueError
-        `method` is neither of the two.
     """
-    noisy = is_noisy(method)
-    if noisy:
-        require_one_record(shots)
+    noisy = method == "noise"
     n, _, most = found.bin.shape
     drawn = Drawn(
         np.full((n, draws, most, 2, 4), np.nan), np.full((n, draws, most), -1),
@@ -264,10 +248,7 @@ def _beside(shots: Shots, found: Groups) -> np.ndarray:
     """Chances of groups in the down segment, as of :class:`Known`."""
     up, down = found.pd[:, 0], found.pd[:, 2]
     both = shots.both(up.T, down.T, (found.magnitude[:, 0].T, found.magnitude[:, 2].T)).T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        detected = np.where(up > 0, np.minimum(both / up, 1.0), down)
-        missed = np.where(up < 1, np.clip((down - both) / (1 - up), 0.0, 1.0), down)
-    return np.stack([missed, detected], axis=1)
+    return np.ascontiguousarray(np.moveaxis(down_given_up(up, down, both), 0, 1))
 
 
 def beamlet_lines(shots: Shots) -> np.ndarray:
@@ -391,21 +372,14 @@ def draw_peaks(address, at, how, known, seen, tables, peaks, which, up):
 
     Parameters
     ----------
-    address : (uint64, uint64, int)
-        Key of the point, number of the draw.
-    at : (int, int)
-        Point and segment.
+    address, at
+        Key of the point and number of the draw; point and segment.
     how, known, seen, tables
         :class:`How`, :class:`Known`, :class:`sweep.model.draws.Seen`, and the interpolator.
     peaks, which : (most + 1, 4) float64, (most + 1,) int64
-        Result: peaks by their fields, and their groups.
+        Result: peaks by their fields, and their groups; their number is returned.
     up : (most,) bool
         Groups that are detected in the up segment, which comes first.
-
-    Returns
-    -------
-    int
-        Number of peaks.
     """
     (a, b, draw), (i, s) = address, at
     sigma, beta, under_lines = known.levels[i]

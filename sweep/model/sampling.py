@@ -28,7 +28,7 @@ import numpy as np
 
 from sweep.model import waveform
 from sweep.model.accuracy import COUNTED, Accuracy, bounded_mean, half_width
-from sweep.model.draws import Rows, count_by_chance, count_in_noise, is_noisy
+from sweep.model.draws import Rows, count_by_chance, count_in_noise
 from sweep.model.estimators import DEFAULTS
 from sweep.model.noisy_spectra import VALUES, Methods, View, counted, view_of
 from sweep.model.outputs import DRAW_OUTPUTS, KEPT, PROMISED, RUNNING
@@ -281,7 +281,7 @@ class Sample(Drawn):
         before: Before | None = None, **given: Any,
     ) -> None:  # fmt: skip
         super().__init__(parameters, effects, before=before, **given)
-        self._noisy, size = is_noisy(method), self.number.size
+        self._noisy, size = method == "noise", self.number.size
         self._means = Means(size) if random_effects(effects) else None
         if self._means is None:
             values = evaluate(parameters, effects)

@@ -22,13 +22,7 @@ __all__ = ["Parameters", "Shots", "evaluate", "find", "prepare", "report", "stat
 
 
 def nodes(effects: Collection[str]) -> tuple[Effect, ...]:
-    """Effects by name in the order in which they act.
-
-    Raises
-    ------
-    ValueError
-        No effect has such a name.
-    """
+    """Effects by name in the order in which they act; a ValueError for names that no effect has."""
     if unknown := sorted(set(effects) - set(NAMES)):
         raise ValueError(f"no effect {', '.join(unknown)}: choose from {', '.join(NAMES)}")
     return tuple(effect for effect in EFFECTS if effect.name in effects)
@@ -59,18 +53,12 @@ def prepare_cast(
     effects: Collection[str] = CORE,
     flags: np.ndarray | None = None,
 ) -> Shots:
-    """Shots whose footprints are given, all of one category.
+    """Shots whose footprints are given, all of one category, parameters as of :func:`prepare`.
 
-    Parameters
-    ----------
-    parameters, effects
-        As of :func:`prepare`. Ranges and radial velocities are those of the beam's centre;
-        grazing angle and law are not looked at.
-    ground : Cast
-        The footprints.
-    flags : (n,) uint32 ndarray, optional
-        Of the effects that each shot has, where that are not all of them; they may differ in
-        those that are not computed :attr:`~sweep.model.effects.effect.Effect.apart`.
+    Ranges and radial velocities are those of the beam's centre; grazing angle and law are not
+    looked at. `flags` (n,) uint32 are of the effects that each shot has, where that are not all of
+    them; they may differ in those that are not computed
+    :attr:`~sweep.model.effects.effect.Effect.apart`.
     """
     p = as_arrays(DEFAULTS | dict(parameters))
     return assembled(p, ground.beamlets.row.size, ground, effects, flags)
@@ -108,19 +96,10 @@ def evaluate(
     *,
     look: Callable[[Shots], np.ndarray] = find,
 ) -> dict[str, np.ndarray]:
-    """Statistics of n shots on a flat plane.
+    """Statistics of n shots on a flat plane: (n,) by name in :data:`sweep.model.outputs.OUTPUTS`.
 
-    Parameters
-    ----------
-    parameters, effects
-        As of :func:`prepare`.
-    look
-        Finder of the peaks in the spectra, :func:`find` or another way to the same.
-
-    Returns
-    -------
-    dict of (n,) ndarray
-        One entry per name in :data:`sweep.model.outputs.OUTPUTS`.
+    Parameters as of :func:`prepare`; `look` finds the peaks in the spectra, by :func:`find` or
+    another way to the same.
     """
     groups = list(prepare(parameters, effects))
     if len(groups) == 1:
@@ -147,13 +126,11 @@ def statistics(shots: Shots, found: np.ndarray | None = None) -> dict[str, np.nd
     miss_shot = np.minimum(miss[0] + pd[0] * miss[2], 1.0)  # of roundings
     if shots.fading is not None:
         miss_shot = np.minimum(miss[0] + np.maximum(pd[0] - pd_shot, 0.0), 1.0)
-    by_segment = {"pd": pd, "miss": miss, "snr": snr}
     results = {
-        **{
-            f"{name}_{segment}": values[s]
-            for name, values in by_segment.items()
-            for s, segment in enumerate(waveform.SEGMENTS)
-        },
+        f"{name}_{segment}": values[s]
+        for name, values in {"pd": pd, "miss": miss, "snr": snr}.items()
+        for s, segment in enumerate(waveform.SEGMENTS)
+    } | {
         "pd_shot": pd_shot,
         "miss_shot": miss_shot,
         **alarms,

@@ -470,22 +470,13 @@ def stays_below(level, weight, place, form, sizes):
 def detect(origin, lines, levels, shifts, table, form, sizes, tangent, room, exempt):
     """Run of bins around a segment's lines, and the detection in it.
 
-    Parameters
-    ----------
-    origin, lines
-        Bin from which lines count; number of lines, lowest and highest place, their summed weight,
-        and the most that an image may come to that is left out.
-    levels : (float, float)
-        Threshold; level below which bins may be left out. If none is above it, bins that the
-        largest is known to exceed are.
-    exempt : (width,) bool
-        Result: bins of the run that can't raise a false alarm.
+    ``origin``: bin from which lines count. ``lines``: their number, lowest and highest place, their
+    summed weight, and the most that an image may come to that is left out. ``levels``: threshold;
+    level below which bins may be left out; if none is above it, bins that the largest is known to
+    exceed are. ``exempt``: result, bins of the run that can't raise a false alarm.
 
-    Returns
-    -------
-    low, count, peak, exempted : int
-        First bin of the run, number of bins, index of the largest, number of exempt ones; |X| in
-        row OUT.
+    Returns first bin of the run, number of bins, index of the largest, number of exempt ones; |X|
+    in row OUT.
     """
     n, lowest, highest, total, least = lines
     room_for = sizes[0] if sizes[7] == COMPLEX else sizes[0] // 2 + 1

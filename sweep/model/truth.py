@@ -29,23 +29,18 @@ def spectrum(
 ) -> np.ndarray:
     """|X[k]| of point i's segment, without noise, for k = 0..N/2, (N // 2 + 1,).
 
-    Of a complex record for k = -N/2..N/2 - 1, (N,).
+    Of a complex record for k = -N/2..N/2 - 1, (N,). With incoherent phases: the root of the mean of
+    |X|^2 over independent uniform phases.
 
     Parameters
     ----------
     segment : int
         0 up, 1 Doppler, 2 down.
-    range_walk : bool
-        Whether the terms of the phase in t^2 are kept: the frequency drift while the target
-        moves. The fast path leaves them out.
-    acceleration : bool
-        Whether the velocity drifts within the record.
+    range_walk, acceleration : bool
+        Whether the terms of the phase in t^2 are kept, the frequency drift while the target moves,
+        which the fast path leaves out; whether the velocity drifts within the record.
     laser_phase : (L,) ndarray or float
         Phase theta(t) - theta(t - tau) of the laser in each sample [rad].
-
-    Notes
-    -----
-    With incoherent phases: the root of the mean of |X|^2 over independent uniform phases.
     """
     w = window.samples(shots.window.name, shots.window.length)
     half, signed = shots.fft_size // 2 + 1, shots.complex_record

@@ -3,7 +3,7 @@
 import math
 import re
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 
 import numpy as np
 
@@ -29,66 +29,50 @@ _STAND_IN = 256
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """A window of a given length with all that the spectrum's kernel needs.
-
-    Attributes
-    ----------
-    name, length
-        Canonical name; number of samples L.
-    edge : float
-        First sample w[0].
-    sum, energy : float
-        sum w (W at its peak) and E_w = sum w^2.
-    reach, envelope : (m,) ndarray
-        max |W(y)| / sum over |y| >= reach [bins of fs/L].
-    """
+    """A window of a given length with all that the spectrum's kernel needs."""
 
     name: str
     length: int
+    """Number of samples L."""
     edge: float
+    """First sample w[0]."""
     sum: float
+    """sum w, W at its peak."""
     energy: float
+    """E_w = sum w^2."""
     reach: np.ndarray
     envelope: np.ndarray
+    """(m,): max |W(y)| / sum over |y| >= `reach` [bins of fs/L]."""
 
-    @cached_property
-    def band_weights(self) -> tuple[float, ...]:
+    def band_weights(self, power: bool) -> tuple[float, ...]:
         """Shares of the sum that |w| has at places |t| evenly spaced over 0..1, the record's end.
 
-        All at the end for other windows than sums of cosines: an upper bound.
+        Of powers those of its autocorrelation, of transform |W|^2: t is the lag over L. All at the
+        end for other windows than sums of cosines: an upper bound.
         """
         if self.name not in COSINE_SUMS or self.length < _SHORTEST_CLOSED_FORM:
             return 0.0, 1.0
-        w = np.abs(samples(self.name, min(self.length, _STAND_IN) // 2 * 2))
-        half = w.size // 2
-        return _shares(np.append(w[half:], 0.0) + np.append(0.0, w[half - 1 :: -1]))
-
-    @cached_property
-    def power_band_weights(self) -> tuple[float, ...]:
-        """Shares of the sum of |w|'s autocorrelation, of transform |W|^2: t is the lag over L."""
-        if self.name not in COSINE_SUMS or self.length < _SHORTEST_CLOSED_FORM:
-            return 0.0, 1.0
-        w = np.abs(samples(self.name, min(self.length, _STAND_IN)))
-        correlation = np.correlate(w, w, "full")[w.size - 1 :]
-        correlation[1:] *= 2  # either sign
-        return _shares(np.append(correlation, 0.0))
+        length = min(self.length, _STAND_IN)
+        w = np.abs(samples(self.name, length if power else length // 2 * 2))
+        if power:
+            weights = np.append(np.correlate(w, w, "full")[w.size - 1 :], 0.0)
+            weights[1:] *= 2  # either sign
+        else:
+            half = w.size // 2
+            weights = np.append(w[half:], 0.0) + np.append(0.0, w[half - 1 :: -1])
+        return tuple(map(float, weights / weights.sum()))
 
     def node_limits(self, power: bool) -> np.ndarray:
         """Return the limits pi h of J equivalent lines (:func:`sweep.model.lines.node_limits`)."""
         from sweep.model.lines import AMPLITUDE_TOLERANCES, POWER_TOLERANCES, node_limits
 
-        if power:
-            return node_limits(self.power_band_weights, POWER_TOLERANCES)
-        return node_limits(self.band_weights, AMPLITUDE_TOLERANCES)
+        tolerances = POWER_TOLERANCES if power else AMPLITUDE_TOLERANCES
+        return node_limits(self.band_weights(power), tolerances)
 
     @property
     def equivalent_noise_bandwidth(self) -> float:
         """Equivalent noise bandwidth [bins of fs/L]."""
         return self.length * self.energy / self.sum**2
-
-
-def _shares(weights: np.ndarray) -> tuple[float, ...]:
-    return tuple(map(float, weights / weights.sum()))
 
 
 def canonical_name(name: str) -> str:
@@ -100,13 +84,8 @@ def canonical_name(name: str) -> str:
 def samples(name: str, length: int) -> np.ndarray:
     """DFT-even window samples (length,), peak about 1.
 
-    ``name`` is a cosine sum, or any window of scipy.signal.get_window, its parameters in
-    brackets: ``kaiser(8.6)``.
-
-    Raises
-    ------
-    ValueError
-        Where scipy knows no such window or refuses its parameters.
+    ``name`` is a cosine sum, or any window of scipy.signal.get_window, its parameters in brackets:
+    ``kaiser(8.6)``; a ValueError where scipy knows none such or refuses its parameters.
     """
     name = canonical_name(name)
     if name in COSINE_SUMS:
@@ -155,15 +134,9 @@ def transform(window: Window, y: np.ndarray) -> np.ndarray:
 def _closed_form(name: str, length: int) -> Window:
     c = tuple(float(t) for t in COSINE_SUMS[name])
     reach, envelope = _sidelobe_envelope(c, length)
-    return Window(
-        name=name,
-        length=length,
-        edge=math.fsum((-1) ** m * x for m, x in enumerate(c)),
-        sum=length * c[0],
-        energy=length * (c[0] ** 2 + sum(x * x for x in c[1:]) / 2),
-        reach=reach,
-        envelope=envelope,
-    )
+    edge = math.fsum((-1) ** m * x for m, x in enumerate(c))
+    energy = length * (c[0] ** 2 + sum(x * x for x in c[1:]) / 2)
+    return Window(name, length, edge, length * c[0], energy, reach, envelope)
 
 
 def _sidelobe_envelope(c: tuple[float, ...], length: int) -> tuple[np.ndarray, np.ndarray]:
@@ -198,12 +171,5 @@ def _tabulated(name: str, length: int) -> Window:
     spectrum = np.fft.rfft(w, size)
     magnitude = np.abs(spectrum) / w.sum()
     reach, envelope = _thinned(y[1:], np.maximum.accumulate(magnitude[::-1])[::-1][1:])
-    return Window(
-        name=name,
-        length=length,
-        edge=float(w[0]),
-        sum=float(w.sum()),
-        energy=float((w**2).sum()),
-        reach=reach,
-        envelope=envelope,
-    )
+    sums = float(w[0]), float(w.sum()), float((w**2).sum())
+    return Window(name, length, *sums, reach, envelope)

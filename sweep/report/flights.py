@@ -15,16 +15,19 @@ import xarray as xr
 
 from sweep.analysis import canvas, labels
 from sweep.analysis.charts import CHANCE, Axis, Chart, Line, Panel, not_shown
+from sweep.analysis.figures import SceneStudy
 from sweep.analysis.opening import NotAStoreError
-from sweep.analysis.scenes.clouds import AXES, Cloud, Ground, gathered
-from sweep.analysis.scenes.figures import SceneStudy
 from sweep.analysis.scenes.navigation import curves, navigation_chart
+from sweep.analysis.scenes.pictures import Ground
 from sweep.analysis.scenes.recording import (
+    AXES,
     INTERPOLATED,
     KINDS,
+    Cloud,
     Place,
     Recording,
     eyepoints_of,
+    gathered,
     kinds,
     label,
     place_at,

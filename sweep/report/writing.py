@@ -16,9 +16,8 @@ import yaml
 
 from sweep.analysis import labels, noise_only
 from sweep.analysis.charts import Chart, Room
-from sweep.analysis.figures import Study, held
+from sweep.analysis.figures import SceneStudy, Study, held
 from sweep.analysis.opening import ACCURACY, GRID, SCENE, NotAStoreError, read_attributes
-from sweep.analysis.scenes.figures import SceneStudy
 from sweep.analysis.scenes.recording import INTERPOLATED, QUANTITIES, shown
 from sweep.analysis.selection import known
 from sweep.analysis.tables import Page as TablePage

@@ -1,8 +1,4 @@
-"""Eyepoints as the arrays of a store, and back.
-
-The names are those of :mod:`sweep.model.outputs`. Nothing is lost on the way: a shot read
-back gives the same radiometry, bit for bit, as the one that was cast.
-"""
+"""Eyepoints as the arrays of a store, named as in :mod:`sweep.model.outputs`, and back."""
 
 from __future__ import annotations
 
@@ -31,11 +27,7 @@ _FIELDS = {
 
 
 def to_arrays(eyepoints: Eyepoints) -> dict[str, np.ndarray]:
-    """Arrays SHOTS and BEAMLETS of n shots of b beamlets, in the types of the store.
-
-    ``beam_surface`` is the surface of the reference beamlet, the first that hits; -1 where all
-    miss.
-    """
+    """Arrays SHOTS and BEAMLETS of n shots of b beamlets, in the types of the store."""
     stored = {**SHOTS, **BEAMLETS}
     arrays = {
         name: np.asarray(getattr(eyepoints, field), stored[name].dtype)
@@ -47,15 +39,7 @@ def to_arrays(eyepoints: Eyepoints) -> dict[str, np.ndarray]:
 
 
 def from_arrays(arrays: Mapping[str, np.ndarray], weight: np.ndarray) -> Eyepoints:
-    """Eyepoints of stored arrays by name, and power fractions of the beamlets (b,).
-
-    Arrays beyond SHOTS and BEAMLETS are not looked at.
-
-    Raises
-    ------
-    ValueError
-        An array is missing, or its number of shots or of beamlets is not that of the others.
-    """
+    """Eyepoints of stored arrays and power fractions (b,); ValueError for unlike shapes."""
     if missing := sorted(_FIELDS.keys() - arrays.keys()):
         raise ValueError(f"eyepoints lack {', '.join(missing)}")
     fields = {field: np.asarray(arrays[name]) for name, field in _FIELDS.items()}

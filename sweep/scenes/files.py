@@ -1,26 +1,24 @@
-"""Files of a scene: what is wrong with one, and the digest that tells it from others."""
+"""Files of a scene: what is wrong with one, what tells it from others, tables of waypoints."""
 
 from __future__ import annotations
 
+import csv
 import hashlib
 import json
+import re
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import unquote
+
+import numpy as np
+
+from sweep.model.geometry.quaternion import from_heading
+from sweep.units import QuantityError, read_unit
 
 
 class SceneError(Exception):
-    """A file that a scene can not be made of.
-
-    Parameters
-    ----------
-    file : str or Path
-        The file.
-    rule : str
-        The rule broken, as the end of a sentence about the file.
-    remedy : str
-        What to do about it.
-    """
+    """A file that a scene can not be made of: the rule broken, and what to do about it."""
 
     def __init__(self, file: str | Path, rule: str, remedy: str) -> None:
         super().__init__(f"{file}: {rule}; {remedy}")
@@ -28,13 +26,7 @@ class SceneError(Exception):
 
 
 def existing(path: str | Path) -> Path:
-    """Path of a file that is there.
-
-    Raises
-    ------
-    SceneError
-        Where it is not, or is no plain file: a pipe would be waited for.
-    """
+    """Path of a file that is there; SceneError where it is not, or is no plain file."""
     path = Path(path)
     if str(path).startswith("/vsi"):
         raise SceneError(path, "is no file of this machine", "fetch it, and name the file")
@@ -52,16 +44,7 @@ def existing(path: str | Path) -> Path:
 
 
 def file_digest(path: str | Path) -> str:
-    """Digest of a file's bytes (BLAKE2b, 128 bits), and of those of the files that it is read with.
-
-    A glTF file keeps its vertices in others. No file's name is part of it but those by which one
-    names another.
-
-    Raises
-    ------
-    SceneError
-        Where it is missing or can not be read.
-    """
+    """Digest of a file's bytes, and of those of files that a glTF reads; SceneError if lost."""
     path = existing(path)
     digest = hashlib.blake2b(digest_size=16)
     for part in (path, *_companions(path)):
@@ -84,3 +67,133 @@ def _companions(path: Path) -> list[Path]:
     buffers: Any = document.get("buffers") if isinstance(document, dict) else None
     names = [b.get("uri", "") for b in buffers or () if isinstance(b, dict)]
     return [path.parent / unquote(name) for name in names if name and not name.startswith("data:")]
+
+
+COLUMNS = {
+    "time": "s", "x": "m", "y": "m", "z": "m",
+    "qw": "", "qx": "", "qy": "", "qz": "",
+    "heading": "rad", "pitch": "rad", "roll": "rad",
+}  # fmt: skip
+"""Columns and the SI unit of each; quaternions have none."""
+
+_POSITION = ("time", "x", "y", "z")
+_QUATERNION = ("qw", "qx", "qy", "qz")
+_ANGLES = ("heading", "pitch", "roll")
+_HEADING = re.compile(r"\s*([A-Za-z]+)\s*(?:[\[(]([^\])]*)[\])])?\s*")
+_EXAMPLE = "time [s], x [m], y [m], z [m], heading [deg], pitch [deg], roll [deg]"
+
+
+class Table(NamedTuple):
+    """Waypoints of a table."""
+
+    time: np.ndarray  # (n,): rising times [s]
+    position: np.ndarray  # (n, 3) [m]
+    attitude: np.ndarray | None
+    """(n, 4): quaternions (w, x, y, z), body to world; None where the table has no attitude."""
+
+
+def read_waypoints(path: str | Path) -> Table:
+    """Waypoints of a CSV table.
+
+    The first row names the columns and their units: ``time [s]``, ``x [km]``, ``y [km]``, ``z
+    [m]``, and for the attitude either ``qw, qx, qy, qz`` (body to world) or ``heading [deg]``
+    (counter-clockwise from the x axis), ``pitch [deg]`` (nose up) and ``roll [deg]`` (left side
+    up), of which those left out are 0. Lines that begin with # are passed over. SceneError for
+    a file that is missing or no such table.
+    """
+    path = existing(path)
+    lines = _lines(path)
+    if len(lines) < 3:
+        remedy = f"write a header ({_EXAMPLE}) and a line for each"
+        raise SceneError(path, "holds fewer than two waypoints", remedy)
+    factors = _header(path, lines[0][1])
+    rows = np.array([_row(path, number, cells, len(factors)) for number, cells in lines[1:]])
+    table = {name: rows[:, i] * factor for i, (name, factor) in enumerate(factors.items())}
+    falls = np.flatnonzero(np.diff(table["time"]) <= 0)
+    if len(falls):
+        line = lines[falls[0] + 2][0]
+        raise SceneError(path, f"line {line}: the time does not rise", "sort the lines by time")
+    position = np.column_stack([table[name] for name in "xyz"])
+    return Table(table["time"], position, _attitude(path, table))
+
+
+def _lines(path: Path) -> list[tuple[int, list[str]]]:
+    """Line numbers and cells of all lines that say something."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        raise SceneError(path, "is no text in UTF-8", "save the table as CSV") from None
+    reader = csv.reader(text.splitlines(), skipinitialspace=True)
+    return [
+        (reader.line_num, row)
+        for row in reader
+        if any(cell.strip() for cell in row) and not row[0].lstrip().startswith("#")
+    ]
+
+
+def _header(path: Path, cells: list[str]) -> dict[str, float]:
+    """Columns in their order, with the factor that makes each SI."""
+    factors: dict[str, float] = {}
+    for cell in cells:
+        match = _HEADING.fullmatch(cell)
+        name = match[1].lower() if match else ""
+        if match is None or name not in COLUMNS:
+            raise SceneError(path, f"has an unknown column '{cell.strip()}'", f"use {_EXAMPLE}")
+        if name in factors:
+            raise SceneError(path, f"has two columns '{name}'", "leave one out")
+        factors[name] = _factor(path, name, (match[2] or "").strip())
+    missing = [name for name in _POSITION if name not in factors]
+    if missing:
+        raise SceneError(path, f"has no column '{missing[0]}'", f"add it: {_EXAMPLE}")
+    return factors
+
+
+def _factor(path: Path, name: str, unit: str) -> float:
+    """Factor that makes a column SI."""
+    si = COLUMNS[name]
+    if not si:
+        if unit not in ("", "1"):
+            raise SceneError(path, f"gives '{name}' a unit", "quaternions have none")
+        return 1.0
+    example = f"{name} [{si}]"
+    try:
+        if not unit:
+            raise QuantityError("has none")
+        return read_unit(unit, si_unit=si, example=example).to_si(1)  # type: ignore[arg-type]
+    except QuantityError as error:
+        rule = f"the unit of column '{name}' {error.rule}"
+        raise SceneError(path, rule, f"write e.g. {example}") from None
+
+
+def _row(path: Path, number: int, cells: list[str], columns: int) -> list[float]:
+    """Numbers of a line."""
+    if len(cells) != columns:
+        rule = f"line {number} has {len(cells)} cells under {columns} columns"
+        raise SceneError(path, rule, "fill or cut it")
+    try:
+        values = [float(cell) for cell in cells]
+    except ValueError:
+        values = [np.nan]
+    if not np.isfinite(values).all():
+        raise SceneError(path, f"line {number} holds no finite numbers", "write plain numbers")
+    return values
+
+
+def _attitude(path: Path, table: Mapping[str, np.ndarray]) -> np.ndarray | None:
+    """Quaternions of the table, (n, 4)."""
+    given = [name for name in _QUATERNION if name in table]
+    angles = {name: table[name] for name in _ANGLES if name in table}
+    if given and angles:
+        raise SceneError(path, "has both a quaternion and angles", "leave one of them out")
+    if angles:
+        zero = np.zeros(len(table["time"]))
+        return from_heading(**{name: angles.get(name, zero) for name in _ANGLES})
+    if not given:
+        return None
+    if len(given) < len(_QUATERNION):
+        raise SceneError(path, "has part of a quaternion", "give qw, qx, qy and qz")
+    q = np.column_stack([table[name] for name in _QUATERNION])
+    length = np.linalg.norm(q, axis=1)
+    if not (np.abs(length - 1) < 1e-3).all():
+        raise SceneError(path, "has quaternions of a length other than 1", "divide them by it")
+    return np.asarray(q / length[:, None])

@@ -30,17 +30,10 @@ _Y_UP_FORMATS = {".glb", ".gltf"}
 class Facets:
     """A soup of triangles.
 
-    Parameters
-    ----------
-    vertices : (n, 3) float64 ndarray
-        Positions relative to `origin` [m].
-    faces : (m, 3) int64 ndarray
-        Rows of `vertices`, counter-clockwise as seen from outside (or above).
-    surface : (m,) int16 ndarray
-        Index of each face's surface in the scene's list.
-    origin : (3,) float64 ndarray
-        World position of the zero of `vertices` [m]. Terrain lies millions of metres from the
-        zero of its map; a vertex that is kept apart from that offset loses no digits to it.
+    Vertices (n, 3) relative to an origin (3,) [m]: terrain lies millions of metres from the
+    zero of its map, and a vertex kept apart from that loses no digits to it. Faces (m, 3) are
+    counter-clockwise as seen from outside; surface (m,) int16 is the index of each face's in
+    the scene's list.
     """
 
     vertices: np.ndarray
@@ -124,22 +117,11 @@ def clean(vertices: ArrayLike, faces: ArrayLike, surface: ArrayLike) -> tuple[Me
 
     Faces without data, without area or given twice are dropped, coincident vertices merged,
     unused ones dropped, and the rest centred. Holes, crowded edges and inverted normals change
-    nothing for rays, which see both sides of a face; they are counted. Faces keep their order.
+    nothing for rays, which see both sides of a face; they are counted. Faces (m, 3) keep their
+    order; vertices (n, 3) [m] are not finite where there is no data.
 
-    Parameters
-    ----------
-    vertices : (n, 3) array_like of float
-        Coordinates [m]; not finite where there is no data.
-    faces : (m, 3) array_like of int
-        Vertices of each face, 0..n-1.
-    surface : (m,) array_like of int, or int
-        Surface of each face, or of all.
-
-    Raises
-    ------
-    ValueError
-        The arrays' shapes do not fit, a face names a vertex that does not exist, or no face is
-        left.
+    ValueError where the arrays' shapes do not fit, a face names a vertex that does not exist,
+    or no face is left.
     """
     points, corners = np.array(vertices, dtype=np.float64), np.asarray(faces)
     kinds = np.full(len(corners), surface) if np.ndim(surface) == 0 else np.asarray(surface)
@@ -222,21 +204,9 @@ def read_mesh(
 ) -> Facets:
     """Facets of a mesh file (STL, OBJ, PLY, glTF ...), all its parts; nothing is mended here.
 
-    Parameters
-    ----------
-    path
-        The file.
-    unit
-        Unit of its lengths, such as ``mm``; by default the one the file states, or else metres.
-    up
-        Its vertical axis, ``y`` or ``z``; by default y for glTF, as its specification says.
-    scale
-        Factor on top of the units, > 0.
-
-    Raises
-    ------
-    SceneError
-        For a file that is missing, can not be loaded or holds no triangles, or an unknown unit.
+    The unit of lengths is by default the one that the file states, or else metres; up is by
+    default y for glTF, z for others. SceneError for a file that is missing, can not be loaded
+    or holds no triangles, or an unknown unit.
     """
     import trimesh
 
@@ -281,11 +251,7 @@ def _metres(path: Path, unit: str | None) -> float:
 
 
 def sphere(*, radius: float, subdivisions: int) -> Facets:
-    """Return a refined icosahedron; its corners lie on the sphere and its faces within.
-
-    Each of `subdivisions` cuts every face in four: n of them make 20 * 4^n faces, which lie within
-    ``0.3 radius / 4^n`` of the sphere.
-    """
+    """Return a refined icosahedron of 20 * 4^subdivisions faces, with its corners on the sphere."""
     import trimesh
 
     ball = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)

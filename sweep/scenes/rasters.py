@@ -46,28 +46,16 @@ def read_raster(
     metres_per_degree: tuple[float, float] | None = None,
     pixel: float | None = None,
 ) -> Terrain:
-    """Terrain of a georeferenced raster, such as a GeoTIFF.
+    """Terrain of a georeferenced raster, such as a GeoTIFF, or of a window (W, S, E, N) of it.
 
-    Nodes lie at the centres of the pixels. Pixels without data are holes. The raster's own scale
-    and offset are applied, and feet are turned into metres.
+    Nodes lie at the centres of the pixels; those without data are holes. The raster's own scale
+    and offset are applied, and feet are turned into metres. One in degrees needs metres per
+    degree, east and north; one without a scale the size of a pixel [m], its lower left corner
+    being the world's origin.
 
-    Parameters
-    ----------
-    path, band
-        The file; the band that holds the heights, from 1.
-    window
-        West, south, east, north of the part to read, in the raster's own coordinates.
-    metres_per_degree
-        East and north, for a raster in degrees of longitude and latitude.
-    pixel
-        Size of a pixel [m], for a raster that states no scale; its lower left corner is then the
-        world's origin.
-
-    Raises
-    ------
-    SceneError
-        For a file that is missing, no raster, without scale, rotated, in degrees whose size is not
-        stated, too large, or without any height; or a band or window that it does not have.
+    SceneError for a file that is missing, no raster, without scale, rotated, in degrees whose
+    size is not stated, too large, or without any height; or a band or window that it does not
+    have.
     """
     path = existing(path)
     with _opened(path) as data:
@@ -84,15 +72,7 @@ def read_raster(
 
 
 def raster_digest(path: str | Path) -> str:
-    """Digest of a raster's heights, spacing and frame, as :func:`sweep.scenes.files.file_digest`.
-
-    They may come from other files: those that a .vrt names, a world file, a mask.
-
-    Raises
-    ------
-    SceneError
-        For a file that is missing or no raster.
-    """
+    """Digest of a raster's heights, spacing and frame, wherever they come from; or SceneError."""
     from rasterio.windows import Window as Pixels
 
     path = existing(path)
@@ -110,10 +90,7 @@ def raster_digest(path: str | Path) -> str:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """Dataset of a raster; rasterio's import takes a third of a second and waits for its use.
-
-    A raster may name sources on other machines. None of them is asked for anything.
-    """
+    """Dataset of a raster. No source on another machine that it names is asked for anything."""
     import rasterio
 
     _look_for_sources(path, set())
@@ -241,21 +218,9 @@ def read_array(
 ) -> Terrain:
     """Terrain of a NumPy file, ``.npy`` or ``.npz``, whose first height is at the world's origin.
 
-    Parameters
-    ----------
-    path
-        The file.
-    spacing
-        Step from column to column and from row to row [m]; dy < 0 where row 0 is the northern one.
-    name
-        Array of an ``.npz`` that holds the heights [m]; not needed where it holds only one grid.
-    no_data
-        Value that stands for a missing height, beside NaN.
-
-    Raises
-    ------
-    SceneError
-        For a file that is missing or holds no grid of numbers.
+    Steps from column to column and from row to row [m]; dy < 0 where row 0 is the northern one.
+    An ``.npz`` of several grids needs the name of one; a value may stand for missing heights,
+    as NaN does. SceneError for a file that is missing or holds no grid of numbers.
     """
     path = existing(path)
     try:
@@ -303,12 +268,8 @@ def read_image(path: str | Path, *, pixel: float, black: float = 0.0, white: flo
     """Terrain of a grey image: row 0 is the northern one, its first pixel at the world's origin.
 
     Heights [m] are from that of black to that of full white, in steps of one grey level: smooth
-    them before trusting slopes (`sweep.scenes.terrain.smooth`). Pixels are of a size on the ground.
-
-    Raises
-    ------
-    SceneError
-        For a file that is missing, no image, in colour, or of another depth than 8 or 16 bits.
+    them before trusting slopes. SceneError for a file that is missing, no image, in colour, or
+    of another depth than 8 or 16 bits.
     """
     levels = _grey(existing(path))
     heights = black + (white - black) * levels / np.iinfo(levels.dtype).max
@@ -337,9 +298,8 @@ def degree_at(
 ) -> tuple[float, float]:
     """Metres of a degree of longitude and of latitude at a geodetic latitude [deg].
 
-    Exact at that latitude only: over a grid of h degrees the east-west scale is off by up to
-    ``tan(latitude) h/2`` at its edges, 0.2 % for a quarter of a degree at 37 deg. Radius [m] at the
-    equator and flattening are the ellipsoid's, 0 for a sphere.
+    Over a grid of h degrees the east-west scale is off by up to ``tan(latitude) h/2`` at its
+    edges.
     """
     square = flattening * (2 - flattening)
     phi = math.radians(latitude)
@@ -352,8 +312,8 @@ def degree_at(
 def jacksboro() -> Terrain:
     """Heights of the Jacksboro fault, Tennessee, that come with matplotlib: 30 km by 32 km.
 
-    From a survey at 3 arc seconds (USGS): a post is 74 m from east to west and 92 m from north to
-    south. World coordinates are metres from its middle; heights are above sea level.
+    From a survey at 3 arc seconds (USGS). World coordinates are metres from its middle; heights
+    are above sea level.
     """
     from matplotlib.cbook import get_sample_data
 

@@ -1,9 +1,4 @@
-"""Craters, boulders and trees: how many lie on an area, and what they look like.
-
-Simple impact craters are carved into a grid of heights; boulders are half-ellipsoids of facets,
-set on the ground. Broad-leaved trees have a tapered trunk, and leaves as loose facets in an
-ellipsoid.
-"""
+"""Craters, boulders and trees: how many lie on an area, and what they look like."""
 
 from __future__ import annotations
 
@@ -20,13 +15,7 @@ from sweep.scenes.terrain import Bounds, Terrain
 
 @dataclass(frozen=True)
 class PowerLaws:
-    """The least of several power laws ``N(>D) = coefficient * D**-exponent``.
-
-    Parameters
-    ----------
-    laws : tuple of (coefficient, exponent)
-        Coefficient in SI (number per m^2 at 1 m) and exponent, both > 0.
-    """
+    """The least of several power laws ``N(>D) = coefficient * D**-exponent`` [1/m^2, D in m]."""
 
     laws: tuple[tuple[float, float], ...]
 
@@ -69,15 +58,10 @@ def lunar_craters(*, equilibrium_diameter: float = math.inf) -> PowerLaws:
 class MartianRocks:
     """Rocks of the Martian plains, by their cumulative fractional area.
 
-    ``F(D) = k exp(-q D)``, ``q = 1.79 + 0.152/k`` with D in metres (Golombek and Rapp, J. Geophys.
-    Res. 102, 4117, 1997); each rock covers ``pi D^2 / 4``, so that the number per area is
-    ``N(>D) = (4 k q / pi) (exp(-q D)/D - q E1(q D))``.
-
-    Parameters
-    ----------
-    cover : float
-        k: fraction of the ground covered by rocks of any size, 0 < k < 1; 0.02 to 0.2 at the
-        landing sites.
+    ``F(D) = k exp(-q D)``, ``q = 1.79 + 0.152/k`` with D in metres (Golombek and Rapp, J.
+    Geophys. Res. 102, 4117, 1997); each rock covers ``pi D^2 / 4``, so that the number per area
+    is ``N(>D) = (4 k q / pi) (exp(-q D)/D - q E1(q D))``. The cover k is that of rocks of any
+    size, 0.02 to 0.2 at the landing sites.
     """
 
     cover: float
@@ -125,11 +109,7 @@ def scatter(
     """Independent places (x, y) and diameters [m] on a rectangle, in falling order of diameter.
 
     The number is Poisson with the law's mean between the two diameters; places are uniform.
-
-    Raises
-    ------
-    ValueError
-        For an empty rectangle or range of diameters, or more than 5 million of them.
+    ValueError for an empty rectangle or range of diameters, or more than 5 million of them.
     """
     west, south, east, north = bounds
     if not (0 < smallest < largest and west < east and south < north):
@@ -205,9 +185,9 @@ def draw_craters(
 ) -> Craters:
     """Craters that reach into a rectangle, largest first; `scatter` has the parameters.
 
-    Those centred outside whose ejecta reach in are drawn too. Ground in equilibrium holds craters
-    of every state from fresh to all but gone. Their freshness is drawn evenly from `least_fresh` to
-    1: a simplification, as wear by diffusion leaves more of the shallow ones.
+    Ground in equilibrium holds craters of every state from fresh to all but gone. Their
+    freshness is drawn evenly: a simplification, as wear by diffusion leaves more of the shallow
+    ones.
     """
     margin = REACH * largest / 2
     wider = bounds[0] - margin, bounds[1] - margin, bounds[2] + margin, bounds[3] + margin
@@ -220,13 +200,7 @@ def draw_craters(
 
 
 def carve(terrain: Terrain, craters: Craters) -> Terrain:
-    """Terrain with craters added to it, one on top of the other.
-
-    Raises
-    ------
-    ValueError
-        Where a crater is under three grid steps across: the grid can not hold it.
-    """
+    """Terrain with craters added to it; ValueError where one is under three grid steps across."""
     step = max(abs(d) for d in terrain.spacing)
     if len(craters.x) and craters.diameter.min() < 3 * step:
         raise ValueError(
@@ -263,23 +237,11 @@ def draw_boulders(
     elongation: float = 1.5,
     subdivisions: int = 2,
 ) -> Facets:
-    """Boulders on a terrain, from a size-frequency law.
+    """Boulders on a terrain, from a size-frequency law; `scatter` has the other parameters.
 
-    The outline of each covers the area of a circle of its diameter exactly. Those that would stand
-    in a hole of the terrain are left out.
-
-    Parameters
-    ----------
-    generator, law, smallest, largest, bounds
-        As of `scatter`; by default within the terrain's bounds.
-    terrain
-        Ground that they stand on.
-    height_ratio
-        Height above the ground over diameter, > 0; 0.5 is a hemisphere.
-    elongation
-        Long over short axis of the outline, drawn evenly from 1 to this; >= 1.
-    subdivisions
-        Refinement of the half-octahedron under the dome: 4^(n+1) facets, and 8 2^n of a skirt.
+    The outline of each covers the area of a circle of its diameter exactly. Its long axis over
+    the short one is drawn evenly from 1 to the elongation. Those that would stand in a hole of
+    the terrain are left out.
     """
     x, y, diameter = scatter(
         generator, law, bounds=bounds or terrain.bounds, smallest=smallest, largest=largest
@@ -305,8 +267,8 @@ def draw_boulders(
 def half_ball(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
     """Return a unit dome above z = 0 with a skirt down to z = -1: vertices, faces.
 
-    The outline's area is pi exactly, its corners lying a little outside the unit circle. The top is
-    the first vertex. Each subdivision cuts every facet of the half-octahedron into four.
+    The outline's area is pi exactly. Each subdivision cuts every facet of the half-octahedron
+    into four.
     """
     side = 2**subdivisions
     points: list[np.ndarray] = []
@@ -390,12 +352,7 @@ def clump(
 ) -> Facets:
     """Plant a clump of trees on a terrain, their trunks at least half a crown apart.
 
-    They stand no farther than `radius` [m] from a world position (x, y).
-
-    Raises
-    ------
-    ValueError
-        Where the trees do not find room, or one would stand where there is no ground.
+    ValueError where they find no room within the radius [m], or no ground.
     """
     parts = []
     for x, y in _places(generator, centre, radius, number, tree.crown_diameter / 2):

@@ -1,14 +1,12 @@
 """Ground as a grid of heights: its triangles, pieces, refining, and random relief.
 
-Heights sit at the grid's nodes; row i lies at y = i dy and column j at x = j dx from the grid's
-first node, so a raster that runs southwards has dy < 0. A cell of four nodes becomes two
-triangles. Missing heights (NaN) leave holes; a cell that lacks one node keeps the triangle of the
-other three.
+Heights sit at the grid's nodes, row i at y = i dy and column j at x = j dx from the first. A cell
+of four nodes becomes two triangles. Missing heights (NaN) leave holes; a cell that lacks one node
+keeps the triangle of the other three.
 
-Random ground, fractal or smooth hills, is exact in its statistics. Both are Gaussian fields on a
-grid, drawn by circulant embedding: the covariance is laid on a torus at least twice as large, where
-the FFT diagonalises it. Only a corner of the torus is kept, so that opposite edges of the ground
-have nothing to do with each other.
+Random ground is a Gaussian field, exact in its statistics, drawn by circulant embedding. The
+covariance is laid on a torus at least twice as large, where the FFT diagonalises it; a corner is
+kept.
 """
 
 from __future__ import annotations
@@ -34,16 +32,9 @@ Bounds = tuple[float, float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class Terrain:
-    """Heights on a grid.
+    """Heights (rows, columns) of nodes on a grid above its origin [m]; NaN where there is none.
 
-    Parameters
-    ----------
-    heights : (rows, columns) float64 ndarray
-        Height of each node above the origin [m]; NaN where there is none.
-    spacing : (dx, dy) of float
-        Step from column to column and from row to row [m]; either may be negative.
-    origin : (3,) float64 ndarray
-        World position of node (0, 0) at height 0 [m].
+    Steps (dx, dy) [m] may be negative; the origin (3,) is that of node (0, 0) at height 0 [m].
     """
 
     heights: np.ndarray
@@ -74,10 +65,7 @@ class Terrain:
         return np.array([x, y, self.height_at(np.array(x), np.array(y))])
 
     def height_at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """World height of the ground [m] at world (x, y) [m], on its triangles.
-
-        NaN outside the grid and in holes.
-        """
+        """World height of the ground at world (x, y) [m], on its triangles; NaN where none is."""
         column = (np.asarray(x, float) - self.origin[0]) / self.spacing[0]
         row = (np.asarray(y, float) - self.origin[1]) / self.spacing[1]
         return np.asarray(_on_triangles(self.heights, row, column) + self.origin[2])
@@ -141,14 +129,9 @@ def _on_triangles(z: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndar
 def refine(terrain: Terrain, *, factor: int) -> Terrain:
     """Terrain with `factor` times as many steps a side, through all the given heights.
 
-    A cubic spline: slopes are continuous, so that a beam a few centimetres wide sees no facets of
-    the size of the survey's posts. Holes stay as they are: a new node has a height where all the
-    nodes around it have one.
-
-    Raises
-    ------
-    ValueError
-        For a factor below 1 or a grid too small for a cubic.
+    A cubic spline: slopes are continuous, so that a narrow beam sees no facets of the survey's
+    posts. A new node has a height where all the nodes around it have one. ValueError for a
+    factor below 1 or a grid too small for a cubic.
     """
     from scipy.interpolate import RectBivariateSpline
     from scipy.ndimage import distance_transform_edt
@@ -172,14 +155,10 @@ def refine(terrain: Terrain, *, factor: int) -> Terrain:
 
 
 def smooth(terrain: Terrain, *, width: float) -> Terrain:
-    """Terrain blurred by a Gaussian of that standard deviation [m].
+    """Terrain blurred by a Gaussian of that standard deviation [m]; holes stay holes.
 
-    Holes stay holes and lend nothing to their neighbours.
-
-    Raises
-    ------
-    ValueError
-        For a negative width, or one beyond the ground's longer side: its memory goes by the width.
+    ValueError for a negative width, or one beyond the ground's longer side: its memory goes by
+    it.
     """
     from scipy.ndimage import gaussian_filter
 
@@ -197,13 +176,7 @@ def smooth(terrain: Terrain, *, width: float) -> Terrain:
 
 
 def piece(terrain: Terrain, *, centre: Sequence[float], size: float) -> Terrain:
-    """Cut out a square of a terrain about (x, y) [m], widened to whole grid steps.
-
-    Raises
-    ------
-    ValueError
-        Where the square holds no cell of the terrain.
-    """
+    """Cut out a square of a terrain about (x, y) [m]; ValueError where it holds no cell."""
     cuts, corner = [], terrain.origin.copy()
     for axis in (1, 0):
         step, number = terrain.spacing[axis], terrain.heights.shape[1 - axis]
@@ -220,13 +193,7 @@ def piece(terrain: Terrain, *, centre: Sequence[float], size: float) -> Terrain:
 
 
 def square(terrain: Terrain, *, centre: Sequence[float], size: float) -> Bounds:
-    """Bounds of a square about (x, y) [m], as far as there is ground.
-
-    Raises
-    ------
-    ValueError
-        Where the square holds nothing of the terrain.
-    """
+    """Bounds of a square about (x, y) [m], as far as there is ground; ValueError for none."""
     west, south, east, north = terrain.bounds
     (x, y), half = centre[:2], size / 2
     bounds = max(x - half, west), max(y - half, south), min(x + half, east), min(y + half, north)
@@ -252,27 +219,15 @@ def fractal(
 ) -> np.ndarray:
     """Self-affine relief: a fractional Brownian surface, (rows, columns) [m], 0 at its first node.
 
-    The difference of height of any two nodes, a distance L apart in any direction, is normal with
-    the standard deviation ``rms_slope * baseline * (L / baseline)**hurst``: the deviogram by which
-    planetary roughness is measured (Shepard et al., J. Geophys. Res. 106, 32777, 2001). It has no
-    smallest and no largest scale within the grid. Drawn by Stein's exact method (J. Comput. Graph.
-    Stat. 11, 587, 2002): a stationary field whose covariance differs from the fractal's by a
-    paraboloid only, plus the random plane that makes up for it.
+    The difference of height of two nodes, a distance L apart, is normal with the standard
+    deviation ``rms_slope * baseline * (L / baseline)**hurst``: the deviogram by which planetary
+    roughness is measured (Shepard et al., J. Geophys. Res. 106, 32777, 2001). Drawn by Stein's
+    exact method (J. Comput. Graph. Stat. 11, 587, 2002): a stationary field whose covariance
+    differs from the fractal's by a paraboloid only, plus the random plane that makes up for it.
 
-    Parameters
-    ----------
-    generator
-        Source of randomness; the same state gives the same ground.
-    shape, spacing
-        Nodes (rows, columns); grid steps (dx, dy) [m], whose signs are ignored.
-    hurst
-        Hurst exponent, 0 < . < 1: 0.5 is a random walk, towards 1 is smooth. Lunar ground has a
-        median near 0.95 in the highlands and 0.76 in the maria over 57 m to 2.7 km
-        (Rosenburg et al., J. Geophys. Res. 116, E02001, 2011).
-    rms_slope
-        Standard deviation of height differences over `baseline`, divided by it; >= 0.
-    baseline
-        Distance at which that slope is stated [m], > 0.
+    Hurst's exponent, 0 < . < 1, is 0.5 for a random walk, towards 1 for smooth ground; lunar
+    ground has a median near 0.95 in the highlands and 0.76 in the maria over 57 m to 2.7 km
+    (Rosenburg et al., J. Geophys. Res. 116, E02001, 2011).
     """
     steps = abs(spacing[1]), abs(spacing[0])
     span = math.hypot(*((n - 1) * step for n, step in zip(shape, steps, strict=True)))
@@ -317,10 +272,9 @@ def hills(
 ) -> np.ndarray:
     """Smooth rolling ground with a Gaussian covariance, (rows, columns) [m].
 
-    The covariance of two nodes L apart is ``rms_height**2 * exp(-(L / correlation_length)**2)``,
-    and the slope along each axis has the standard deviation
-    ``sqrt(2) * rms_height / correlation_length``. Other parameters are as of `fractal`; steps are
-    finer than a third of the correlation length.
+    The covariance of two nodes L apart is ``rms_height**2 * exp(-(L /
+    correlation_length)**2)``. Other parameters are as of `fractal`; steps are finer than a
+    third of the correlation length.
     """
     steps = abs(spacing[1]), abs(spacing[0])
     unit = [step / correlation_length for step in steps]
@@ -331,10 +285,7 @@ def hills(
 
 
 def _field(generator, shape, steps, covariance, period):  # type: ignore[no-untyped-def]
-    """Stationary Gaussian field of an isotropic covariance, a function of distance.
-
-    `shape` and `steps` have rows first; the torus is at least `period` a side, in their unit.
-    """
+    """Stationary Gaussian field of a function of distance, on a torus of at least a period."""
     size = [fft.next_fast_len(math.ceil(period / step), real=True) for step in steps]
     if math.prod(size) > 2e8:
         raise ValueError(f"relief on {shape} nodes needs a torus of {size}; use a coarser grid")

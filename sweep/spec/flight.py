@@ -63,7 +63,7 @@ class WaypointPath(Part):
 
     def path(self, files: Files, span: Span | None = None) -> laws.Path:
         """Return the path through the file's waypoints."""
-        from sweep.scenes.waypoints import read_waypoints
+        from sweep.scenes.files import read_waypoints
 
         table = read_waypoints(files.path(self.file))
         return laws.Waypoints(table.time, table.position, smooth=self.smooth)
@@ -173,8 +173,7 @@ class Tracked(Part):
 
     def law(self, files: Files, path: Any) -> laws.Attitude:
         """Return the law of attitude."""
-        from sweep.scenes.files import SceneError
-        from sweep.scenes.waypoints import read_waypoints
+        from sweep.scenes.files import SceneError, read_waypoints
 
         if self.file is None:
             raise ValueError("needs a table: name its file, or take waypoints for the path")

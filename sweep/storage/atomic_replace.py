@@ -49,6 +49,11 @@ def real(location: Location) -> Location:
     return location.resolve() if location.is_symlink() else location.absolute()
 
 
+def eyepoints_path(store: Location, geometry_id: str) -> Location:
+    """Eyepoint store of a geometry, in a folder next to the stores of the studies that use it."""
+    return real(store).parent / "eyepoints" / f"{geometry_id}.zarr"
+
+
 def beside(path: Path) -> Path:
     """Place of a store that is to replace another once it is complete."""
     return path.with_name(f".{path.name}{NEXT}")
@@ -62,10 +67,7 @@ def replaced_by(path: Path) -> Path:
 
 @contextmanager
 def draft(path: Path, *, replace: bool = False) -> Iterator[Path]:
-    """Make a file or folder in a hidden place, and put it in its own place at the end.
-
-    An existing one stays, with an OSError, unless it may be replaced.
-    """
+    """Make a file or folder in a hidden place, and put it in its own at the end."""
     settle(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     made = _hidden(path, "creating")
@@ -112,9 +114,9 @@ def discard(path: Path) -> None:
 def settle(location: Location) -> None:
     """Finish or undo what processes that died have left in the folder of a store.
 
-    A store whose replacement was interrupted is replaced if its successor is whole, or is put back.
-    Half made and half removed ones are removed. The work of living processes is left alone, and so
-    is everything where the folder can't be written.
+    A store whose replacement was interrupted is replaced if its successor is whole, or is put
+    back. Drafts of dead processes are removed. Everything is left alone where the folder can't
+    be written.
     """
     path = real(location)
     if not isinstance(path, Path):
@@ -127,10 +129,7 @@ def settle(location: Location) -> None:
 
 
 def stamp(location: Location) -> tuple[int, ...] | None:
-    """Identity of the store at a place, unlike any other that was or will be there.
-
-    None where there is no such thing: its metadata are then the only way to know.
-    """
+    """Identity of the store at a place, unlike any other that was or will be there; or None."""
     if not isinstance(location, Path):
         return None
     try:

@@ -1,7 +1,6 @@
 """Places of stores: a folder on disk, or a key in an object store, and files put there whole.
 
-The environment gives the credentials and the endpoint of an object store (AWS_ACCESS_KEY_ID,
-AWS_ENDPOINT_URL and so on); nothing of it is kept in a store.
+The environment gives credentials and endpoint of an object store; nothing of it is kept in a store.
 """
 
 from __future__ import annotations
@@ -267,13 +266,7 @@ Location = Path | ObjectPath
 
 
 def located(where: str | Location) -> Location:
-    """Parse a place: a path, ``s3://bucket/key``, ``gs://...``, ``az://...``.
-
-    Raises
-    ------
-    ObjectStoreError
-        For an address of another kind, or one without a bucket or a key.
-    """
+    """Parse a place: a path, ``s3://bucket/key``, ``gs://...``, ``az://...``."""
     if isinstance(where, ObjectPath):
         return where
     text = str(where)
@@ -347,8 +340,7 @@ def put_whole(location: Location, content: bytes) -> None:
 def put(file: str, content: bytes, *, durable: bool = False) -> None:
     """Write a file on disk in one step, also where a directory has got into its place.
 
-    Folders above it are made. Where it is `durable` the content is on the disk before the file gets
-    its name: else a power cut may leave the name with nothing behind it.
+    A power cut can't leave the name of a `durable` one with nothing behind it.
     """
     draft = f"{file}.{uuid.uuid4().hex}{PARTIAL}"
     try:

@@ -1,9 +1,7 @@
 """Logs of lines that tell whether they are as they were written, and digests of stored objects.
 
-A line is JSON with its own digest at the end. A log is a file that is appended to; objects can't be
-appended to. In an object store it is a row of numbered objects, each written whole, with the lines
-of some seconds. The log of receipts, some 300 bytes a line, is read a million lines in a few
-seconds, into a few bytes a block.
+A line is JSON with its own digest at the end. A log is a file that is appended to; in an object
+store it is a row of numbered objects, each written whole, with the lines of some seconds.
 """
 
 from __future__ import annotations
@@ -76,10 +74,7 @@ def _digest(body: bytes) -> bytes:
 
 
 def read_sealed(path: Location) -> Iterator[tuple[bytes, dict[str, Any] | None]]:
-    """Lines of a log and their records, None where damaged or cut short; nothing if it is absent.
-
-    A line end that was damaged joins two lines into one that is damaged.
-    """
+    """Lines of a log, and their records: None where damaged or cut short."""
     for line in raw_lines(path):
         yield line, unsealed(line)
 
@@ -110,23 +105,13 @@ def digest_of(contents: Iterable[tuple[str, bytes]]) -> str:
 
 
 class FileLog:
-    """A file that is appended to, and not kept open: one whose directory went away takes no more.
-
-    Where it is `durable`, lines are on the disk once appended, and not only with the operating
-    system.
-    """
+    """A file that is appended to, and not kept open; on the disk at once where it is `durable`."""
 
     def __init__(self, path: Path, *, durable: bool = False) -> None:
         self._path, self._durable = path, durable
 
     def append(self, lines: bytes) -> None:
-        """Append whole lines, all or none; they are there when this returns.
-
-        Raises
-        ------
-        OSError
-            Where they can't be written.
-        """
+        """Append whole lines, all or none; OSError where they can't be written."""
         log = os.open(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
         try:
             size = os.fstat(log).st_size
@@ -163,10 +148,7 @@ class ObjectLog:
         self._lines.append(lines)
 
     def flush(self, *, now: bool = False) -> bool:
-        """Put what was appended as an object, now or if the last one was put `WAVE` s ago.
-
-        True where all is written.
-        """
+        """Put what was appended as an object, now or `WAVE` s after the last; True if none left."""
         if not self._lines:
             return True
         if time.monotonic() - self._put < WAVE and not now:
@@ -196,10 +178,7 @@ class ObjectLog:
     def _rewrite(
         self, names: list[str], lines: list[bytes], is_sound: Callable[[bytes], bool]
     ) -> None:
-        """Put the sound lines of some objects in the place of the last one, then remove these.
-
-        Cut short, it leaves lines twice: in their order they say the same as once.
-        """
+        """Put sound lines of objects in the last one's place; cut short, they are there twice."""
         sound = [line for line in lines if is_sound(line)]
         if len(names) == 1 and len(sound) == len(lines):
             return
@@ -254,17 +233,12 @@ def raw_lines(path: Location) -> Iterator[bytes]:
 class Receipts:
     """Sums of a log of receipts: which blocks are done, when, how fast."""
 
-    points: np.ndarray
-    """(blocks,) int64: points of every block that is committed, 0 of the others."""
-    sizes: np.ndarray
-    """(blocks,) int64: bytes of these as they are stored, where the receipt says."""
+    points: np.ndarray  # (blocks,) int64: points of every block that is committed, 0 of the others
+    sizes: np.ndarray  # (blocks,) int64: bytes of these as they are stored, where the receipt says
     first: float = np.inf
-    last: float = -np.inf
-    """Times of the first and last receipt [s since the epoch]."""
-    recent: int = 0
-    """Points committed since the time asked for."""
-    workers: set[bytes] = field(default_factory=set)
-    """Hosts and processes that computed them."""
+    last: float = -np.inf  # times of the first and last receipt [s since the epoch]
+    recent: int = 0  # points committed since the time asked for
+    workers: set[bytes] = field(default_factory=set)  # hosts and processes that computed them
 
     @property
     def blocks(self) -> int:
@@ -273,10 +247,7 @@ class Receipts:
 
 
 def read_receipts(store: Location, n_blocks: int, *, since: float = np.inf) -> Receipts:
-    """Sum the log of a store; damaged lines and other blocks do not count.
-
-    Points and workers are counted from the time `since` on [s since the epoch].
-    """
+    """Sum the log of a store, points and workers `since` a time; damaged lines do not count."""
     found = Receipts(np.zeros(n_blocks, np.int64), np.zeros(n_blocks, np.int64))
     for line in raw_lines(store / JOURNAL / RECEIPTS):
         body = body_of(line)

@@ -1,8 +1,8 @@
 """Stores opened only as this program writes them.
 
-Zarr decodes whatever the metadata of arrays declare: older formats, objects to unpickle, codecs of
-plug-ins. A store has the metadata of all its arrays in one document, that of its root. It is
-checked first, and arrays are opened by it alone.
+Zarr decodes whatever the metadata of arrays declare, objects to unpickle and codecs of plug-ins
+too. The document of a store's root has the metadata of all its arrays: it is checked first, and
+arrays are opened by it alone.
 """
 
 from __future__ import annotations
@@ -100,10 +100,7 @@ def read_attributes(path: Location) -> dict[str, Any]:
 
 
 def read_document(path: Location) -> dict[str, Any]:
-    """Read the document of a store's root, with the metadata of all its arrays, checked.
-
-    NotAStoreError where there is no store, or one that this version of the program does not write.
-    """
+    """Read the document of a store's root, checked; NotAStoreError for what is not as ours."""
     document = _document(path)
     attributes = recognised(path, document["attributes"])
     try:
@@ -127,10 +124,7 @@ def read_document(path: Location) -> dict[str, Any]:
 
 
 def recognised(path: Location, attributes: Any) -> dict[str, Any]:
-    """Attributes of a store, where this version of the program writes such.
-
-    NotAStoreError where it does not.
-    """
+    """Attributes of a store, where this version of the program writes such; or NotAStoreError."""
     ours = _ours(path, attributes)
     if (layout := ours.get("layout")) != LAYOUT:
         raise NotAStoreError(

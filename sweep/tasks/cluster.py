@@ -100,8 +100,8 @@ class RunOptions:
     def place(self, spec: Spec | SceneSpec) -> AnyCluster | None:
         """Return the cluster given here or by the spec's `execution`; None for a plain loop.
 
-        ClusterError where both a scheduler and a cluster are named, or workers that are not ours to
-        start.
+        ClusterError where both a scheduler and a cluster are named, or workers that are not
+        ours to start.
         """
         if self.cluster is not None:
             if self.scheduler is not None:
@@ -129,10 +129,7 @@ class RunOptions:
 
 
 def about_seconds(spec: Spec | SceneSpec) -> float:
-    """Time that a study takes of one core at most, about, by the study alone [s].
-
-    Infinite where shots have as many rays as they turn out to need.
-    """
+    """Time of one core that a study takes, about [s]; infinite if rays follow a tolerance."""
     places = math.prod(int(axis.size) for axis in spec.axes)
     if isinstance(spec, Spec):
         return places * seconds_a_point(spec)
@@ -160,10 +157,7 @@ class Pool(ExitStack):
         return self.options.client is None and self._cluster is None
 
     def connect(self) -> Reached:
-        """Reach the workers, of which there are to be no more than `most`.
-
-        ClusterError where there is no scheduler or worker to be had.
-        """
+        """Reach the workers, no more than `most`; ClusterError where there are none to be had."""
         if self._reached is None:
             client = self.options.client
             if client is None:
@@ -236,12 +230,10 @@ def of_workers(cluster: AnyCluster, workers: int | None) -> AnyCluster:
 def connected(
     cluster: AnyCluster, *, most: int, processes: bool, say: Callable[[str], None]
 ) -> Iterator[Reached]:
-    """Connect a client to a cluster; a cluster that is started here ends with it.
+    """Connect a client to a cluster; one that is started here ends with it.
 
-    No more workers are started than there can be tasks at once (`most`); those of this machine are
-    processes, or threads of this one. `say` takes where the cluster is, and its dashboard.
-
-    ClusterError where no scheduler answers or no worker starts.
+    No more workers are started than there can be tasks at once (`most`). ClusterError where no
+    scheduler answers or no worker starts.
     """
     from distributed import Client
 
@@ -311,10 +303,7 @@ def _started(cluster: Local | Batch | SSH, bounds: Bounds, processes: bool) -> A
 
 
 def _keep(started: Any, cluster: AnyCluster, bounds: Bounds) -> None:
-    """Keep the number of workers within bounds, in the place of those that leave.
-
-    Jobs end with their time, so that theirs is kept even where it is fixed.
-    """
+    """Keep the number of workers within bounds; that of jobs, which end, even if it is fixed."""
     if isinstance(cluster, Batch):
         from sweep.tasks.clusters import batch
 

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sweep.storage.atomic_replace import beside, put, real, replaced_by, settle
+from sweep.storage.atomic_replace import beside, eyepoints_path, put, real, replaced_by, settle
 from sweep.storage.locations import PACKED, Location, located
 from sweep.storage.opening import read_attributes, study_id
 from sweep.tasks import studies, user_code
 from sweep.tasks.cluster import Pool, RunOptions
 from sweep.tasks.errors import BusyError, ClusterError, StoreError, told
-from sweep.tasks.eyepoint_study import EyepointStudy, eyepoints_path
+from sweep.tasks.eyepoint_study import EyepointStudy
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.journal import (
@@ -33,7 +33,6 @@ from sweep.tasks.journal import (
 )
 from sweep.tasks.lock import Lock
 from sweep.tasks.progress import working
-from sweep.tasks.reuse import changed, refuse_unlike, what_is_there
 from sweep.tasks.session import Outcome, Session
 from sweep.tasks.store import (
     create,
@@ -45,6 +44,7 @@ from sweep.tasks.store import (
     sync,
     under_way,
 )
+from sweep.tasks.studies import changed, refuse_unlike, what_is_there
 from sweep.tasks.verify import refuse_damaged
 
 if TYPE_CHECKING:
@@ -235,11 +235,7 @@ def _into(
     anew: bool,
     extends: Location | None = None,
 ) -> Outcome:
-    """Compute a study into its place, or beside a store whose place it takes once it is complete.
-
-    A store that is there is replaced where `replace` says so; what was begun of the study is begun
-    `anew`. Results are taken from the store of a smaller study that it `extends`.
-    """
+    """Compute a study into its place, or beside a store whose place it takes when complete."""
     settle(path)
     new, facts, durable = path, _facts(asked), pool.options.durable
     with ExitStack() as stack:
@@ -343,10 +339,7 @@ def _go_on(
 
 
 def _is_done(path: Location, study: FlightStudy) -> bool:
-    """Tell whether no block is missing, nor any of those eyepoints that are there.
-
-    Folders are looked at only where the log says so.
-    """
+    """Tell whether no block is missing, nor any of those eyepoints that are there."""
     return bool(receipted(path, study).all() and committed(path, study).all()) and all(
         _is_whole(place, eyepoints)
         for eyepoints in study.eyepoint_studies()
@@ -355,11 +348,7 @@ def _is_done(path: Location, study: FlightStudy) -> bool:
 
 
 def _cast(study: FlightStudy, pool: Pool) -> tuple[dict[str, int], str]:
-    """Cast what is missing of a study's eyepoints; rays by scanner, and why any is still missing.
-
-    StoreError where an eyepoint store is not what its name says, or can't be written; SceneError
-    where a file of the scene is missing, changed or unfit.
-    """
+    """Cast what is missing of a study's eyepoints; rays by scanner, and why any is missing."""
     rays: dict[str, int] = {}
     for eyepoints in study.eyepoint_studies():
         path, scanner = eyepoints_path(study.path, eyepoints.id), eyepoints.scanner
@@ -397,10 +386,7 @@ def _is_whole(path: Location, eyepoints: EyepointStudy) -> bool:
 
 
 def _locked(path: Location, eyepoints: EyepointStudy, pool: Pool) -> Lock | None:
-    """Lock an eyepoint store, made if need be, once no other run casts its rays.
-
-    None where the run is interrupted before.
-    """
+    """Lock an eyepoint store, made if need be, once no other run casts; None if interrupted."""
     waiting = False
     while not pool.interrupts.stopping:
         try:

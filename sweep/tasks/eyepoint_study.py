@@ -1,8 +1,8 @@
 """Eyepoints as a study of its own: what every shot of a flight sees through one scanner.
 
-Rays are cast here and nowhere else. The store is named by its content, so that every radiometric
-study of the same geometry finds it. It holds as many rays of each shot as most need; the few shots
-for which the tolerance asks for more are cast again as they are looked at (:func:`refine`).
+Rays are cast here and nowhere else. The store is named by its content, so that every study of the
+same geometry finds it. Shots that need more rays are cast again as they are looked at
+(:func:`refine`).
 """
 
 from __future__ import annotations
@@ -17,18 +17,13 @@ import numpy as np
 from sweep.model.accuracy import Accuracy
 from sweep.model.outputs import BEAMLETS, CYCLES, SHOTS, WEIGHT
 from sweep.model.resolution import more_rays
-from sweep.storage.atomic_replace import real
-from sweep.storage.locations import Location
-from sweep.tasks.effect_selection import TILE_SHOTS
+from sweep.tasks.grid import TILE_SHOTS
 from sweep.tasks.study import FILLS, ArrayLayout, BlockGrid, Results, Study, described
 
 if TYPE_CHECKING:
     from sweep.model.eyepoints import Eyepoints
     from sweep.spec import SceneSpec
     from sweep.spec.world import World
-
-#: Directory of eyepoint stores, beside the stores of the studies that use them.
-EYEPOINTS = "eyepoints"
 
 #: Shots and beamlets of a block, as far as whole cycles allow.
 BLOCK_SHOTS = 4096
@@ -52,16 +47,8 @@ ABOVE = 1.0
 SIZES = {"xyz": 3, "xyz_again": 3}
 
 
-def eyepoints_path(study_path: Location, geometry_id: str) -> Location:
-    """Eyepoint store of a geometry, for the study stored at a path."""
-    return real(study_path).parent / EYEPOINTS / f"{geometry_id}.zarr"
-
-
 class EyepointStudy(Study):
-    """Eyepoints of the shots of a flight through one scanner.
-
-    Rays of each shot, and the scene, built, are those of the spec by default.
-    """
+    """Eyepoints of a flight's shots through one scanner; rays and scene by default its own."""
 
     unit = "shots"
 
@@ -237,8 +224,8 @@ def refine(
 ) -> None:
     """Look at shots again, with more rays, until what these leave is within the tolerance.
 
-    Their number follows from each shot alone. What the ``rays`` of each so far leave is its
-    ``error``, (n,); ``again`` looks at shots, by place, with more, and says what these leave.
+    The ``rays`` of each shot leave an ``error`` so far, (n,); ``again`` looks at shots, by
+    place, with more, and says what these leave.
     """
     needed = more_rays(rays, error, accuracy)
     for number in accuracy.rays:  # rising, and so are the needs of each shot

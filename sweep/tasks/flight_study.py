@@ -21,21 +21,28 @@ from sweep.model.outputs import (
     STATISTICS,
 )
 from sweep.model.resolution import by_tolerance
+from sweep.storage.atomic_replace import eyepoints_path
 from sweep.storage.locations import Location
 from sweep.storage.opening import open_group
-from sweep.tasks.effect_selection import EFFECTS, ERROR, TILE_SHOTS, Selected, ShotsPlan, plan_shots
 from sweep.tasks.eyepoint_study import (
     SIZES,
     EyepointStudy,
-    eyepoints_path,
     refine,
     scene_map,
     world_of,
 )
-from sweep.tasks.grid import Lattice, LatticeGrid
+from sweep.tasks.grid import (
+    EFFECTS,
+    ERROR,
+    TILE_SHOTS,
+    Lattice,
+    LatticeGrid,
+    Selected,
+    ShotsPlan,
+    plan_shots,
+)
 from sweep.tasks.grid_study import coordinates
-from sweep.tasks.reuse import GrowingStudy
-from sweep.tasks.study import ArrayLayout, BlockGrid, Results
+from sweep.tasks.study import ArrayLayout, BlockGrid, GrowingStudy, Results
 
 if TYPE_CHECKING:
     from sweep.model.error_floor import ErrorFloor
@@ -129,17 +136,12 @@ class ScannerBlocks(LatticeGrid):
 class KnownCloud(NamedTuple):
     """Results of a flight's block that are there before it is computed."""
 
-    there: np.ndarray
-    """(shots, draws): which."""
-    results: Results
-    """(shots or cycles, draws, ...) by name; (shots, ...) what no draw changes."""
+    there: np.ndarray  # (shots, draws): which
+    results: Results  # (shots or cycles, draws, ...) by name; (shots, ...) what no draw changes
 
 
 class FlightStudy(GrowingStudy):
-    """The point clouds of a flight, a group of arrays for each scanner.
-
-    Its eyepoints are in the folder of its store. The scene, built, is by default that of the spec.
-    """
+    """The point clouds of a flight, a group of arrays for each scanner."""
 
     unit = "shots"
 
@@ -249,10 +251,7 @@ class FlightStudy(GrowingStudy):
     def _looked_at(
         self, blocks: ScannerBlocks, part: Part
     ) -> tuple[np.ndarray, Results, Eyepoints, Selected]:
-        """Numbers of a block's shots, what they see, and what is simulated of them.
-
-        Whole tiles are planned, so that this does not depend on the block.
-        """
+        """Numbers of a block's shots, what they see, and what is simulated, by whole tiles."""
         first, stop = (i * blocks.shots_a_cycle for i in (part.cycles.start, part.cycles.stop))
         begin = first // TILE_SHOTS * TILE_SHOTS
         end = -(-stop // TILE_SHOTS) * TILE_SHOTS
@@ -283,10 +282,7 @@ class FlightStudy(GrowingStudy):
         numbers: np.ndarray,
         known: KnownCloud | None = None,
     ) -> Results:
-        """Radiometry, draws and navigation of shots in whole cycles, by number in the flight.
-
-        Results that are ``known`` are not computed.
-        """
+        """Radiometry, draws and navigation of shots in whole cycles, but for what is ``known``."""
         blocks = self.scanners[part.scanner]
         draws, each = len(part.draws), blocks.shots_a_cycle
         there, results = known or self._nothing_known(blocks, selected.flags.size, draws)
@@ -323,10 +319,7 @@ class FlightStudy(GrowingStudy):
         rows: np.ndarray,
         cloud: Cloud,
     ) -> Iterator[tuple[np.ndarray, Results]]:
-        """Results of some of the shots, those together that need much the same.
-
-        With more rays of those whose own tell that they are too few.
-        """
+        """Results of some shots, those together that need much the same; with more rays if so."""
         for index, effects, flags in selected.some(rows).together():
             some, look = rows[index], partial(cloud, effects)
             results = look(eyepoints.some(some), numbers[some], flags)

@@ -27,13 +27,13 @@ from sweep.model.outputs import (
 )
 from sweep.model.resolution import by_tolerance
 from sweep.model.unsupported import UnsupportedShot
-from sweep.tasks.effect_selection import EFFECTS, ERROR, EffectSelection, Selected
-from sweep.tasks.grid import Grid, Value, canonical_rows
-from sweep.tasks.reuse import DAMAGED, GrowingStudy
+from sweep.tasks.grid import EFFECTS, ERROR, EffectSelection, Grid, Selected, Value, canonical_rows
 from sweep.tasks.study import (
+    DAMAGED,
     NONE_FOUND,
     ArrayLayout,
     Found,
+    GrowingStudy,
     Known,
     Results,
     Stop,
@@ -188,11 +188,7 @@ class GridStudy(GrowingStudy):
         return number
 
     def compile(self) -> None:
-        """Compile what the model compiles, once, before workers find it on disk.
-
-        One draw of a point with every effect that may be needed, and one with none. Random effects
-        are not for every instrument: of these, only those that the point itself needs.
-        """
+        """Compile what the model compiles: a point with all effects that may be, and with none."""
         modes, once = self.spec.modes(), with_few_draws(self.spec, 1)
         may_be = [e.name for e in ALL if modes[e.name] != "off" and not e.is_random]
         own = names_of(int(self.selection.of_block(0).flags[0]))
@@ -238,8 +234,7 @@ def evaluated(
     """Compute a block's points that are not done, grouped by their effects.
 
     Those that need not be computed are ``known``, of another study, or ``begun`` by a call that
-    was stopped. Raises Unfinished where it is stopped, with at least some draws taken; the next
-    call goes on, to the same bits.
+    was stopped. Unfinished where it is stopped; the next call goes on, to the same bits.
     """
     parameters, order = grid.parameters(block), grid.geometry_order(block)
     order = order[~np.isin(order, [*known.done.points, *begun.done.points])]
@@ -285,9 +280,8 @@ def evaluate_points(
 ) -> Results:
     """Results of points, (count,) each; counts of a fixed number of draws (count, batches).
 
-    Parameters are scalars, strings or arrays (count,). Outputs are means over the study's draws
-    where random effects are simulated, and an error where it has no draws. Draws go on from those
-    ``before``, until there are all or ``stop`` says so.
+    Parameters are scalars, strings or arrays (count,). Draws go on from those ``before``, until
+    there are all or ``stop`` says so.
     """
     if spec.draws.any:
         return _drawn(spec, parameters, count, effects, before, stop)
@@ -319,10 +313,7 @@ def batch_sizes(spec: Spec) -> list[int]:
 
 
 def draw_keys(spec: Spec, parameters: Mapping[str, Value], count: int) -> np.ndarray:
-    """Random keys (count, 2) uint64 of points, by what they are.
-
-    The same however closely draws are looked at, and by whatever method.
-    """
+    """Random keys (count, 2) uint64 of points, however closely these are looked at."""
     from sweep.model.philox import point_keys
 
     physical = {path: v for path, v in parameters.items() if not path.startswith(NOT_PHYSICAL)}

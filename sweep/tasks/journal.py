@@ -2,21 +2,14 @@
 
 A block is done when its receipt is in the log and its objects are in the store; what is not done is
 computed again, to the same bytes. The log is only appended to, by the one driver that holds the
-store's lock; a receipt whose chunks were later found damaged is withdrawn by a further line. Every
-line carries its own digest, and one that is damaged counts for nothing.
+store's lock. A receipt whose chunks were later found damaged is withdrawn by a further line; a line
+that does not match its own digest counts for nothing.
 
-Chunks are seen by listing folders, one look a folder. Sizes of files are asked of the operating
-system one by one, some 3 us each: 27 arrays of a million blocks take more than a minute. The check
-runs in threads, concurrently with the work; its memory is a few bytes a block.
+The recipe is what a store's own bytes do not say: where its study's files are, and which store it
+extends.
 
-The recipe is the part that a store's own bytes do not say: where its study's files are, and which
-store it extends. A study is the same wherever its files are, and however much of it was computed
-before. It is written anew by whoever runs the study from its spec.
-
-Blocks that take long are computed in pieces. A worker draws for some seconds, saves what it has in
-a file of the journal, and whoever takes up the block next goes on from there, to the same bytes.
-The file carries a digest: where it is damaged, cut short or of another block, its draws are taken
-again.
+Blocks that take long are computed in pieces. A worker draws for some seconds and saves what it has
+in a file of the journal, with a digest; whoever takes up the block next goes on from there.
 """
 
 from __future__ import annotations
@@ -100,8 +93,8 @@ class Failure:
 class Journal:
     """Logs of a store, to append to; on opening, lines that are damaged or cut short are dropped.
 
-    The caller holds the store's lock. Where it is `durable`, a receipt is on the disk once
-    committed, and not only with the operating system.
+    The caller holds the store's lock. A receipt of a `durable` one is on the disk once
+    committed.
     """
 
     def __init__(self, store_path: Location, *, durable: bool = False) -> None:
@@ -111,10 +104,7 @@ class Journal:
             log.keep(lambda line: body_of(line) is not None)
 
     def commit(self, *receipts: Receipt) -> None:
-        """Append receipts: from here on their blocks are done.
-
-        In an object store that is so some seconds later (`flush`): till then they are gathered.
-        """
+        """Append receipts: their blocks are done; in an object store from the next `flush` on."""
         now = round(time.time(), 3)
         self._append(RECEIPTS, *({**asdict(receipt), "time": now} for receipt in receipts))
 
@@ -233,10 +223,7 @@ class Look:
         return not wait(self._arrays, seconds).not_done
 
     def whole(self) -> np.ndarray:
-        """Blocks that lack nothing as far as was looked, (blocks,) bool.
-
-        OSError where a folder can't be read.
-        """
+        """Blocks that lack nothing as far as was looked, (blocks,) bool; OSError if unreadable."""
         found = self._among.copy()
         for array in self._arrays:
             if array.done():
@@ -291,11 +278,7 @@ def _keys(folder: ObjectPath, shape: tuple[int, ...]) -> Iterator[tuple[tuple[in
 
 
 def _look(folder: Path | str, there: np.ndarray, within: int | None = None) -> None:
-    """Note the chunks in a folder and those below it, (positions,) bool.
-
-    Folders are named in the one that they are in, which is open (`within`, a descriptor): a file's
-    path is then short.
-    """
+    """Note the chunks in a folder and below, (positions,) bool; it is in an open one."""
     try:
         opened = os.open(folder, os.O_RDONLY | os.O_DIRECTORY, dir_fd=within)
     except (FileNotFoundError, NotADirectoryError):
@@ -322,17 +305,12 @@ class Begun(NamedTuple):
     """The saved part of a block."""
 
     known: Known = Known()
-    points: float = 0.0
-    """That this comes to; a point that is drawn in part counts in part."""
-    seconds: float = 0.0
-    """Spent on it."""
+    points: float = 0.0  # that this comes to; a point that is drawn in part counts in part
+    seconds: float = 0.0  # spent on it
 
 
 def write_begun(path: Location, study_id: str, block: int, begun: Begun) -> None:
-    """Save what there is of a block, in the place of less.
-
-    OSError where it can't be written.
-    """
+    """Save what there is of a block, in the place of less; OSError where it can't be written."""
     if read_begun(path, study_id, block).points >= begun.points:
         return  # another worker, that was thought to be lost, was quicker
     buffer = io.BytesIO()

@@ -1,7 +1,4 @@
-"""One driver a store: a lock that says who holds it and whether they still live.
-
-On disk it is a file that is linked into place, in an object store an object that is put if absent.
-"""
+"""One driver a store: a lock that says who holds it and whether they still live."""
 
 from __future__ import annotations
 
@@ -95,21 +92,14 @@ def holder(store_path: Location) -> Holder | None:
 
 
 def is_live(store_path: Location, who: Holder) -> bool:
-    """Tell whether the holder of a lock still runs.
-
-    On this host the process itself is asked for. Elsewhere the heartbeat decides, its age taken by
-    the clock of the file system, or object store, that both write to.
-    """
+    """Tell whether the holder of a lock runs: its process here, its heartbeat elsewhere."""
     if who.host == socket.gethostname() and who.machine in ("", _machine()):
         return abs(_start_of(who.pid) - who.started) < 1.0
     return heartbeat_age(store_path) < EXPIRY
 
 
 def heartbeat_age(store_path: Location) -> float:
-    """Age of a lock's last heartbeat [s]; infinite where there is no lock.
-
-    The clock of the file system, or object store, is read off a file made for it.
-    """
+    """Age of a lock's last heartbeat [s], by the file system's clock; infinite without one."""
     path = store_path / JOURNAL / LOCK
     probe = path.with_name(f"clock-{os.getpid()}-{uuid.uuid4().hex[:8]}")
     now: float | None = None
@@ -178,11 +168,7 @@ def _guard(path: Path) -> Iterator[None]:
 
 
 class _ObjectClaim:
-    """A lock as an object: every change of it is a conditional put, of what was seen before.
-
-    Its first line is the holder's; a second counts its heartbeats, so that no two states of it are
-    alike. Nobody holds an empty one.
-    """
+    """A lock as an object, changed by conditional puts: its holder, and a count of heartbeats."""
 
     def __init__(self, path: ObjectPath) -> None:
         self._path = path
@@ -240,10 +226,7 @@ def _claim(store_path: Location) -> _FileClaim | _ObjectClaim:
 class Lock:
     """A store's lock, held and kept alive until released.
 
-    Raises
-    ------
-    BusyError, StoreError
-        Where a living driver holds it; where the store can't be written.
+    BusyError where a living driver holds it, StoreError where the store can't be written.
     """
 
     def __init__(self, store_path: Location) -> None:

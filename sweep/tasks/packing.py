@@ -1,8 +1,4 @@
-"""A finished store as few large files: a copy, sharded, checked value by value as it is made.
-
-A store that is being written has a file for every chunk, for no two writers may share one. Once it
-is complete, chunks are better kept many to a file: to copy, to archive, to open over a network.
-"""
+"""A finished store as few large files: a copy, sharded, checked value by value as it is made."""
 
 from __future__ import annotations
 
@@ -27,6 +23,7 @@ from sweep.storage.locations import (
     zarr_store,
 )
 from sweep.storage.logs import read_lines, sealed
+from sweep.storage.opening import open_group
 from sweep.tasks import store, studies
 from sweep.tasks.errors import StoreError, told
 from sweep.tasks.journal import LOGS, RECIPE, committed
@@ -46,13 +43,8 @@ def pack(
 ) -> Location:
     """Copy a complete store into one of few files, each many chunks: whole, or not at all.
 
-    Progress is as in `run`; shown after two seconds.
-
-    Raises
-    ------
-    StoreError
-        Where there is no store, or it is not complete; where something is in the way of the copy,
-        or it can't be written or read back as it was.
+    StoreError where it is not complete, where something is in the way of the copy, or it can't
+    be written or read back as it was.
     """
     path, output = located(path).absolute(), located(output).absolute()
     attributes, study = studies.read(path)
@@ -84,7 +76,7 @@ def _pack(path: Location, output: Location, study: Study, shown: Progress) -> No
         root = (template / "zarr.json").read_bytes()
         for name in files_below(template).keys() - {"zarr.json", f"{JOURNAL}/{store.MANIFEST}"}:
             put_whole(output / name, (template / name).read_bytes())
-    names, arrays = sorted(study.owners()), store.open_group(path)
+    names, arrays = sorted(study.owners()), open_group(path)
     shown.begin(points=len(names), done=0, unit="arrays")
     try:
         for name in names:
@@ -96,18 +88,16 @@ def _pack(path: Location, output: Location, study: Study, shown: Progress) -> No
     if studies.read(path)[0]["study_id"] != study.id:
         raise StoreError(f"{path} was extended or replaced while it was copied: try again")
     for name in (*LOGS, RECIPE):
-        if content := b"".join(map(_without_host, read_lines(path / JOURNAL / name))):
+        lines = read_lines(path / JOURNAL / name)
+        # without the machine, as copies are given away
+        told = [{k: v for k, v in line.items() if k not in ("host", "pid")} for line in lines]
+        if content := b"".join(map(sealed, told)):
             put_whole(output / JOURNAL / name, content)
     names = [name for name in files_below(output) if not name.startswith(f"{JOURNAL}/")]
     digests = {name: logs.digest(output, [name]) for name in names}
     digests["zarr.json"] = logs.digest_of([("zarr.json", root)])
     store.list_objects(output, attributes, digests)
     put_whole(output / "zarr.json", root)
-
-
-def _without_host(record: dict[str, Any]) -> bytes:
-    """Remove the machine from a line of a log: copies are given away."""
-    return sealed({name: value for name, value in record.items() if name not in ("host", "pid")})
 
 
 def _pack_array(source: Any, output: Location) -> None:
@@ -131,10 +121,7 @@ def _copy(source: zarr.Array[Any], target: zarr.Array[Any], part: tuple[slice, .
 
 
 def shard_shape(layout: ArrayLayout) -> tuple[int, ...] | None:
-    """Whole chunks along each axis that make a file, the last axis filled first.
-
-    None where a single chunk is a file, or what it holds is known.
-    """
+    """Whole chunks along each axis that make a file, the last axis filled first; or None."""
     if layout.values is not None:
         return None
     room = SHARD_BYTES // max(1, layout.bytes_of(layout.chunks))

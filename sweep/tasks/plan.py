@@ -14,12 +14,12 @@ import numpy as np
 import psutil
 
 from sweep.model.effects.catalogue import EFFECTS, NAMES
+from sweep.storage.atomic_replace import eyepoints_path
 from sweep.storage.locations import Location
 from sweep.tasks import cluster
-from sweep.tasks.effect_selection import TILE_SHOTS, EffectSelection
-from sweep.tasks.eyepoint_study import EyepointStudy, eyepoints_path
+from sweep.tasks.eyepoint_study import EyepointStudy
 from sweep.tasks.flight_study import FlightStudy
-from sweep.tasks.grid import Value
+from sweep.tasks.grid import TILE_SHOTS, EffectSelection, Value
 from sweep.tasks.grid_study import GridStudy, evaluate_points, select, with_few_draws
 from sweep.tasks.studies import study_of
 
@@ -82,17 +82,7 @@ class Plan:
 def plan(
     spec: Spec | SceneSpec, *, store: Location | None = None, workers: int | None = None
 ) -> Plan:
-    """Plan a study, by its size and a second of measuring its own points.
-
-    Parameters
-    ----------
-    spec
-        The study.
-    store
-        Where it would be stored: eyepoints are searched for in its folder.
-    workers
-        Workers it would run on; default those of the spec, else all cores.
-    """
+    """Plan a study to be stored at a place, by its size and a second of measuring points."""
     study = study_of(spec, (store or Path("nowhere.zarr")).absolute())
     scanners: tuple[ScannerPlan, ...] = ()
     reports: tuple[str, ...] = ()
@@ -129,8 +119,8 @@ def plan(
 def measured(study: GridStudy) -> float:
     """Time a point takes on one core [s], measured on points spread over the grid.
 
-    Whole sets of points that share a geometry are taken, so that sharing shows as it will. With an
-    accuracy to be met, points that miss it after few draws are taken to reach their limit.
+    Whole sets of points that share a geometry are taken, so that sharing shows as it will.
+    Points that miss an accuracy after few draws are taken to reach their limit.
     """
     grid = study.grid
     blocks = np.unique(np.linspace(0, grid.n_blocks - 1, PLACES).astype(np.int64))
@@ -151,10 +141,8 @@ class Round(NamedTuple):
     """A look at some points."""
 
     points: int
-    seconds: float
-    """That it has taken."""
-    parts: tuple[float, ...]
-    """Time of each kind of work [s]."""
+    seconds: float  # that it has taken
+    parts: tuple[float, ...]  # time of each kind of work [s]
 
 
 def _enough(look: Callable[[int], Round], points: int, seconds: float) -> Round:
@@ -193,8 +181,7 @@ def _evaluate_some(study: GridStudy, block: int, rows: int) -> tuple[int, float]
 class Seconds(NamedTuple):
     """Time of some points on one core."""
 
-    taken: float
-    """Measured."""
+    taken: float  # measured
     left_out: float
     """Of draws that were left out: of all up to their limit, of points that are not settled."""
 
@@ -207,10 +194,7 @@ def timed(
     *,
     most_draws: int,
 ) -> Seconds:
-    """Time of some points, each drawn so many times at the most.
-
-    The other parameters are those of :func:`evaluate_points`.
-    """
+    """Time of some points, each drawn so many times at the most; as of :func:`evaluate_points`."""
     fewer = with_few_draws(spec, most_draws)
     if spec.draws.whole_spectra:
         evaluate_points(with_few_draws(spec, 1), parameters, count, effects)  # makes tables once
@@ -305,11 +289,7 @@ class EffectsTable:
 
 
 def effects_table(study: GridStudy | FlightStudy, *, costs: bool = True) -> EffectsTable:
-    """Effects of a study: where they are simulated, as its store will tell.
-
-    By the plans of its tiles, as many as are looked at, and of a flight at some places along its
-    axes. ``costs``: whether to measure what effects of a grid cost, in a second or so.
-    """
+    """Effects of a study, by the plans of its tiles, and what they cost, if asked and on a grid."""
     if isinstance(study, GridStudy):
         return _of_grid(study, costs)
     return _of_flight(study)
@@ -375,12 +355,9 @@ def _of_flight(study: FlightStudy) -> EffectsTable:
 class _Planned(NamedTuple):
     """Plans of m tiles."""
 
-    simulated: np.ndarray
-    """(effects, m): points at which each effect is simulated."""
-    change: np.ndarray
-    """(effects, m)"""
-    error: np.ndarray
-    """(m,)"""
+    simulated: np.ndarray  # (effects, m): points at which each effect is simulated
+    change: np.ndarray  # (effects, m)
+    error: np.ndarray  # (m,)
 
 
 def _table(

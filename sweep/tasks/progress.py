@@ -57,11 +57,7 @@ def chosen(progress: bool | Progress) -> Progress:
 
 @contextmanager
 def working(what: str, told: Progress | None = None) -> Iterator[None]:
-    """Say that something goes on while a block runs, from its third second on.
-
-    While kernels are compiled that is said in the place of `what`, with their number. It is `told`
-    to what standard error can show, by default.
-    """
+    """Say from the third second on that something goes on, or that kernels are compiled."""
     from numba.core.event import install_recorder
 
     shown, begun, over = told or chosen(True), time.monotonic(), threading.Event()
@@ -249,10 +245,7 @@ class Bar(_Counting):
 
 
 class Interrupts:
-    """Ctrl-C once: finish what runs and stop; twice: stop at once.
-
-    Outside the main thread, where no signal arrives, nothing is ever stopping.
-    """
+    """Ctrl-C once: finish what runs and stop; twice: stop at once; in the main thread only."""
 
     def __init__(self) -> None:
         self.stopping = False

@@ -1,7 +1,6 @@
 """A rolling window of Dask tasks: never more in flight than keeps every worker busy.
 
-The client holds twice as many tasks as there are worker slots, whatever the size of the study. A
-task writes its blocks itself and returns receipts, which the client takes and lets go at once: no
+A task writes its blocks itself and returns receipts, which the client takes and lets go at once: no
 result stays on a worker that its death could lose.
 """
 
@@ -128,10 +127,7 @@ class Pace:
 
 @dataclass
 class Slots:
-    """Worker threads of a cluster, asked for anew every few seconds: workers come and go.
-
-    Those that may come count as well: a cluster between bounds grows with the work it sees.
-    """
+    """Worker threads of a cluster, or those that may come, asked for anew every few seconds."""
 
     client: Client
     hoped: int = 0
@@ -161,12 +157,10 @@ class Scheduler:
     """Tasks in flight on a cluster.
 
     A worker that can't open the store, can't write to it, or writes to another one is left out,
-    and its blocks go to the others. Blocks of a worker that is silent for long are computed by
-    others too, once these have nothing else to do; the first answer counts.
-
-    The cluster may come to have the worker threads that are ``hoped`` for. ``seen`` tells whether
-    what a receipt is for is in the store here: by its size, or read and held to its digest, as is
-    done with the first block of each worker.
+    and its blocks go to the others. Blocks of a silent worker are computed by others too, once
+    these have nothing else to do; the first answer counts. ``seen`` tells whether what a
+    receipt is for is in the store here: by its size, or read and held to its digest, as the
+    first block of each worker is.
     """
 
     def __init__(
@@ -189,11 +183,9 @@ class Scheduler:
     def answers(self, stopping: Callable[[], bool]) -> Iterator[Answer]:
         """Answers as they arrive; an empty one every `TICK` while none does.
 
-        Once `stopping` says so nothing more is sent, and the iteration ends with what is out, or
-        at once where there is no worker to do it.
-
-        SchedulerLost where the scheduler, and with it what was out, is gone. StoreError, OSError
-        where no worker can write to the store.
+        Once `stopping` says so nothing more is sent, and the iteration ends with what is
+        out, or at once where there is no worker to do it. SchedulerLost where the scheduler
+        is gone; StoreError, OSError where no worker can write to the store.
         """
         try:
             while True:
@@ -234,10 +226,7 @@ class Scheduler:
             self._send(_Task(blocks), **self._elsewhere(blocks[0]))
 
     def _suspect_flies(self) -> bool:
-        """Tell whether a block that failed before is out: two could blame each other's deed.
-
-        Tasks on a worker that one of them kills all count as failed; a second failure is final.
-        """
+        """Tell whether a block that failed before is out: two could blame each other's deed."""
         failed = self._blocks.failed
         return bool(failed) and any(task.blocks[0] in failed for task in self._flying.values())
 
@@ -331,11 +320,7 @@ class Scheduler:
         self._copies.update(blocks)
 
     def _verify(self, answer: Answer) -> None:
-        """Leave the receipts in an answer of what is in the store here, held-back ones too.
-
-        A file server may show what others write some seconds late. A worker whose writing never
-        shows sees another store.
-        """
+        """Leave the receipts of what is in the store here, which may show some seconds late."""
         now = time.monotonic()
         looked_for = [(receipt, answer.worker, now + LATENCY) for receipt in answer.receipts]
         if now - self._looked > TICK:

@@ -97,10 +97,7 @@ class Absence:
         self._since, self._ever, self._patience = time.monotonic(), False, ABSENT
 
     def told(self, workers: int, *, worked: bool = False) -> str:
-        """Words for so many workers at this time; mostly none.
-
-        ``worked`` says that one has answered since, which may have gone before it was counted.
-        """
+        """Words for so many workers now, mostly none; ``worked``: one has answered since."""
         if workers or worked:
             self._since, self._ever, self._patience = time.monotonic(), True, ABSENT
         waited = time.monotonic() - self._since
@@ -131,10 +128,7 @@ class Session:
         self._begun: dict[int, float] = {}  # points there are of unfinished blocks
 
     def run(self, *, before: str = "", rays: Mapping[str, int] | None = None) -> Outcome:
-        """Compute all that is left, or as much as can be.
-
-        ``before``: why what comes before this study is not there. ``rays``: those cast for it.
-        """
+        """Compute all that is left; ``before``: why what comes before is not there."""
         start = time.monotonic()
         self._begun = journal.begun_points(self._path, self._study.id)
         receipts = read_receipts(self._path, self._study.n_blocks)
@@ -197,10 +191,7 @@ class Session:
         return self._compute(settled, settled & done)
 
     def _compute(self, settled: np.ndarray, done: np.ndarray) -> str:
-        """Compute all blocks but those that are settled; why it ended before, where it did.
-
-        Those that are done are told as such.
-        """
+        """Compute all blocks but those that are settled; why it ended before, where it did."""
         if settled.all():
             return ""
         blocks = BlockQueue(settled)

@@ -32,21 +32,11 @@ SUFFIXES = (".zarr", ".npz")
 def spectra(
     spec: Spec, parameters: Mapping[str, float | int | str], *, draws: int, first: int = 0
 ) -> xr.Dataset:
-    """Spectra of one point of a study.
+    """Spectra of one point of a study, by the SI values of its parameters, as the study draws them.
 
-    Parameters
-    ----------
-    spec, parameters
-        The study, and the SI values of all parameters of the point.
-    draws, first
-        Number of draws and of the first one: noise and random effects are those that the study
-        itself draws there.
-
-    Returns
-    -------
-    Dataset
-        Complex ``spectrum`` (draw, segment, frequency), ``signal`` without noise, and what is true.
-        Every effect is there that is not off and that the point has anything of.
+    Complex ``spectrum`` (draw, segment, frequency), ``signal`` without noise, and what is true.
+    Every effect is there that is not off and that the point has anything of. The draws begin at
+    ``first``.
     """
     from sweep.model.noisy_spectra import drawn_of, fading_of, noise_of, signal_of
     from sweep.model.realisations import random_effects, realise
@@ -164,11 +154,8 @@ def _lines(shots: Shots, width: float) -> tuple[np.ndarray, np.ndarray]:
 def write(dataset: xr.Dataset, path: Path, *, overwrite: bool = False) -> None:
     """Write spectra as a Zarr store or as a numpy archive, by the path's suffix.
 
-    Raises
-    ------
-    StoreError
-        Where the suffix is another, or something is in the way: with `overwrite`, what this
-        function did not write.
+    StoreError for another suffix, or something in the way: with `overwrite`, what is no such
+    file.
     """
     if path.suffix not in SUFFIXES:
         raise StoreError(f"{path} ends in neither {' nor '.join(SUFFIXES)}")

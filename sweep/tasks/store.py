@@ -1,8 +1,8 @@
 """A study's Zarr store: a template made whole at once, then whole chunks written block by block.
 
-No two blocks share a chunk of any array, so writers need no locks between them; a chunk is either
-there, whole, or absent. Only `.sweep/`, the journal, knows hosts and times: every other byte
-follows from the study, and from the versions of the software, by which a store may be refused.
+No two blocks share a chunk, so writers need no locks between them. Only `.sweep/`, the journal,
+knows hosts and times: every other byte follows from the study, and from the versions of the
+software.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ import platform
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from functools import cache, cached_property
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Self, cast
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -37,7 +37,7 @@ from sweep.storage.locations import (
     put_whole,
 )
 from sweep.storage.logs import digest, digest_of, read_lines, sealed
-from sweep.storage.opening import LAYOUT, MANIFEST, ZSTD_LEVEL, open_group
+from sweep.storage.opening import LAYOUT, MANIFEST, ZSTD_LEVEL
 from sweep.tasks.errors import BusyError, StoreError
 from sweep.tasks.journal import LOGS, REPLACES, read_recipe, write_recipe
 from sweep.tasks.lock import LOCK, Lock
@@ -52,9 +52,6 @@ ROOT = "zarr.json"
 
 #: Object that says that what lies at a place in an object store is a store half made or removed.
 UNFINISHED = "partial"
-
-#: Kinds of numpy's types whose chunks are their values and nothing else.
-PLAIN = "biuf"
 
 _libc = ctypes.CDLL(None, use_errno=True)
 
@@ -74,14 +71,8 @@ def create(
     """Make a new store without results: metadata, known arrays, and the spec.
 
     It is built in the same folder and renamed, so that a creation cut short leaves nothing that
-    looks like a store; one in an object store is built here and sent, its root last. It may
-    `replace` what is there, on disk, and be on the disk, where it is `durable`, before it is in its
-    place. The `recipe` is facts for its journal.
-
-    Raises
-    ------
-    StoreError
-        Where something is in its place, or the place can't be written.
+    looks like a store; one in an object store is built here and sent, its root last. StoreError
+    where something is in its place, or the place can't be written.
     """
     path = located(path)
     try:
@@ -117,10 +108,7 @@ def _send(built: Path, path: ObjectPath) -> None:
 
 @contextmanager
 def making(path: ObjectPath) -> Iterator[None]:
-    """Reserve a place while a store is made there, marked as half made till the end.
-
-    StoreError where something is there, or somebody makes a store there.
-    """
+    """Reserve a place while a store is made there, marked so; StoreError where it is taken."""
     mark = path / JOURNAL / UNFINISHED
     with Lock(path):
         if mark.exists():  # what a creation or removal cut short has left
@@ -133,10 +121,7 @@ def making(path: ObjectPath) -> Iterator[None]:
 
 
 def remove(path: Location) -> None:
-    """Take a store away, out of its place in one step; an object store's lock stays.
-
-    There the root goes first, so that what is left looks like none.
-    """
+    """Take a store away in one step; in an object store its root first: it is none then."""
     if isinstance(path, Path):
         discard(path)
         return
@@ -156,11 +141,7 @@ def build(
     *,
     shards: Callable[[ArrayLayout], tuple[int, ...] | None] = lambda layout: None,
 ) -> None:
-    """Make a store without results, in a place of its own, where nothing is.
-
-    Its group says `attributes` of it. A file of an array holds one chunk, or as many as make up the
-    points that `shards` gives.
-    """
+    """Make a store without results; a file holds one chunk, or as many as `shards` has."""
     import zarr
 
     group = zarr.create_group(path, zarr_format=3, attributes=attributes)
@@ -185,10 +166,7 @@ def new_attributes(study: Content) -> dict[str, Any]:
 
 
 def list_objects(path: Location, attributes: dict[str, Any], digests: Mapping[str, str]) -> None:
-    """Put down what a store is made of before there are results, by digests of its objects.
-
-    The attributes, too, which all of it follows from.
-    """
+    """Put down a store's attributes, and digests of what it is made of before results."""
     lines = [sealed({"attributes": attributes, "objects": len(digests)})]
     lines += [sealed({"object": name, "digest": found}) for name, found in sorted(digests.items())]
     put_whole(path / JOURNAL / MANIFEST, b"".join(lines))
@@ -219,11 +197,7 @@ def _add(group: zarr.Group, layout: ArrayLayout, shards: tuple[int, ...] | None)
 
 
 def _consolidate(path: Path) -> None:
-    """Put the metadata of all arrays in the group's own, as Zarr's Python library lays it out.
-
-    Written by hand because the library warns on doing it. It can't go stale: neither shapes nor
-    attributes change after creation.
-    """
+    """Put the metadata of all arrays in the group's own; Zarr's library warns on doing it."""
     documents = {
         str(file.parent.relative_to(path)): json.loads(file.read_text())
         for file in sorted(path.rglob("zarr.json"))
@@ -238,51 +212,22 @@ def _consolidate(path: Path) -> None:
     (path / "zarr.json").write_text(json.dumps(root))  # not indented: ten times as fast
 
 
-class Chunked(NamedTuple):
-    """Cut of an array into chunks, and their bytes, as Zarr writes them.
+def encoded(layout: ArrayLayout, values: np.ndarray) -> bytes:
+    """Bytes of a chunk of numbers, at the array's edge a part of one, as Zarr writes them.
 
-    Zarr recomputes these every time, and hands every chunk to an event loop with threads. That
-    takes nearly a millisecond, ten times as long as here; for a block of 26 arrays it is 2 % of a
-    second's work.
+    They are packed little-endian values in C order, and the crc32c of that. Zarr takes ten times as
+    long, some 2 % of a second's work for a block of 26 arrays.
     """
+    from google_crc32c import value as crc32c
 
-    shape: tuple[int, ...]
-    chunks: tuple[int, ...]
-    dtype: np.dtype[Any]
-    fill: Any
-
-    @classmethod
-    def of(cls, array: zarr.Array[Any]) -> Self:
-        """Return the layout of an array."""
-        return cls(array.shape, array.chunks, array.dtype, array.fill_value)
-
-    @property
-    def is_plain(self) -> bool:
-        """Tell whether chunks are numbers."""
-        return self.dtype.kind in PLAIN
-
-    def place(self, position: tuple[int, ...]) -> tuple[slice, ...]:
-        """Slices of the array that a chunk holds; at the far edge they are a part of one."""
-        return tuple(
-            slice(p * chunk, min((p + 1) * chunk, size))
-            for p, chunk, size in zip(position, self.chunks, self.shape, strict=True)
-        )
-
-    def encoded(self, values: np.ndarray) -> bytes:
-        """Bytes of a chunk: little-endian values in C order, compressed, and the crc32c of that.
-
-        At the array's far edge values fill a part of it.
-        """
-        from google_crc32c import value as crc32c
-
-        dtype = self.dtype.newbyteorder("<")
-        if values.shape == self.chunks:
-            chunk = np.ascontiguousarray(values, dtype).reshape(self.chunks)
-        else:
-            chunk = np.full(self.chunks, self.fill, dtype)
-            chunk[tuple(slice(size) for size in values.shape)] = values
-        content: bytes = _zstd().encode(chunk)
-        return content + int(crc32c(content)).to_bytes(4, "little")
+    dtype = np.dtype(layout.dtype).newbyteorder("<")
+    if values.shape == layout.chunks:
+        chunk = np.ascontiguousarray(values, dtype).reshape(layout.chunks)
+    else:
+        chunk = np.full(layout.chunks, layout.fill, dtype)
+        chunk[tuple(slice(size) for size in values.shape)] = values
+    content: bytes = _zstd().encode(chunk)
+    return content + int(crc32c(content)).to_bytes(4, "little")
 
 
 @cache
@@ -300,22 +245,13 @@ class Written(NamedTuple):
 
 
 class Arrays:
-    """Arrays of a store for writing blocks, opened when they are first written and kept open."""
+    """Arrays of a study's store, for writing blocks."""
 
     def __init__(self, path: str | Location, study: Study) -> None:
-        self.path = located(path)
-        self.study = study
-        self._arrays: dict[str, tuple[zarr.Array[Any], Chunked]] = {}
+        self.path, self.study = located(path), study
 
     def write(self, block: int, results: Mapping[str, np.ndarray]) -> Written:
-        """Write the chunks of one block, each whole.
-
-        Raises
-        ------
-        ValueError
-            Where the results are not exactly the block's: a missing or unknown name, or a shape
-            that would fill its chunks in part.
-        """
+        """Write the chunks of one block, each whole; ValueError where results are not its own."""
         positions = self.study.chunks(block)
         if results.keys() != positions.keys():
             odd = sorted(results.keys() ^ positions.keys())
@@ -329,34 +265,20 @@ class Arrays:
         return Written(digest_of(stored), sum(len(content) for _, content in stored))
 
     def _put(self, name: str, position: tuple[int, ...], values: np.ndarray) -> tuple[str, bytes]:
-        """Write a chunk; its path inside the store, and the bytes that are there."""
-        array, chunked = self._array(name)
-        place = chunked.place(position)
-        whole = tuple(s.stop - s.start for s in place)
+        """Write a chunk; its path inside the store, and its bytes."""
+        layout = self.study.layouts[name]
+        whole = tuple(s.stop - s.start for s in layout.region(position))
         if values.shape != whole:
             raise ValueError(
                 f"{name} has shape {values.shape} for its chunk {whole} at {position}: "
                 "blocks write whole chunks only"
             )
-        stored = chunk_object(name, position)
-        if isinstance(self.path, Path) and chunked.is_plain:
-            content = chunked.encoded(values)
+        stored, content = chunk_object(name, position), encoded(layout, values)
+        if isinstance(self.path, Path):
             locations.put(f"{self.path}/{stored}", content)
         else:
-            array[place or ...] = values
-            content = (self.path / stored).read_bytes()
+            (self.path / stored).write_bytes(content)
         return stored, content
-
-    def _array(self, name: str) -> tuple[zarr.Array[Any], Chunked]:
-        if name not in self._arrays:
-            opened = cast("zarr.Array[Any]", self._group[name])
-            self._arrays[name] = opened.with_config(WRITTEN_WHOLE), Chunked.of(opened)
-        return self._arrays[name]
-
-    @cached_property
-    def _group(self) -> zarr.Group:
-        """The store, its metadata read once for all arrays."""
-        return open_group(self.path, mode="r+")
 
 
 def block_objects(study: Study, block: int) -> list[str]:
@@ -370,12 +292,9 @@ def chunk_object(name: str, position: tuple[int, ...]) -> str:
 
 
 def sync(path: Location) -> None:
-    """Have everything written to a store so far on its disk, not only with the operating system.
+    """Have all that was written to a store on its disk; OSError where the disk did not take it.
 
-    One call syncs the whole file system, which costs as much as syncing the files one by one costs
-    for a few of them. An object store keeps all it has taken.
-
-    OSError where the disk did not take it.
+    One call syncs the whole file system, which costs as much as a few files one by one.
     """
     if not isinstance(path, Path):
         return
@@ -418,11 +337,7 @@ def _entries(folder: str) -> Iterator[os.DirEntry[str]]:
 
 
 def is_seen(path: Location, objects: list[str], wanted: Written, *, read: bool) -> bool:
-    """Tell whether a block that a worker has written is here, too: it is, but in another place.
-
-    It is known by its size, or by its digest where it is `read`. An object store shows what is
-    written, whole, to everyone at once: one object tells.
-    """
+    """Tell whether a block that a worker has written is here: by size, or digest where `read`."""
     try:
         if read:
             return digest(path, objects) == wanted.digest
@@ -438,13 +353,9 @@ DISTRIBUTIONS = ("numba", "numpy", "scipy", "sweep", "zarr")
 
 
 @cache
-def _installed() -> tuple[tuple[str, str], ...]:
-    return tuple((name, version(name)) for name in DISTRIBUTIONS)
-
-
 def software() -> dict[str, str]:
     """Versions of the software that a result depends on, by name."""
-    return dict(_installed())
+    return {name: version(name) for name in DISTRIBUTIONS}
 
 
 def model_version() -> str:
@@ -456,10 +367,7 @@ def model_version() -> str:
 
 @cache
 def processor() -> str:
-    """Machine, processor and vector instructions that numpy dispatches to.
-
-    numpy and LLVM choose their code by these, and with it the last bits of a result.
-    """
+    """Machine, processor and vector instructions, by which numpy and LLVM choose their code."""
     import llvmlite.binding
     import numpy as np
 
@@ -496,10 +404,7 @@ def refuse_to_replace(path: Location) -> None:
 
 
 def under_way(path: Location) -> Path | None:
-    """Return the unfinished store that is to replace the one at a path, if any.
-
-    StoreError where it was begun to take the place of another store than is there now.
-    """
+    """Return the unfinished store that is to replace the one at a path; StoreError for another."""
     settle(path)
     if not isinstance(path, Path) or not (new := beside(path)).exists():
         return None

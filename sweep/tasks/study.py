@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
@@ -35,23 +35,19 @@ Results = dict[str, np.ndarray]
 FILLS = {"f": float("nan"), "i": -1, "u": 0}
 
 
+def slices(
+    position: tuple[int, ...], chunks: tuple[int, ...], shape: tuple[int, ...]
+) -> tuple[slice, ...]:
+    """Slices of the chunk at a position among chunks, cut at the far edge."""
+    return tuple(
+        slice(at * chunk, min((at + 1) * chunk, size))
+        for at, chunk, size in zip(position, chunks, shape, strict=True)
+    )
+
+
 @dataclass(frozen=True, kw_only=True)
 class ArrayLayout:
-    """An array of a store.
-
-    Parameters
-    ----------
-    name
-        Its path inside the store, ``range`` or ``group/range``.
-    shape, chunks, dims, dtype
-        As Zarr has them; text has the type ``string``.
-    fill
-        Value of what is not written.
-    attributes
-        Units, name in words and so on.
-    values
-        Content, where it is known as the store is made; else blocks write it.
-    """
+    """An array of a store: its path inside, shape, chunks; its values if they are known."""
 
     name: str
     shape: tuple[int, ...]
@@ -96,10 +92,7 @@ class ArrayLayout:
 
     def region(self, position: tuple[int, ...]) -> tuple[slice, ...]:
         """Slices of the chunk at a position."""
-        return tuple(
-            slice(at * chunk, min((at + 1) * chunk, n))
-            for at, chunk, n in zip(position, self.chunks, self.shape, strict=True)
-        )
+        return slices(position, self.chunks, self.shape)
 
 
 CONVENTIONS = "CF-1.11"
@@ -125,20 +118,8 @@ def described(units: str, long_name: str, comment: str = "", name: str = "") -> 
 class BlockGrid:
     """Points cut into blocks along named dimensions, the last one fastest.
 
-    Parameters
-    ----------
-    dims, shape, block_shape
-        Names of the dimensions, and steps along each: of all points, and of a block.
-    group
-        Group of the store that its arrays are in; empty for the root.
-    finer, each
-        Dimension that divides every step of the last one, and into how many: shots of a cycle.
-
-    Examples
-    --------
-    >>> grid = BlockGrid(("y", "x"), (4, 5), (2, 2))
-    >>> grid.n_blocks, grid.position(5), grid.block(5), grid.block_size(5)
-    (6, (1, 2), (slice(2, 4, None), slice(4, 5, None)), 2)
+    A ``finer`` dimension divides every step of the last one into ``each``: shots of a cycle.
+    Arrays are in a ``group`` of the store; empty for the root.
     """
 
     def __init__(
@@ -162,13 +143,7 @@ class BlockGrid:
         return math.prod(self.shape) * self.each
 
     def position(self, block: int) -> tuple[int, ...]:
-        """Position of a block among the blocks.
-
-        Raises
-        ------
-        IndexError
-            Where there is no such block.
-        """
+        """Position of a block among the blocks; IndexError where there is no such block."""
         if not 0 <= block < self.n_blocks:
             raise IndexError(f"block {block} of {self.n_blocks}")
         position: list[int] = []
@@ -183,12 +158,7 @@ class BlockGrid:
 
     def block(self, block: int) -> tuple[slice, ...]:
         """Slices of a block along each dimension, cut at the edge of the grid."""
-        return tuple(
-            slice(p * chunk, min((p + 1) * chunk, size))
-            for p, chunk, size in zip(
-                self.position(block), self.block_shape, self.shape, strict=True
-            )
-        )
+        return slices(self.position(block), self.block_shape, self.shape)
 
     def extent(self, block: int) -> tuple[int, ...]:
         """Return steps of a block along each dimension."""
@@ -233,10 +203,7 @@ class BlockGrid:
         sizes: Mapping[str, int],
         attributes: Mapping[str, Any] | None = None,
     ) -> ArrayLayout:
-        """Return an array of the model's, cut along the dimensions that follow the grid.
-
-        ``sizes``: of its further dimensions, along which it is whole.
-        """
+        """Return an array of the model's, cut along the dimensions that follow the grid."""
         whole = dict(sizes) | dict(zip(self.dims, self.shape, strict=True))
         cut = dict(sizes) | dict(zip(self.dims, self.block_shape, strict=True))
         if self.finer:
@@ -287,11 +254,7 @@ class Content(Protocol):
 
 
 class Study(Content, ABC):
-    """A study as the driver and its workers see it.
-
-    No two blocks share a chunk of any array, and every chunk belongs to a block. Blocks are
-    numbered grid by grid.
-    """
+    """A study as the driver and its workers see it; blocks are numbered grid by grid."""
 
     unit = "points"
     """Name of its points, in the plural."""
@@ -359,13 +322,7 @@ class Study(Content, ABC):
         return sum(grid.n_blocks for grid in self.grids)
 
     def find(self, block: int) -> tuple[BlockGrid, int]:
-        """Return the grid that a block is of, and its number there.
-
-        Raises
-        ------
-        IndexError
-            Where there is no such block.
-        """
+        """Return the grid that a block is of, and its number there; IndexError if there is none."""
         number = block
         for grid in self.grids:
             if 0 <= number < grid.n_blocks:
@@ -394,13 +351,11 @@ class Study(Content, ABC):
         return sum(grid.points_in(part) for grid, part in zip(self.grids, marked, strict=True))
 
     @cached_property
-    def _follows(self) -> dict[str, tuple[list[tuple[int | None, ...]], dict[str, int]]]:
-        """Dimensions that arrays of a group may follow, and by name which of these each does."""
-        found: dict[str, tuple[list[tuple[int | None, ...]], dict[str, int]]] = {}
-        for group, (_, grid) in self._groups.items():
-            follows = {n: grid.follows(a) for n, a in self.layouts.items() if a.group == group}
-            kinds = list(dict.fromkeys(follows.values()))
-            found[group] = kinds, {name: kinds.index(each) for name, each in follows.items()}
+    def _follows(self) -> dict[str, dict[str, tuple[int | None, ...]]]:
+        """Dimensions of the grid that each array follows, by group and name."""
+        found: dict[str, dict[str, tuple[int | None, ...]]] = {group: {} for group in self._groups}
+        for name, layout in self.layouts.items():
+            found[layout.group][name] = self._groups[layout.group][1].follows(layout)
         return found
 
     def chunks(self, block: int) -> dict[str, tuple[int, ...]]:
@@ -408,14 +363,11 @@ class Study(Content, ABC):
         grid, number = self.find(block)
         position = grid.position(number)
         apart = {k for k, at in enumerate(position) if at}  # of these an array must have them all
-        kinds, arrays = self._follows[grid.group]
-        at = [
-            tuple(0 if k is None else position[k] for k in follows)
+        return {
+            name: tuple(0 if k is None else position[k] for k in follows)
+            for name, follows in self._follows[grid.group].items()
             if apart.issubset(follows)
-            else None
-            for follows in kinds
-        ]
-        return {name: place for name, kind in arrays.items() if (place := at[kind]) is not None}
+        }
 
     def regions(self, block: int) -> dict[str, tuple[slice, ...]]:
         """Slices of the arrays that a block writes."""
@@ -430,6 +382,41 @@ class Study(Content, ABC):
         return found
 
 
+#: Errors of Zarr at a chunk that is not there, or not as it was written.
+DAMAGED = (OSError, ValueError, RuntimeError)
+
+
+class GrowingStudy(Study):
+    """A study that may be extended, and may extend another."""
+
+    def __init__(self, spec: Any) -> None:
+        self.spec = spec
+        self.look_up: Callable[[], Any] = lambda: None
+
+    @cached_property
+    def earlier(self) -> Any:
+        """Results of a smaller study, or None; looked for as the first block is computed."""
+        return self.look_up()
+
+    @property
+    def id(self) -> str:
+        """Hash of the spec's identity."""
+        return str(self.spec.id)
+
+    @abstractmethod
+    def follows_tolerance(self, block: int) -> np.ndarray | bool:
+        """Mark the points of a block that a tighter tolerance computes more closely, (points,)."""
+
+    def home(self, block: int) -> int:
+        """Block with all that the draws of a block have in common."""
+        return block
+
+    def there(self, block: int) -> int:
+        """Points of a block that the smaller study has, if nothing is damaged."""
+        shares = self.earlier.shares(block) if self.earlier else ()
+        return sum(share.points.size for share in shares) * self.find(block)[0].each
+
+
 class Evaluate(Protocol):
     """Computes a block in place of the study itself, with the same results."""
 
@@ -440,10 +427,8 @@ class Evaluate(Protocol):
 class Found(NamedTuple):
     """Results of some points of a block."""
 
-    points: np.ndarray
-    """(m,) int64: their numbers in C order over the block."""
-    results: Results
-    """(m, ...) each, by name."""
+    points: np.ndarray  # (m,) int64: their numbers in C order over the block
+    results: Results  # (m, ...) each, by name
 
 
 NONE_FOUND = Found(np.zeros(0, np.int64), {})
@@ -452,10 +437,8 @@ NONE_FOUND = Found(np.zeros(0, np.int64), {})
 class Known(NamedTuple):
     """Results of a block that are there before it is computed."""
 
-    done: Found = NONE_FOUND
-    """Points that need not be computed."""
-    begun: Found = NONE_FOUND
-    """Points that were drawn less often."""
+    done: Found = NONE_FOUND  # points that need not be computed
+    begun: Found = NONE_FOUND  # points that were drawn less often
 
 
 def together(found: Sequence[Found]) -> Found:
@@ -473,10 +456,8 @@ def together(found: Sequence[Found]) -> Found:
 class Stop:
     """End of the time that a piece of a block's work may take, asked for between draws."""
 
-    at: float = float("inf")
-    """By `time.monotonic`."""
-    told: bool = False
-    """True once it was over when asked."""
+    at: float = float("inf")  # by `time.monotonic`
+    told: bool = False  # true once it was over when asked
 
     def __call__(self) -> bool:
         """Tell whether the time is over."""

@@ -1,7 +1,6 @@
 """Stores in numbers: blocks done, detection, what came back in a flight, errors and tolerance.
 
-Errors are, of a grid, those of what is drawn; of a flight, what rays leave where the tolerance says
-how many they are. StoreError where there is no store of sweep's, or one of another kind.
+StoreError where there is no store of sweep's, or one of another kind.
 """
 
 from __future__ import annotations
@@ -67,16 +66,9 @@ class Row:
 
 
 def summary(store: str | Location) -> tuple[str, list[Row], float]:
-    """Heading and rows of the table.
+    """Heading of the slowest axis; a row for each part of it and one for all.
 
-    Returns
-    -------
-    heading : str
-        Name and unit of the slowest axis; empty without axes.
-    rows : list of Row
-        One for each part of that axis, and a last one for the whole grid.
-    share : float
-        Of the blocks that are done, what was looked at.
+    The share of the blocks that are done, of which some are looked at, comes last.
     """
     path = located(store)
     _, study = studies.read(path)
@@ -99,7 +91,8 @@ def summary(store: str | Location) -> tuple[str, list[Row], float]:
         return "", [whole], share
     names = [_name(axis, first, stop) for first, stop in pairwise(edges)]
     rows = [Row.of(name, *values) for name, values in zip(names, of_parts, strict=True)]
-    return _heading(axis), [*rows, whole], share
+    units = axis.members[0].units if len(axis.members) == 1 else ""
+    return f"{axis.name} [{units}]" if units else axis.name, [*rows, whole], share
 
 
 def beyond_model(store: str | Location) -> tuple[int, str]:
@@ -135,13 +128,6 @@ def _some(done: np.ndarray, block_points: int) -> np.ndarray:
     if len(done) <= most:
         return done
     return np.sort(np.random.default_rng(0).choice(done, most, replace=False))
-
-
-def _heading(axis: Axis) -> str:
-    """Name of an axis, with the unit of its values."""
-    if len(axis.members) > 1 or not axis.members[0].units:
-        return axis.name
-    return f"{axis.name} [{axis.members[0].units}]"
 
 
 def _edges(axis: Axis) -> np.ndarray:
@@ -276,10 +262,7 @@ class ErrorRow:
 
     @property
     def needed(self) -> float:
-        """Draws that would do there, about, as the half-width's square falls with them.
-
-        nan where these did; inf where none would.
-        """
+        """Draws that would do there, about; nan where these did, inf where none would."""
         if not self.missed:
             return math.nan
         if not self.tolerance:
@@ -317,10 +300,7 @@ def accuracy_table(store: str | Location) -> list[ErrorRow]:
 
 
 def rays_table(store: str | Location) -> list[ErrorRow]:
-    """Return a row for each scanner; none if the number of rays is given.
-
-    Of a grid one row, with no scanner, where even the most beamlets are too few for some points.
-    """
+    """Return a row for each scanner; of a grid one where even the most beamlets are too few."""
     path = located(store)
     _, study = studies.read(path)
     if isinstance(study, GridStudy):

@@ -1,9 +1,8 @@
 """Detectors and estimators that are functions of the user's: allowed, imported, checked.
 
-A spec names them as ``module:function``. Reading a spec or a store imports nothing. Processes that
-compute a study import its functions only from modules that the user has allowed: by ``--allow-code
-MODULE``, or in the environment variable ``SWEEP_ALLOW_CODE``, which workers on this machine inherit
-and others need set where they run.
+A spec names them as ``module:function``; reading it imports nothing. Processes that compute import
+them only from modules allowed by ``--allow-code MODULE``, or in the environment variable
+``SWEEP_ALLOW_CODE``, which workers on this machine inherit and others need set.
 """
 
 from __future__ import annotations
@@ -38,10 +37,7 @@ _PATHS = {
 
 
 def allow(modules: Iterable[str]) -> None:
-    """Allow this process and the workers that it starts to import modules, also from here.
-
-    They are named as they stand before the colon in a spec.
-    """
+    """Allow this process and its workers to import modules, named as before a spec's colon."""
     allowed = {*_allowed(), *modules}
     if allowed:
         os.environ[ALLOWED] = ",".join(sorted(allowed))
@@ -59,10 +55,7 @@ def _allowed() -> set[str]:
 
 
 def check(spec: Spec | SceneSpec) -> None:
-    """Import the functions that a study names, and try each on a small known spectrum.
-
-    CodeError where one may not run, can't be imported, or does not answer as it must.
-    """
+    """Import the functions that a study names, and try each; CodeError where one fails."""
     for role, name in _named(spec):
         _try(role, name)
 

@@ -1,8 +1,7 @@
 """Every byte of a store held against the digests that were taken as it was written.
 
-Metadata, coordinates and the spec, all that a store held before there were results, are listed with
-their digests in the journal's directory. They follow from the study, so that any of them can be
-made again, to the same bytes.
+All that a store held before there were results is listed with digests in the journal's directory.
+It follows from the study, so that any of it can be made again, to the same bytes.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ import google_crc32c
 import numpy as np
 
 from sweep.storage import opening
-from sweep.storage.atomic_replace import settle
+from sweep.storage.atomic_replace import eyepoints_path, settle
 from sweep.storage.locations import (
     JOURNAL,
     PACKED,
@@ -33,7 +32,6 @@ from sweep.storage.logs import damaged_lines, digest, read_lines, read_sealed
 from sweep.storage.opening import MANIFEST
 from sweep.tasks import journal, lock, store, studies
 from sweep.tasks.errors import StoreError, told
-from sweep.tasks.eyepoint_study import eyepoints_path
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.journal import RECIPE, read_recipe
 from sweep.tasks.progress import Late, Progress, chosen
@@ -85,31 +83,11 @@ def verify(
     """Check every byte of a store, and of the eyepoints that its study looks with.
 
     Receipts of damaged blocks are withdrawn, so that `resume` computes them again, where nobody
-    writes to the store. Whole lines that are missing at the end of a log are not seen as such: the
-    blocks of missing receipts count as not done.
+    writes to the store. `repair` puts back metadata, coordinates and the spec; a `spec` says
+    what the store holds where that no longer says so itself.
 
-    Parameters
-    ----------
-    path
-        The store.
-    repair
-        Whether to put back what was in the store before there were results: metadata,
-        coordinates, the spec.
-    spec
-        The study that the store holds, to repair one that no longer says so itself.
-    progress
-        As in `run`; shown after two seconds.
-
-    Returns
-    -------
-    list of Report
-        Of the store, and of each eyepoint store that is there.
-
-    Raises
-    ------
-    StoreError
-        Where there is no store, or not one of this program's, or one of another study than
-        `spec`; where it can't be repaired.
+    StoreError where there is no store of this program's, or one of another study than `spec`;
+    where it can't be repaired.
     """
     path, shown = located(path).absolute(), Late(chosen(progress))
     settle(path)
@@ -273,10 +251,7 @@ class Damage(NamedTuple):
 
 
 def _made_with(path: Location) -> dict[str, Any]:
-    """Attributes that a store was made with, from its list, else from its group.
-
-    StoreError where there is no store, or not one of this program's; where both are damaged.
-    """
+    """Attributes that a store was made with, from its list, else from its group, if undamaged."""
     if listed := opening.listed_attributes(path):
         return opening.recognised(path, listed)
     found = opening.read_attributes(path)
@@ -333,10 +308,7 @@ def refuse_damaged(path: Location) -> None:
 def restore(path: Location, study: Study) -> list[str]:
     """Put back, each in one step, what a store held before there were results; names of objects.
 
-    The caller holds the store's lock. The study is what it holds, by its attributes or by a spec
-    that is said to be its own.
-
-    StoreError where this machine can't make the same again. Nothing is touched.
+    The caller holds the store's lock. StoreError where this machine can't make the same again.
     """
     store.refuse_links(path)
     try:

@@ -73,10 +73,7 @@ _opening = threading.Lock()
 
 
 def study(path: str, study_id: str) -> store.Arrays:
-    """Return the study of a store, opened for writing its blocks, once a process.
-
-    StoreError where the store holds another study, or was begun with other software than is here.
-    """
+    """Return the study of a store, opened for writing once a process; StoreError for another."""
     with _opening:
         if (path, study_id) not in _studies:
             if len(_studies) >= STUDIES_OPEN:
@@ -109,8 +106,7 @@ def _refuse_another(path: str, study_id: str) -> None:
 def work(job: Job, blocks: list[int]) -> Answer:
     """Evaluate and write blocks, each on its own: one that raises does not stop the next.
 
-    Of one that takes long a piece is computed, and saved for the next task. The answer is of what
-    was done before the store could not be read or written here, where that is so.
+    Of one that takes long a piece is computed, and saved for the next task.
     """
     answer = Answer(worker=worker_address(), host=socket.gethostname())
     try:
@@ -250,16 +246,16 @@ def _raise_in(thread: int, error: type[BaseException] | None) -> None:
 
 
 def limited(work: Callable[[], T], seconds: float | None, spent: float = 0.0) -> T:
-    """Do some work, for no longer than some seconds less those spent before; None sets no limit.
+    """Do some work, for no longer than some seconds less those spent before; Overtime where it was.
 
     Python code is interrupted. A worker process that is still in compiled code `GRACE` seconds
-    later ends itself; a process that computes on its own account waits for it to return.
-
-    Overtime where it took longer.
+    later ends itself; any other waits for it to return.
     """
     if seconds is None:
         return work()
-    alarm = _Alarm(max(seconds - spent, 0.0), deadly=_is_worker_process())
+    # A worker in a process of its own may end without harm.
+    deadly = worker_address().partition("://")[0] not in ("", "inproc")
+    alarm = _Alarm(max(seconds - spent, 0.0), deadly=deadly)
     where: _Interruption | None = None
     # No context manager: an interruption on the way into its exit would go past it.
     try:
@@ -274,11 +270,6 @@ def limited(work: Callable[[], T], seconds: float | None, spent: float = 0.0) ->
     if alarm.rung:
         raise Overtime(f"took longer than the {seconds:g} s that a block may take") from where
     return found
-
-
-def _is_worker_process() -> bool:
-    """Tell whether this is a worker in a process of its own, which may end without harm."""
-    return worker_address().partition("://")[0] not in ("", "inproc")
 
 
 def worker_address() -> str:

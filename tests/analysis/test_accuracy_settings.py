@@ -7,7 +7,6 @@ import pytest
 import xarray as xr
 
 from sweep.analysis import accuracy as settings
-from sweep.analysis import accuracy_figure as report
 from sweep.analysis.opening import NotAStoreError
 
 MADE_UP = [
@@ -214,7 +213,7 @@ def test_the_page_has_every_setting_and_the_sentences(dataset):
 
 
 def test_marks_stand_at_times_and_errors(dataset):
-    sheet = report.sheet(dataset, settings.settings_in(dataset))
+    sheet = settings.sheet(dataset, settings.settings_in(dataset))
     (axes,) = sheet.axes
     marks = {
         tuple(np.ravel(line.get_data()))
@@ -222,7 +221,7 @@ def test_marks_stand_at_times_and_errors(dataset):
         if line.get_marker() in "os^DPXvp*" and len(line.get_xdata()) == 1
     }
     expected = {
-        (us, max(max(e), report.FLOOR)) for _, kind, _, us, e in MADE_UP if kind != "reference"
+        (us, max(max(e), settings.EXACT)) for _, kind, _, us, e in MADE_UP if kind != "reference"
     }
     assert {(round(t, 9), e) for t, e in marks} == expected
     assert axes.get_xscale() == axes.get_yscale() == "log"
@@ -244,7 +243,7 @@ def test_marks_that_lie_together_have_one_name_whatever_lies_between_in_time(dat
         )
     ]  # fmt: skip
     others = [setting for setting in found if setting.kind != "adaptive"]
-    (axes,) = report.sheet(dataset, [*four, *others]).axes
+    (axes,) = settings.sheet(dataset, [*four, *others]).axes
     words = [t.get_text() for t in axes.texts]
     assert "1e-1 … 1e-3" in words and "1e-4" in words and "1e-3" not in words
 
@@ -263,7 +262,7 @@ def test_names_keep_off_marks_and_each_other(dataset):
             (beamlets, "223 beamlets", np.nan, 22.0, 9e-4),
         )
     ]  # fmt: skip
-    sheet = report.sheet(dataset, [*found, *crowd])
+    sheet = settings.sheet(dataset, [*found, *crowd])
     (axes,) = sheet.axes
     names = [text.get_window_extent() for text in axes.texts]
     assert len(names) >= 8
@@ -279,4 +278,4 @@ def test_names_keep_off_marks_and_each_other(dataset):
 
 def test_a_store_of_another_kind_is_refused(tmp_path):
     with pytest.raises(NotAStoreError, match="there is no store"):
-        report.opened(tmp_path / "none.zarr")
+        settings.opened(tmp_path / "none.zarr")

@@ -5,6 +5,11 @@ import pytest
 from sweep.analysis import noise_only
 
 
+def shot_probability(tnr, bins):
+    in_a_bin = np.asarray(noise_only.bin_probability(tnr))
+    return float(noise_only.segment_probability(in_a_bin, bins)) ** 2
+
+
 @pytest.mark.parametrize("tnr", [1.0, 5.0, 10.0, 15.0])
 def test_a_bin_of_noise_crosses_as_often_as_a_rayleigh_magnitude_exceeds_its_deviations(tnr):
     # integral of the Rayleigh density beyond TNR standard deviations, sigma = 1
@@ -18,14 +23,14 @@ def test_a_shot_is_the_complement_of_silence_in_both_segments(bins):
     with mpmath.workdps(50):
         p = mpmath.exp(-(4 - mpmath.pi) / 4 * 100)
         expected = float((1 - (1 - p) ** bins) ** 2)
-    assert noise_only.shot_probability(10.0, bins) == pytest.approx(expected, rel=1e-13)
+    assert shot_probability(10.0, bins) == pytest.approx(expected, rel=1e-13)
 
 
 def test_the_published_instrument_gives_3_93e_9_and_doubling_its_bins_quadruples_it():
-    one = noise_only.shot_probability(10.0, 2**17)
+    one = shot_probability(10.0, 2**17)
     assert one == pytest.approx(3.93e-9, rel=2e-3)
     # to first order in N p = 6e-5
-    assert noise_only.shot_probability(10.0, 2**18) / one == pytest.approx(4.0, rel=1e-4)
+    assert shot_probability(10.0, 2**18) / one == pytest.approx(4.0, rel=1e-4)
 
 
 @pytest.mark.parametrize("excess", [-0.01, 0.0, 1e-6, 0.0018, 0.05])

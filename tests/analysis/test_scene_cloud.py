@@ -8,9 +8,9 @@ from mpl_toolkits.mplot3d import proj3d
 
 from sweep.analysis import canvas
 from sweep.analysis.opening import opened
-from sweep.analysis.scenes import clouds, colours, pictures
-from sweep.analysis.scenes.clouds import AXES, Cloud, Ground, gathered
-from sweep.analysis.scenes.recording import Interval, place
+from sweep.analysis.scenes import colours, pictures, recording
+from sweep.analysis.scenes.pictures import Ground
+from sweep.analysis.scenes.recording import AXES, Cloud, Interval, gathered, place
 from sweep.model.pairing import TRUE
 
 
@@ -111,7 +111,7 @@ def test_crops_cut_points_and_dropouts_and_the_picture(weak):
     assert 0 < found.total < every.total and 0 < found.total_dropouts < every.total_dropouts
     for table in (found.points, found.dropouts):
         assert table["x"].min() >= -30 and table["x"].max() <= 25
-    room = max(high - low for low, high in found.box.values()) * clouds.MARGIN
+    room = max(high - low for low, high in found.box.values()) * recording.MARGIN
     assert found.box["x"][0] >= -30 - room and found.box["x"][1] <= 25 + room
     assert gathered(weak, ["range"], ranges="quantised", crops={"x": Interval(1e5)}) is None
 

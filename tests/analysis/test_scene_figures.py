@@ -5,10 +5,10 @@ import pytest
 import xarray as xr
 from drawn_scenes import cut_short, flown, scene
 
-from sweep.analysis.figures import draw
+from sweep.analysis import figures
+from sweep.analysis.figures import SceneStudy, default_scene_figures, draw
 from sweep.analysis.opening import NotAStoreError, opened
-from sweep.analysis.scenes import figures, pictures
-from sweep.analysis.scenes.figures import SceneStudy, default_figures
+from sweep.analysis.scenes import pictures
 from sweep.analysis.scenes.recording import Interval, place
 from sweep.model.pairing import TRUE
 
@@ -19,7 +19,7 @@ def spec(tmp_path_factory):
 
 
 def test_a_study_that_asks_for_none_gets_clouds_by_range_and_velocity_and_navigation(scene_store):
-    usual = default_figures(opened(scene_store))
+    usual = default_scene_figures(opened(scene_store))
     assert [figure.stem for figure in usual] == [
         "square_range_cloud", "square_radial_velocity_cloud", "pair_range_cloud",
         "pair_radial_velocity_cloud", "velocity_all_navigation", "altitude_all_navigation",
@@ -33,8 +33,8 @@ def test_a_store_cut_short_is_drawn_as_far_as_it_is_and_says_how_far(
     log = short / ".sweep" / "receipts.jsonl"
     log.write_text("".join(log.read_text().splitlines(keepends=True)[:-8]))
     assert SceneStudy.of(short).note.endswith("32 of 40 blocks computed")
-    usual = figures.default_figures
-    monkeypatch.setattr(figures, "default_figures", lambda tree: usual(tree)[4:5])
+    usual = figures.default_scene_figures
+    monkeypatch.setattr(figures, "default_scene_figures", lambda tree: usual(tree)[4:5])
     assert [file.name for file in draw(short)] == ["velocity_all_navigation.png"]
 
 

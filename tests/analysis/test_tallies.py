@@ -9,8 +9,16 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sweep.analysis.selection import Points
-from sweep.analysis.tallies import Search, Tally, for_median, median, pieces, search, tallied
+from sweep.analysis.selection import (
+    Points,
+    Search,
+    Tally,
+    for_median,
+    median,
+    pieces,
+    search,
+    tallied,
+)
 
 floats = st.floats(allow_nan=False, allow_infinity=False)
 some = st.lists(st.one_of(floats, st.sampled_from([0.0, -0.0, 1.0, 5e-324])), min_size=1)

@@ -16,7 +16,7 @@ from small import quiet, small, tree
 
 from sweep.spec import cluster_of, load_cluster
 from sweep.spec.clusters import Bounds
-from sweep.tasks.clusters import certificates, kubernetes
+from sweep.tasks.clusters import kubernetes, machines
 from sweep.tasks.errors import ClusterError
 
 pytest.importorskip("dask_kubernetes", reason="the extra sweep[kubernetes] is not installed")
@@ -161,7 +161,7 @@ def free_port() -> int:
 
 
 def test_a_study_in_pods_with_tls_leaves_nothing_behind(tmp_path, undisturbed, monkeypatch):
-    files = certificates.make(tmp_path / "tls", 1)
+    files = machines.make_certificates(tmp_path / "tls", 1)
     monkeypatch.setattr(kubernetes, "PORT", free_port())
     monkeypatch.setattr(kubernetes, "host", lambda _: "127.0.0.1")
     mapping = {

@@ -14,7 +14,7 @@ import pytest
 from small import quiet, small, tree
 
 from sweep.spec import cluster_of
-from sweep.tasks.clusters import certificates, machines
+from sweep.tasks.clusters import machines
 from sweep.tasks.errors import ClusterError
 
 SSH = {
@@ -95,7 +95,7 @@ def server(directory: Path):
 
 
 def test_a_study_over_ssh_with_tls(tmp_path, undisturbed):
-    files = certificates.make(tmp_path / "tls", 1)
+    files = machines.make_certificates(tmp_path / "tls", 1)
     with server(tmp_path) as (port, commands):
         cluster = {
             **SSH, "port": port, "user": "lidar", "identity": str(tmp_path / "user"),

@@ -13,13 +13,13 @@ from small import quiet, small, tree
 from sweep.cli import main
 from sweep.spec import cluster_of
 from sweep.tasks import cluster
-from sweep.tasks.clusters import certificates, machines
+from sweep.tasks.clusters import machines
 from sweep.tasks.errors import ClusterError
 
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    return certificates.make(tmp_path_factory.mktemp("tls") / "new", 30)
+    return machines.make_certificates(tmp_path_factory.mktemp("tls") / "new", 30)
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +96,7 @@ def test_all_parts_talk_tls_and_a_client_without_certificates_is_refused(
         plain = address.replace("tls://", "tcp://")
         with pytest.raises(ClusterError, match="no Dask scheduler answers"):
             quiet(small(), tmp_path / "plain.zarr", scheduler=plain)
-        others = certificates.make(tmp_path / "others", 1)
+        others = machines.make_certificates(tmp_path / "others", 1)
         stranger = address_of(address, {k: str(v) for k, v in others._asdict().items()})
         with pytest.raises(ClusterError, match="no Dask scheduler answers"):
             quiet(small(), tmp_path / "stranger.zarr", cluster=stranger)

@@ -9,8 +9,8 @@ from small import receipts, tree
 from small_flights import small_scene
 from test_kills import process, wait_for
 
+from sweep.storage.atomic_replace import eyepoints_path
 from sweep.tasks.driver import resume, run
-from sweep.tasks.eyepoint_study import eyepoints_path
 
 CLIENT = """
 import sys, time

@@ -315,11 +315,6 @@ def test_no_shots_give_no_points(table_4_1):
     assert all(len(values) == 0 for values in got.values())
 
 
-def test_an_unknown_way_to_draw_is_refused(table_4_1):
-    with pytest.raises(ValueError, match="probabilities, noise"):
-        _cloud(_edge([ON_GROUND]), _strong(table_4_1), method="dice")
-
-
 @pytest.mark.parametrize("law", ["log_normal", "gamma_gamma"])
 def test_each_shot_has_air_of_its_own_that_all_of_its_draws_see(table_4_1, law):
     """Power factors of mean 1 and the variance (1 + I_out) (1 + I_back) - 1 of both ways."""

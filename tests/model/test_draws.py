@@ -119,8 +119,3 @@ def test_batches_split_the_same_draws(method, random, table_4_1):
         np.testing.assert_array_equal(parts[name][:, 1], later[name][:, 0])
     for name in (*OUTPUTS, *ERROR_OUTPUTS):
         np.testing.assert_array_equal(parts[name], whole[name])
-
-
-def test_an_unknown_method_is_refused(table_4_1):
-    with pytest.raises(ValueError, match="probabilities, noise"):
-        simulate(table_4_1(), CORE, keys=keys(1), batch_sizes=[1], method="guess")

@@ -114,7 +114,7 @@ def test_velocity_across_the_footprint_of_a_tumbling_instrument_is_that_of_its_a
     assert spread == pytest.approx(across * 0.02 / 4, rel=1e-3)
 
 
-def test_beamlets_that_miss_send_nothing_back_and_shots_that_miss_are_refused(table_4_1):
+def test_beamlets_that_miss_send_nothing_back(table_4_1):
     edge = [square(5.0)]
     seen = observed(
         flight(position=(5.0, 0.0, 100.0)), bodies=edge, beam_divergence=2e-3, number=109
@@ -123,12 +123,7 @@ def test_beamlets_that_miss_send_nothing_back_and_shots_that_miss_are_refused(ta
     assert 0 < hit.sum() < hit.size
     shots = prepare_eyepoints(seen, table_4_1(), [GROUND])
     assert (shots.amplitude[0][~hit] == 0).all() and (shots.amplitude[0][hit] > 0).all()
-    lost = observed(flight(position=(50.0, 0.0, 100.0)), bodies=edge)
-    assert not lost.seen.any()
-    with pytest.raises(ValueError, match="sees nothing"):
-        prepare_eyepoints(lost, table_4_1(), [GROUND])
-    with pytest.raises(ValueError, match="beyond the 0 given"):
-        prepare_eyepoints(seen, table_4_1(), [])
+    assert not observed(flight(position=(50.0, 0.0, 100.0)), bodies=edge).seen.any()
 
 
 def _turning(rate, arm=(0.0, 0.0, 0.0)):

@@ -193,10 +193,8 @@ def test_gain_raises_light_and_detector_noise_as_its_square_and_leaves_the_ampli
 
 def test_the_narrower_stage_sets_the_bandwidth_of_the_noise(table_4_1):
     for detector, amplifier in ((100e6, 400e6), (400e6, 100e6), (100e6, 100e6)):
-        assert (
-            electrical_bandwidth(detector_bandwidth=detector, amplifier_bandwidth=amplifier)
-            == 100e6
-        )
+        stages = {"detector_bandwidth": detector, "amplifier_bandwidth": amplifier}
+        assert electrical_bandwidth(stages) == 100e6
         scene = table_4_1(detector_bandwidth=detector, amplifier_bandwidth=amplifier, fft_size=1024)
         shot_noise = prepared(scene).noise_sources["local_oscillator_shot"]
         assert shot_noise == pytest.approx(1.40992e-13 / 4 * 4.9e7, rel=1e-5)

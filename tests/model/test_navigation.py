@@ -305,28 +305,3 @@ def test_a_beam_that_grazes_the_fitted_plane_does_not_run_off_with_the_weight():
     found = altitude(direction=SIXTEEN, range=ranges, standard_error=0.1, level=1e-3)
     assert found.status == EXCLUDED and not found.used[0]
     assert found.value == pytest.approx(100.0, rel=1e-12)
-
-
-# ---- what is refused ----
-
-
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        ({"standard_error": [0.1, 0.1, 0.0, 0.1]}, "not positive"),
-        ({"standard_error": np.nan}, "not positive"),
-        ({"direction": 2 * FOUR}, "length is not 1"),
-        ({"direction": FOUR[:, :2]}, "three components"),
-        ({"level": 1.0}, "level"),
-    ],
-)
-def test_measurements_that_can_not_be_are_refused(change, says):
-    given = {"direction": FOUR, "radial_velocity": FOUR @ MOVING, "standard_error": 0.1} | change
-    with pytest.raises(ValueError, match=says):
-        velocity(**given)
-
-
-@pytest.mark.parametrize("change", [{"slope": -0.1}, {"slope": np.inf}, {"relief": -1.0}])
-def test_ground_that_can_not_be_is_refused(change):
-    with pytest.raises(ValueError):
-        altitude(direction=FOUR, range=np.full(4, 10.0), standard_error=0.1, **change)

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy import integrate
 
-from sweep.model.geometry.mesh import Surface
-from sweep.model.ground import LAWS, backscatter
+from sweep.model.ground import backscatter
 
 COSINES = np.array([0.01, 0.1, 0.5, 0.9, 1.0])
 
@@ -45,12 +44,3 @@ def test_the_thesis_law_is_half_of_lommel_seeligers():
     np.testing.assert_array_equal(
         2 * backscatter("thesis", COSINES), backscatter("lommel_seeliger", COSINES)
     )
-
-
-def test_an_unknown_law_is_refused_where_a_surface_is_made():
-    for law in LAWS:
-        assert Surface("rock", 0.2, law).law == law
-    with pytest.raises(ValueError, match=r"rock: no reflectance law 'minnaert': .*lambert"):
-        Surface("rock", 0.2, "minnaert")
-    with pytest.raises(ValueError, match="minnaert"):
-        backscatter("minnaert", COSINES)

@@ -12,9 +12,8 @@ from click.testing import CliRunner
 from reported import EXPERIMENTS, GRID
 
 import sweep
-from sweep.analysis.figures import Study
+from sweep.analysis.figures import SceneStudy, Study
 from sweep.analysis.opening import NotAStoreError
-from sweep.analysis.scenes.figures import SceneStudy
 from sweep.cli import main
 from sweep.model.pairing import TRUE
 from sweep.model.shot import evaluate

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 from facet_areas import areas
 
-from sweep.model.geometry.mesh import Mesh, Surface, merge
+from sweep.model.geometry.mesh import Mesh, merge
 from sweep.scenes.files import SceneError
 from sweep.scenes.meshes import clean, read_mesh
 
@@ -81,13 +81,6 @@ def test_faces_without_area_and_double_ones_are_reported_when_the_mesh_is_made(t
     mesh, report = read_mesh(path).mesh()
     assert len(mesh.faces) == 2
     assert (report.duplicate, report.degenerate) == (1, 1)
-
-
-def test_surfaces_that_cannot_be_are_refused():
-    with pytest.raises(ValueError, match="reflectance"):
-        Surface("shiny", 1.5)
-    with pytest.raises(ValueError, match="roughness"):
-        Surface("odd", 0.5, roughness=-1.0)
 
 
 @pytest.mark.parametrize("unit", ["seconds", "furlonks"])
@@ -232,5 +225,3 @@ def test_a_mesh_made_by_hand_is_checked_too():
         Mesh(CORNERS * np.nan, CUBE, np.zeros(12), np.zeros(3))
     with pytest.raises(ValueError, match="origin"):
         Mesh(CORNERS, CUBE, np.zeros(12), np.zeros(2))
-    with pytest.raises(ValueError, match="no mesh"):
-        merge([])

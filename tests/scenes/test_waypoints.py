@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from sweep.model.geometry.quaternion import about, from_heading, multiply, rotate
-from sweep.scenes.files import SceneError
-from sweep.scenes.waypoints import read_waypoints
+from sweep.scenes.files import SceneError, read_waypoints
 
 PLAIN = "time [s], x [m], y [m], z [m]\n0, 0, 0, 500\n2, 50, 0, 450\n4, 90, 10, 420\n"
 

@@ -7,7 +7,8 @@ import pytest
 import zarr
 
 from sweep.storage import locations
-from sweep.tasks.store import WRITTEN_WHOLE, Chunked, codecs
+from sweep.tasks.store import WRITTEN_WHOLE, codecs, encoded
+from sweep.tasks.study import ArrayLayout
 
 TYPES = ["float64", "float32", "int64", "uint8", "uint64", "int16", "bool"]
 
@@ -17,6 +18,14 @@ def array_at(path, shape, chunk, dtype, fill):
         path, shape=shape, chunks=chunk, dtype=dtype, fill_value=fill, **codecs()
     )
     return made.with_config(WRITTEN_WHOLE)
+
+
+def layout_of(array):
+    dims = tuple(map(str, range(array.ndim)))
+    return ArrayLayout(
+        name="array", shape=array.shape, chunks=array.chunks, dims=dims, dtype=str(array.dtype),
+        fill=array.fill_value,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("dtype", TYPES)
@@ -34,7 +43,7 @@ def test_every_chunk_is_zarrs_byte_for_byte(tmp_path, dtype, shape, chunk):
     for position in itertools.product(*map(range, counts)):
         at = tuple(slice(p * c, (p + 1) * c) for p, c in zip(position, chunk, strict=True))
         file = tmp_path / "hand" / "/".join(["c", *map(str, position)])
-        locations.put(str(file), Chunked.of(by_hand).encoded(values[at]))
+        locations.put(str(file), encoded(layout_of(by_hand), values[at]))
         assert (
             file.read_bytes()
             == (tmp_path / "zarr" / file.relative_to(tmp_path / "hand")).read_bytes()
@@ -45,11 +54,11 @@ def test_every_chunk_is_zarrs_byte_for_byte(tmp_path, dtype, shape, chunk):
 def test_chunks_equal_to_the_fill_and_values_of_the_other_byte_order(tmp_path):
     by_zarr = array_at(tmp_path / "zarr", (4,), (4,), "float64", np.nan)
     by_zarr[...] = np.full(4, np.nan)
-    chunked = Chunked.of(by_zarr)
-    content = chunked.encoded(np.full(4, np.nan))
+    layout = layout_of(by_zarr)
+    content = encoded(layout, np.full(4, np.nan))
     assert content == (tmp_path / "zarr/c/0").read_bytes()
     swapped = np.arange(4.0).astype(">f8")
-    assert chunked.encoded(swapped) == chunked.encoded(np.arange(4.0))
+    assert encoded(layout, swapped) == encoded(layout, np.arange(4.0))
 
 
 def test_a_write_that_fails_leaves_what_was_there(tmp_path, monkeypatch):
@@ -64,8 +73,3 @@ def test_a_write_that_fails_leaves_what_was_there(tmp_path, monkeypatch):
         locations.put(str(file), b"new")
     assert file.read_bytes() == b"old"
     assert [each.name for each in file.parent.iterdir()] == ["0"]
-
-
-def test_text_is_left_to_zarr(tmp_path):
-    text = zarr.create_array(tmp_path / "text", shape=(2,), dtype=str)
-    assert not Chunked.of(text).is_plain

@@ -7,15 +7,15 @@ from small import quiet, small
 from small_flights import small_scene
 
 from sweep.model.effects.catalogue import EFFECTS, NAMES, flag_attributes, flags_of, names_of
-from sweep.tasks.effect_selection import (
+from sweep.tasks.grid import (
     TILE_POINTS,
     EffectSelection,
+    Grid,
     Selected,
     Tiles,
     _stretches,
     tile_shape,
 )
-from sweep.tasks.grid import Grid
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.plan import effects_table
 from sweep.tasks.studies import study_of

@@ -12,10 +12,10 @@ from small_flights import small_scene
 import sweep
 from sweep.analysis.opening import NotAStoreError
 from sweep.cli import main
+from sweep.storage.atomic_replace import eyepoints_path
 from sweep.tasks import journal, studies
 from sweep.tasks.driver import resume, run
 from sweep.tasks.errors import StoreError
-from sweep.tasks.eyepoint_study import eyepoints_path
 from sweep.tasks.lock import Lock
 from sweep.tasks.progress import Progress
 from sweep.tasks.verify import verify

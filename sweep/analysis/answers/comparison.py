@@ -22,6 +22,8 @@ ROUNDING = 1e-12
 
 _DIGITS = 12
 
+ONE_OF_EACH = "a grid of points and a flight have nothing to match: compare two of a kind"
+
 
 def compare(ours: xr.Dataset, other: xr.Dataset) -> xr.Dataset:
     """Differences, other less ours, at the points that both studies have.
@@ -45,8 +47,10 @@ def compare(ours: xr.Dataset, other: xr.Dataset) -> xr.Dataset:
     Raises
     ------
     ValueError
-        No point is in both.
+        No point is in both, or the other is a flight.
     """
+    if not isinstance(other, xr.Dataset):
+        raise ValueError(ONE_OF_EACH)
     names = [n for n in {**OUTPUTS, **SPECTRA_OUTPUTS} if n in ours and n in other]
     return differences(ours, other, names, bounded=PROMISED)
 
@@ -188,8 +192,10 @@ def compare_flights(ours: xr.DataTree, other: xr.DataTree) -> xr.DataTree:
     Raises
     ------
     ValueError
-        The flights have no scanner in common, or no shot of a scanner.
+        The flights have no scanner in common, or no shot of a scanner; the other is a grid.
     """
+    if not isinstance(other, xr.DataTree):
+        raise ValueError(ONE_OF_EACH)
     scanners = [name for name in ours.attrs["scanners"] if name in other.attrs["scanners"]]
     if not scanners:
         has = (", ".join(tree.attrs["scanners"]) for tree in (ours, other))

@@ -32,11 +32,6 @@ _PARAMETERS = {
 def range_error(dataset: xr.Dataset) -> xr.Dataset:
     """Error of the reported range, and the Cramer-Rao bound on any unbiased estimate of it.
 
-    Parameters
-    ----------
-    dataset
-        As `sweep.open` gives it, or a part of it.
-
     Returns
     -------
     xarray.Dataset

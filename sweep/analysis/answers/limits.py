@@ -3,9 +3,6 @@
 Between two points of the grid the place is interpolated in the normal deviate z(pd), pd = Phi(z):
 Q_1(a, b) is near Phi(a - b), so that z follows the signal's amplitude and is nearly a straight line
 where pd itself bends from 1 to 0. Digits near 1 come from the probability of a miss.
-
-Everything is a reduction of pairs of neighbours: of those within a piece first, then of those that
-lie in two. It is lazy, and a store larger than memory goes through piece by piece.
 """
 
 from __future__ import annotations
@@ -53,8 +50,6 @@ def limit(
 
     Parameters
     ----------
-    dataset
-        As `sweep.open` gives it, or a part of it.
     along
         Coordinate, each value of it once; those of a zipped axis after a selection.
     pd
@@ -98,6 +93,18 @@ def limit(
             found |= {f"{key}_{end}": a for key, a in ends.items() if not key.endswith("reason")}
     result = xr.Dataset(found).assign_attrs(dataset.attrs)
     return _described(result, x, segment, pd, confidence(dataset, reach))
+
+
+def maximum_range(dataset: xr.Dataset, pd: float = 0.9, *, segment: str = "shot") -> xr.Dataset:
+    """Range up to which pd keeps to a level, unbroken and at all: :func:`limit`."""
+    return limit(dataset, "target.range", pd, segment=segment)
+
+
+def minimum_grazing_angle(
+    dataset: xr.Dataset, pd: float = 0.9, *, segment: str = "shot"
+) -> xr.Dataset:
+    """Least grazing angle down to which pd keeps to a level: :func:`limit`."""
+    return limit(dataset, "target.grazing_angle", pd, segment=segment, from_highest=True)
 
 
 def _ordered(dataset: xr.Dataset, x: xr.DataArray, from_highest: bool) -> tuple[xr.Dataset, str]:

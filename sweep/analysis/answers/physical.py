@@ -105,8 +105,6 @@ def select(
 
     Parameters
     ----------
-    dataset
-        As `sweep.open` gives it, or a part of it.
     wanted
         By a coordinate's name or path: a value (``"2 km"``, or a number in the coordinate's own
         units), a list of values, or a slice from one value to another, both included. One value of

@@ -40,8 +40,6 @@ def detection_probability(dataset: xr.Dataset, segment: str = "shot") -> xr.Data
 
     Parameters
     ----------
-    dataset
-        As `sweep.open` gives it, or a part of it.
     segment
         ``shot`` (up- and down-chirp both), ``up``, ``doppler`` or ``down``.
 
@@ -82,8 +80,6 @@ def false_alarms_per_second(
 
     Parameters
     ----------
-    dataset
-        As `sweep.open` gives it, or a part of it.
     rate
         Shots a second, ``"20 Hz"`` or a number; by default as many as chirps leave time for,
         one after so many segments and as many gaps as it has in all its looks.
@@ -180,11 +176,6 @@ STATISTICS = ("mean", "least", "largest", "number")
 def summary(dataset: xr.Dataset) -> xr.Dataset:
     """Mean, extremes and number of the computed points of every output.
 
-    Parameters
-    ----------
-    dataset
-        As `sweep.open` gives it, or a part of it.
-
     Returns
     -------
     xarray.Dataset
@@ -266,8 +257,6 @@ def roc(
 
     Parameters
     ----------
-    dataset
-        As `sweep.open` gives it, or better a part of it.
     pfa
         Probabilities of a false alarm in one bin, 0 < pfa < 1; by default 1e-16 to 0.1.
     segment
@@ -302,7 +291,9 @@ def roc(
             f"{number:,} points make too many curves (at most {MOST_POINTS:,}): select some"
         )
     looks = _looks_of(spec_of(dataset))
-    dataset = dataset[_needed(dataset, segment)].compute()
+    needed = [f"{kind}_{s}" for s in _SEGMENTS[segment] for kind in ("snr", "pd")]
+    needed += [named("pd", segment), "log10_pfa_bin", "effects"]
+    dataset = dataset[list(dict.fromkeys(needed))].compute()
     level = xr.DataArray(looks.level(np.log(chances)), dims=["pfa_bin"])
     pd, exact = _closed(dataset, segment, level, looks)
     tnr = level * _own_tnr(dataset) / _own_level(dataset, looks)
@@ -325,12 +316,6 @@ def _looks_of(spec: Spec) -> Looks:
             "makes: put the design pfa on an axis, and read pd over it"
         )
     return Looks.of(spec.parameters())
-
-
-def _needed(dataset: xr.Dataset, segment: str) -> list[str]:
-    """Variables that a curve is made of."""
-    names = [f"{kind}_{s}" for s in _SEGMENTS[segment] for kind in ("snr", "pd")]
-    return [*dict.fromkeys([*names, named("pd", segment), "log10_pfa_bin", "effects"])]
 
 
 def _closed(

@@ -206,10 +206,7 @@ FAR = 1e5
 
 
 def mark_size(places: np.ndarray, width: float, height: float) -> float:
-    """Area of a mark that leaves points (2, n) apart on a picture, if it can [square points].
-
-    Places, width and height of the picture are in inches.
-    """
+    """Area of a mark [square points] that leaves points (2, n) apart on a picture [inches]."""
     number = places.shape[1]
     if number < 2:
         return LARGEST

@@ -28,8 +28,8 @@ class Tally:
     """Errors of a vector of m components, by bin of altitude; parts add up to the whole.
 
     Solutions asked for, and those that there were (bins,); their mean error (bins, m), sums of
-    products of deviations from it (bins, m, m), and mean of the covariances that they came with.
-    Sums of floats depend on their order: see :func:`merge`.
+    products of deviations from it (bins, m, m), and mean of the covariances that they came
+    with.
     """
 
     attempts: np.ndarray
@@ -39,10 +39,7 @@ class Tally:
     predicted: np.ndarray
 
     def __add__(self, other: Tally) -> Tally:
-        """Tally of both, of two sets of draws that share none.
-
-        The update of Chan, Golub and LeVeque (1983), which never subtracts large sums.
-        """
+        """Tally of both, by Chan, Golub and LeVeque (1983), which never subtracts large sums."""
         count = self.count + other.count
         share = (other.count / np.maximum(count, 1))[..., None]
         apart = other.mean - self.mean
@@ -127,11 +124,7 @@ def _with_length(parts: np.ndarray) -> np.ndarray:
 
 
 def curves(named: Sequence[tuple[str, Recording]], *, quantity: str, bins: int) -> list[Curve]:
-    """Errors of scanners that navigate, all over the same bins of altitude.
-
-    Solutions are read chunk by chunk. Each part has a tally of its own, and the tallies are merged
-    in order, which gives the same result to the last bit.
-    """
+    """Errors of scanners that navigate, all over the same bins of altitude."""
     able = [(name, own.dataset) for name, own in named if "velocity_status" in own.dataset]
     edges = _edges([dataset for _, dataset in able], bins)
     if edges is None:
@@ -194,8 +187,7 @@ def tally(
 ) -> Tally:
     """Tally of n solutions by cell, in two passes for the digits' sake.
 
-    Of each its error (n, m), ignored where not available; the covariance that it states (n, m, m);
-    and its cell, 0..cells - 1: a solution elsewhere is left out.
+    Of each its error (n, m), the covariance that it states (n, m, m), and its cell.
     """
     inside = (cell >= 0) & (cell < cells)
     attempts = np.bincount(cell[inside], minlength=cells)
@@ -212,11 +204,7 @@ def tally(
 
 
 def merge(tallies: Sequence[Tally]) -> Tally:
-    """Tally of all, added pair by pair: first and second, third and fourth, ..., then again.
-
-    The tree depends on the number of tallies alone, so the same tallies in the same order give
-    the same bits, and rounding grows with the logarithm of their number.
-    """
+    """Tally of all, added pair by pair, then pairs of pairs: the same bits for the same order."""
     if not tallies:
         raise ValueError("there is no tally to merge")
     level = list(tallies)

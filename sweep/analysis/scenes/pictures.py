@@ -5,26 +5,30 @@ from __future__ import annotations
 import textwrap
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import product
 from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
+import xarray as xr
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Sheet
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from mpl_toolkits.mplot3d import proj3d
+from scipy.ndimage import map_coordinates
 
 from sweep.analysis import canvas, labels
 from sweep.analysis.scenes import colours
-from sweep.analysis.scenes.clouds import AXES, Cloud, Ground
 from sweep.analysis.scenes.colours import Stage
 from sweep.analysis.scenes.recording import (
+    AXES,
     CATEGORIES,
     SIGNED,
     WIDE,
+    Cloud,
     Interval,
     Table,
     Thinned,
@@ -32,6 +36,71 @@ from sweep.analysis.scenes.recording import (
     shown,
 )
 from sweep.model.pairing import TRUE
+
+SUN_AZIMUTH, SUN_ELEVATION = 315.0, 40.0
+"""Direction of the light that shades the ground [deg], from north by east; and its height."""
+
+STEEPEST = 1.5
+"""Slope above which ground is left open: at the edges of crowns and walls, which hide points."""
+
+
+@dataclass(frozen=True)
+class Ground:
+    """Heights of the ground (rows, columns) on an even grid; nan where there is none.
+
+    World coordinates x (columns,) and y (rows,) rise; all in metres.
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    height: np.ndarray
+
+    @classmethod
+    def of(cls, tree: xr.DataTree) -> Ground | None:
+        """Return the map of a store, or None if it has none, or nothing is on it."""
+        if "map_height" not in tree.ds:
+            return None
+        x, y, height = (np.asarray(tree.ds[f"map_{name}"].values) for name in ("x", "y", "height"))
+        return cls(x, y, height) if np.isfinite(height).any() else None
+
+    def cropped(
+        self, x: tuple[float, float], y: tuple[float, float], most: int = 120
+    ) -> Ground | None:
+        """Return the ground within limits, interpolated; None where these miss the map."""
+        cuts = [
+            (max(float(own[0]), low), min(float(own[-1]), high))
+            for own, (low, high) in ((self.x, x), (self.y, y))
+        ]
+        if any(high <= low for low, high in cuts):
+            return None
+        step = max(high - low for low, high in cuts) / (most - 1)
+        nodes = [np.linspace(low, high, max(2, round((high - low) / step) + 1))
+                 for low, high in cuts]  # fmt: skip
+        places = [
+            np.interp(node, own, np.arange(own.size))
+            for node, own in zip(nodes, (self.x, self.y), strict=True)
+        ]
+        rows, columns = np.meshgrid(places[1], places[0], indexing="ij")
+        height = map_coordinates(self.height, [rows, columns], order=1, mode="nearest")
+        return Ground(nodes[0], nodes[1], height)
+
+    def without_walls(self) -> Ground:
+        """Return the ground without what is too steep to be drawn as a surface."""
+        steep = np.hypot(*np.gradient(self.height, self.y, self.x)) > STEEPEST
+        return Ground(self.x, self.y, np.where(steep, np.nan, self.height))
+
+    def shade(self) -> np.ndarray:
+        """Brightness of the ground under a low sun, 0..1; slopes are stretched to stand out."""
+        down, across = np.gradient(self.height, self.y, self.x)
+        slope = np.hypot(down, across)
+        known = slope[np.isfinite(slope)]
+        typical = float(np.percentile(known, 80)) if known.size else 0.0
+        stretch = 0.6 / typical if typical > 0 else 1.0
+        azimuth, elevation = np.radians(90.0 - SUN_AZIMUTH), np.radians(SUN_ELEVATION)
+        towards = np.cos(elevation) * (np.cos(azimuth) * across + np.sin(azimuth) * down) * stretch
+        lit = (np.sin(elevation) - towards) / np.sqrt(1 + (stretch * slope) ** 2)
+        return np.clip(np.where(np.isfinite(lit), lit, 1.0), 0.0, 1.0)
+
 
 DROPOUT, PATH, GROUND = "#C1121F", "#1A1A1A", "0.86"
 
@@ -44,8 +113,7 @@ class _Picture(ABC):
     axes: Any
     scale: float
     size: tuple[float, float]
-    further: Mapping[str, Any] = MappingProxyType({})
-    """Further options of marks."""
+    further: Mapping[str, Any] = MappingProxyType({})  # further options of marks
 
     @abstractmethod
     def _columns(self, places: np.ndarray) -> Sequence[np.ndarray]:

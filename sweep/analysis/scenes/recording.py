@@ -1,4 +1,4 @@
-"""Recordings of scanners: quantities of shots and points, read part by part; eyepoints."""
+"""Recordings of scanners: quantities of shots and points, read part by part; clouds of them."""
 
 from __future__ import annotations
 
@@ -18,13 +18,16 @@ from sweep.model.pairing import FLAGS, TRUE
 from sweep.scenes.eyepoint_arrays import from_arrays
 from sweep.spec import Mistake, SpecError
 from sweep.spec.mistakes import near_miss
-from sweep.storage.atomic_replace import real
+from sweep.storage.atomic_replace import eyepoints_path
 from sweep.storage.locations import PACKED, Location, located, zarr_store
 from sweep.storage.opening import CHECKED, NotAStoreError
 from sweep.units import QuantityError
 
 if TYPE_CHECKING:
     from sweep.spec import SceneSpec
+
+
+AXES = ("x", "y", "z")
 
 QUANTISED, INTERPOLATED = "quantised", "interpolated"
 
@@ -83,11 +86,6 @@ QUANTITIES = _listed()
 """Every quantity by its name."""
 
 
-def stored_name(name: str, ranges: str) -> str:
-    """Array that holds a quantity by whole bins, or interpolated between them."""
-    return _BY_RANGES.get(name, name) if ranges == INTERPOLATED else name
-
-
 def label(name: str) -> str:
     """Return a quantity in words with the units in which it is shown."""
     about = QUANTITIES[name]
@@ -130,10 +128,7 @@ class Interval:
 
 @dataclass(frozen=True)
 class Recording:
-    """Shots and points of one scanner, at one place along the study's axes.
-
-    Chunks of its flags are in a folder; without it all is computed whose time is known.
-    """
+    """Shots and points of one scanner, at one place along the axes; chunks of its flags' folder."""
 
     scanner: str
     dataset: xr.Dataset
@@ -154,8 +149,8 @@ class Recording:
     def computed(self, part: slice, draw: int = 0) -> np.ndarray:
         """Mask (k,) of the shots of a range of which the points of a draw are computed.
 
-        Geometry is stored with a study's first place and draw: that a shot's time is known says
-        nothing of the others, and no point looks like none found. Only its chunk tells.
+        Geometry is stored with a study's first place and draw, and no point looks like none
+        found: only the chunk tells.
         """
         known = np.isfinite(self.read("time", part))
         if self.chunks is None:
@@ -178,8 +173,8 @@ class Recording:
     ) -> Table:
         """Quantities of every point of a range of shots, (m,) each, in order.
 
-        Names are those of :data:`QUANTITIES`, ``return_number``, and ``returns`` (points of the
-        same shot). Positions follow from the ranges taken, quantised or interpolated.
+        Names are those of :data:`QUANTITIES`, ``return_number``, and ``returns`` (points of
+        the same shot).
         """
         present = self.read("flags", part, draw) > 0
         shot, place = np.nonzero(present)
@@ -194,7 +189,8 @@ class Recording:
             elif name == "returns":
                 table[name] = present.sum(axis=1)[shot]
             elif QUANTITIES[name].of_points:
-                table[name] = self.read(stored_name(name, ranges), part, draw)[present]
+                stored = _BY_RANGES.get(name, name) if ranges == INTERPOLATED else name
+                table[name] = self.read(stored, part, draw)[present]
             else:
                 table[name] = self.of_shots(name, part)[shot]
         return {name: table[name] for name in names}
@@ -208,10 +204,7 @@ class Recording:
         ranges: str = QUANTISED,
         time: Interval | None = None,
     ) -> Thinned:
-        """Quantities of every point, or of every computed shot where all of them are a shot's.
-
-        Thinned to `most` of them; of a part of the flight [s] where an interval is given.
-        """
+        """Quantities of every point, or of every computed shot if all are a shot's; thinned."""
         of_points = any(QUANTITIES[name].of_points for name in names)
         crops = {"time": time} if time else {}
         found = Thinned(most)
@@ -254,10 +247,9 @@ class Recording:
 
 
 def several_surfaces(recording: Recording, draw: int = 0) -> int | None:
-    """Return the number of the first shot that tells surfaces apart.
+    """Return the number of the first shot with true points of two surfaces in a draw.
 
-    The first with true points of two surfaces in a draw; where there is none, the first with two
-    groups of bins above the threshold; none where there is none of those either.
+    Else the first with two groups of bins above the threshold; or None.
     """
     fallback = None
     for part in recording.stretches():
@@ -285,15 +277,7 @@ def confined(tables: Table, crops: Mapping[str, Interval]) -> Table:
 
 
 class Thinned:
-    """Rows of tables in order, evenly thinned to a number of them in bounded memory.
-
-    Every row is kept until there are too many, then every second, every fourth, ...
-
-    Parameters
-    ----------
-    most
-        Rows to keep at most.
-    """
+    """Rows of tables in order: all, then every second, every fourth, ... until few enough."""
 
     def __init__(self, most: int) -> None:
         self.most, self.every, self.total = most, 1, 0
@@ -325,9 +309,9 @@ class Thinned:
 
 @dataclass(frozen=True)
 class Place:
-    """A place along the axes of a study: the number of the value along each.
+    """A place along the axes of a study: the number of the value along each, and words.
 
-    In words the values of axes that have several; axes left open have others that would do as well.
+    Axes left open have other values that would do as well.
     """
 
     index: dict[str, int]
@@ -348,8 +332,9 @@ class Place:
 def place(spec: SceneSpec, where: Mapping[str, object]) -> Place:
     """Return the first place at which coordinates have the values asked for.
 
-    Values are written as in a spec, one or several of each coordinate; of an axis with a name of
-    its own, the number along it. SpecError tells of all that are no coordinate or value of it.
+    Values are written as in a spec, one or several of each coordinate; of an axis with a name
+    of its own, the number along it. SpecError tells of all that are no coordinate or value of
+    it.
     """
     fits = {axis.name: np.ones(axis.size, bool) for axis in spec.axes}
     mistakes = []
@@ -415,13 +400,122 @@ def _words(spec: SceneSpec, index: Mapping[str, int]) -> str:
     )
 
 
-FOLDER = "eyepoints"
-"""Folder of the eyepoints of all studies whose stores lie beside it."""
+MOST_POINTS, MOST_DROPOUTS, MOST_PATH = 120_000, 20_000, 2000
+"""Most points, dropouts and places of the path in a picture; more is thinned."""
+
+MARGIN = 0.04
+"""Room around the points, as a share of the longest side of the box that holds them."""
+
+Box = dict[str, tuple[float, float]]
+"""Lowest and highest value of x, y and z [m]."""
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Points of a picture, and what else is in it.
+
+    Dropouts are what shots without a point aimed at. Totals are those within the limits, one of
+    `every` is shown; false points `outside` of the box of the picture [m] are left out.
+    """
+
+    points: Table
+    dropouts: Table
+    path: Table
+    total: int
+    total_dropouts: int
+    outside: int
+    every: int
+    every_dropout: int
+    box: Box
+
+    @property
+    def true(self) -> np.ndarray:
+        """Mask of the true points."""
+        return np.asarray((self.points["flags"] & TRUE) > 0)
+
+    @property
+    def remarks(self) -> list[str]:
+        """Numbers of points, dropouts and false points outside, and how many of them are shown."""
+        said = [labels.counted(self.total, "point") + _one_in(self.every)]
+        if self.dropouts:
+            lost = labels.counted(self.total_dropouts, "shot")
+            said.append(f"{lost} without a point{_one_in(self.every_dropout)}")
+        if self.outside:
+            said.append(f"{labels.counted(self.outside, 'false point')} outside of the picture")
+        return said
+
+
+def _one_in(every: int) -> str:
+    return f", one in {every} of them shown" if every > 1 else ""
+
+
+def gathered(
+    recording: Recording,
+    names: Sequence[str],
+    *,
+    ranges: str,
+    draw: int = 0,
+    crops: Mapping[str, Interval] | None = None,
+    dropouts: bool = False,
+    path: bool = False,
+    most: int = MOST_POINTS,
+) -> Cloud | None:
+    """Points within limits; none where there is none."""
+    crops = dict(crops or {})
+    places = {name: crop for name, crop in crops.items() if name in AXES}
+    kept = list(dict.fromkeys([*AXES, "flags", *names]))
+    found, lost, track = Thinned(most), Thinned(MOST_DROPOUTS), Thinned(MOST_PATH)
+    for part in recording.stretches(crops.get("time")):
+        every = recording.points(list(dict.fromkeys([*kept, *crops])), part, draw, ranges)
+        inside = confined(every, crops)
+        found.add({name: inside[name] for name in kept})
+        time = recording.read("time", part)
+        chosen = crops.get("time", Interval()).holds(time)
+        if dropouts:
+            none = ~(recording.read("flags", part, draw) > 0).any(axis=-1)
+            none &= recording.computed(part, draw) & (chosen | ("time" not in crops))
+            aims = recording.aims(part)[none]
+            aims = aims[np.isfinite(aims[:, 0])]
+            lost.add(confined(dict(zip(AXES, aims.T, strict=True)), places))
+        if path:
+            position = recording.read("platform_position", part)[chosen]
+            track.add(dict(zip(AXES, position.T, strict=True)))
+    if not found.total:
+        return None
+    rows = found.rows()
+    box = _box(rows, lost.rows(), track.rows(), places)
+    inside_box = np.logical_and.reduce([Interval(*box[axis]).holds(rows[axis]) for axis in AXES])
+    return Cloud(
+        points={name: values[inside_box] for name, values in rows.items()},
+        dropouts=lost.rows(),
+        path=track.rows(),
+        total=found.total,
+        total_dropouts=lost.total,
+        outside=int((~inside_box).sum()) * found.every,
+        every=found.every,
+        every_dropout=lost.every,
+        box=box,
+    )
+
+
+def _box(rows: Table, lost: Table, track: Table, places: Mapping[str, Interval]) -> Box:
+    """Box around what a figure shows: asked limits, else true points, dropouts and the path."""
+    true = (rows["flags"] & TRUE) > 0
+    box: Box = {}
+    for axis in AXES:
+        values = rows[axis][true] if true.any() else rows[axis]
+        every = [values, *(t[axis] for t in (lost, track) if t)]
+        crop = places.get(axis, Interval())
+        low = min(float(v.min()) for v in every if v.size)
+        high = max(float(v.max()) for v in every if v.size)
+        box[axis] = (max(low, crop.low), min(high, crop.high))
+    room = MARGIN * max(max(high - low for low, high in box.values()), 1.0)
+    return {axis: (low - room, high + room) for axis, (low, high) in box.items()}
 
 
 def eyepoints_of(store_path: Location, scanner: xr.Dataset) -> Location:
     """Store of the eyepoints that a scanner's clouds were made of."""
-    return real(store_path).parent / FOLDER / f"{scanner.attrs['geometry_id']}.zarr"
+    return eyepoints_path(store_path, str(scanner.attrs["geometry_id"]))
 
 
 def read_eyepoints(path: Location, index: np.ndarray) -> Eyepoints:

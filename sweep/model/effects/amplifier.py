@@ -96,10 +96,7 @@ def _current(p: Mapping[str, np.ndarray], amplified: str) -> np.ndarray:
         power=oscillator,
         apd_gain=p[RECEIVER + "apd_gain"],
         responsivity=p[RECEIVER + "responsivity"],
-        electrical_bandwidth=link.electrical_bandwidth(
-            detector_bandwidth=p[RECEIVER + "detector_bandwidth"],
-            amplifier_bandwidth=p[RECEIVER + "amplifier_bandwidth"],
-        ),
+        electrical_bandwidth=link.electrical_bandwidth(p, RECEIVER),
     )
 
 
@@ -107,7 +104,7 @@ def emission_size(points: Points) -> Size | None:
     """Return the beat noise, exactly; the threshold is set on it."""
     if points.architecture == "direct" or not points.has(_INVERSION):
         return None
-    current = _current(points.numbers, points.word(_AMPLIFIED))
+    current = _current(points.parameters, points.word(_AMPLIFIED))
     return Size(noise=current * points.receiver.per_ampere / points.noise_variance)
 
 

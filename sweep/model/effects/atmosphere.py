@@ -18,6 +18,7 @@ Sources of the tables:
 - Lidar ratios: haze 30 to 70 sr, Martian dust about 40 sr, water drops 18 sr.
 """
 
+import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import replace
@@ -94,15 +95,7 @@ PROFILES = {
 def optical_depth(
     profile: Profile, *, start_height: ArrayLike, end_height: ArrayLike, range: ArrayLike
 ) -> np.ndarray:
-    """Optical depth of a straight path, one way.
-
-    Parameters
-    ----------
-    start_height, end_height : array_like
-        Heights of its ends above the ground [m]; (n,) or scalar, as all.
-    range : array_like
-        Its length [m], at least the difference of heights.
-    """
+    """Optical depth of a straight path `range` [m] long between two heights [m], one way."""
     ends = np.broadcast_arrays(np.asarray(start_height, float), np.asarray(end_height, float))
     low, high = np.minimum(*ends), np.maximum(*ends)
     level = np.maximum(_LEVEL - (high - low), 0.0) / 2
@@ -173,11 +166,10 @@ def dim(shots: Shots, scene: Scene) -> Shots:
     if air is None:
         return shots
     t = transmission(air, **_path(scene.parameters, shots.range))
-    beat = t**2 if shots.architecture == "direct" else t
     return replace(
         shots,
         echo_scale=shots.echo_scale * t**2,
-        beat_scale=shots.beat_scale * beat,
+        beat_scale=shots.beat_scale * (t**2 if shots.architecture == "direct" else t),
         ground_transmission=t,
     )
 
@@ -254,45 +246,26 @@ _NEAR = (1.0, 2.0, 4.0, 10.0, 30.0, 100.0)
 """Cuts of the path for the integral, in units of r_0."""
 
 
-def backscattered(
+def returned(
     profile: Profile,
     *,
     start_height: ArrayLike,
     end_height: ArrayLike,
     range: ArrayLike,
-    laser_power: np.ndarray,
-    aperture: np.ndarray,
-    optical_efficiency: np.ndarray,
-    beam_divergence: np.ndarray,
-    lidar_ratio: np.ndarray,
+    near: ArrayLike,
 ) -> np.ndarray:
-    """Light [W] that the air returns to the detector all along a continuous beam, (n,).
+    """Integral over 0..R of alpha(r) T(r)^2 / (r^2 + r_0^2) dr [1/m^2], r_0 = D / Theta = `near`.
 
-    P = P_tx A tau_o  integral over 0..R of  beta(r) T(r)^2 / (r^2 + r_0^2) dr,   r_0 = D / Theta
-
-    with the backscatter coefficient beta = alpha / S [1/m/sr]. r^2 / (r^2 + r_0^2) is the overlap
-    of a collimated beam with its own receiver: nearer than r_0 a point's image is larger than the
-    field of view. For a beam at the limit of diffraction, Theta = 4 lambda / (pi D), it is the
-    coherent lidar's of Sonnenschein and Horrigan (Appl. Opt. 10, 1971, 1600, focus at infinity).
-    By Gauss's rule over atan(r / r_0) between the rows of the profile that the path crosses, those
-    cut where the extinction or the overlap has fallen; within 1e-8.
-
-    Parameters
-    ----------
-    profile : Profile
-        Extinction over height.
-    start_height, end_height, range : array_like
-        Heights of lidar and target and the path's length [m]; (n,) or scalars, as all.
-    laser_power, aperture, optical_efficiency, beam_divergence : array_like
-        As in the link budget: [W], diameter [m], [1], full angle [rad].
-    lidar_ratio : array_like
-        Extinction over backscatter S [sr], > 0.
+    A continuous beam has P_tx A tau_o / S times it sent back by the air to the detector [W], S the
+    lidar ratio [sr]. r^2 / (r^2 + r_0^2) is the overlap of a collimated beam with its own receiver:
+    nearer than r_0 a point's image is larger than the field of view. For a beam at the limit of
+    diffraction, Theta = 4 lambda / (pi D), it is the coherent lidar's of Sonnenschein and Horrigan
+    (Appl. Opt. 10, 1971, 1600, focus at infinity). By Gauss's rule over atan(r / r_0) between the
+    rows of the profile that the path crosses, those cut where the extinction or the overlap has
+    fallen; within 1e-8. Heights as of :func:`optical_depth`.
     """
-    given = (start_height, end_height, range, np.asarray(aperture, float) / beam_divergence,
-             lidar_ratio)  # fmt: skip
-    h0, h1, far, near, ratio = (
-        np.expand_dims(a, -1) for a in np.broadcast_arrays(*(np.asarray(v, float) for v in given))
-    )
+    given = (np.asarray(value, float) for value in (start_height, end_height, range, near))
+    h0, h1, far, near = (np.expand_dims(column, -1) for column in np.broadcast_arrays(*given))
     rise = h1 - h0
     crossed = (_cut_heights(profile) - h0) / np.where(rise == 0, np.inf, rise)
     inner = [np.clip(crossed, 0, 1) * far, np.minimum(np.asarray(_NEAR) * near, far)]
@@ -304,23 +277,27 @@ def backscattered(
     height = h0[..., None] + rise[..., None] * (r / far[..., None])
     depth = optical_depth(profile, start_height=h0[..., None], end_height=height, range=r)
     local = optical_depth(profile, start_height=height, end_height=height, range=1.0)
-    returned = (half * _WEIGHTS * local * np.exp(-2 * depth)).sum(axis=(-1, -2))
-    collected = laser_power * aperture_area(aperture) * optical_efficiency
-    return np.asarray(collected * returned / near[..., 0] / ratio[..., 0])
+    total = (half * _WEIGHTS * local * np.exp(-2 * depth)).sum(axis=(-1, -2))
+    return np.asarray(total / near[..., 0])
 
 
 def _cut_heights(profile: Profile) -> np.ndarray:
     """Heights between which extinction is smooth and falls by a few e-foldings at most."""
     cuts = [profile.height[0]]
-    rows = zip(
-        profile.height, profile.height[1:], profile.extinction, profile.extinction[1:], strict=False
-    )
-    for z0, z1, a0, a1 in rows:
+    rows = [*zip(profile.height, profile.extinction, strict=True)]
+    for (z0, a0), (z1, a1) in itertools.pairwise(rows):
         folds = abs(math.log(a1 / a0)) if a0 > 0 and a1 > 0 else 0.0
         steps = [fold / folds for fold in _FOLDS if fold < folds]
         cuts += [z0 + step * (z1 - z0) if a1 < a0 else z1 - step * (z1 - z0) for step in steps]
         cuts.append(z1)
     return np.array(cuts)
+
+
+def _light(p: Mapping[str, np.ndarray], integral: np.ndarray) -> np.ndarray:
+    """Light [W] that the air sends back, from :func:`returned`."""
+    collected = p[LASER + "power"] * aperture_area(beam.receiving_field(p)[0])
+    collected = collected * p[TELESCOPE + "optical_efficiency"]
+    return np.asarray(collected * integral / p["atmosphere.lidar_ratio"])
 
 
 def scatter_back(shots: Shots, scene: Scene) -> Shots:
@@ -334,16 +311,8 @@ def scatter_back(shots: Shots, scene: Scene) -> Shots:
     air = profile_of(p)
     if air is None:
         return shots
-    diameter, angle = beam.receiving_field(p)
-    light = backscattered(
-        air,
-        **_path(p, shots.range),
-        laser_power=p[LASER + "power"],
-        aperture=diameter,
-        optical_efficiency=p[TELESCOPE + "optical_efficiency"],
-        beam_divergence=angle,
-        lidar_ratio=p["atmosphere.lidar_ratio"],
-    )
+    aperture, angle = beam.receiving_field(p)
+    light = _light(p, returned(air, near=aperture / angle, **_path(p, shots.range)))
     return noisier(shots, backscatter_shot=np.asarray(shots.shot_noise_scale * light))
 
 
@@ -353,20 +322,18 @@ def backscatter_size(points: Points) -> Size | None:
     It is the lesser of two: the whole path with the air of its lower end, without extinction; or
     all the light that is lost on the path, sent back from the beam's near end.
     """
-    air = profile_of(points.parameters)
+    p = points.parameters
+    air = profile_of(p)
     if air is None:
         return None
-    path = _path(points.parameters, points.range)
-    aperture, angle = beam.receiving_field(points.parameters)
+    path = _path(p, points.range)
+    aperture, angle = beam.receiving_field(p)
     lowest = np.minimum(path["start_height"], path["end_height"])
     near = aperture / angle
     local = optical_depth(air, start_height=lowest, end_height=lowest, range=1.0)
     even = local * np.arctan(points.range / near) / near
-    returned = np.minimum(even, -np.expm1(-2 * optical_depth(air, **path)) / 2 / near**2)
-    efficiency = points[TELESCOPE + "optical_efficiency"]
-    collected = points[LASER + "power"] * aperture_area(aperture) * efficiency
-    light = returned / points["atmosphere.lidar_ratio"] * collected
-    return Size(noise=light * points.receiver.per_watt / points.noise_variance)
+    most = np.minimum(even, -np.expm1(-2 * optical_depth(air, **path)) / 2 / near**2)
+    return Size(noise=_light(p, most) * points.receiver.per_watt / points.noise_variance)
 
 
 BACKSCATTER = Effect(

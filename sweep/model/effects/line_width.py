@@ -85,24 +85,12 @@ class Shifts(NamedTuple):
 def gaussian_shifts(*, fwhm: np.ndarray, duration: np.ndarray) -> Shifts:
     """Shifts and weights whose weighted mean of |X|^2 is that under a Gaussian line.
 
-    Parameters
-    ----------
-    fwhm : (n,) ndarray
-        Full width at half maximum of the beat's line [Hz], >= 0.
-    duration : (n,) ndarray
-        Length of the record L/fs [s].
-
-    Raises
-    ------
-    UnsupportedShot
-        For a line of more than :data:`MOST_BINS` bins standard deviation.
-
-    Notes
-    -----
-    One shift for no width, 19 for lines narrow against a bin, 15 more for each bin of standard
-    deviation; weights of 0 fill rows with fewer than k. With
-    step h the error is exp(-2 pi^2 s^2 (1/h - 1)^2) at the record's longest lag, by Poisson's
-    summation formula; the Gaussian's tails are cut where they hold as much.
+    The FWHM is that of the beat's line [Hz], the duration that of the record [s], (n,) each. One
+    shift for no width, 19 for lines narrow against a bin, 15 more for each bin of standard
+    deviation; weights of 0 fill rows with fewer than k. With step h the error is exp(-2 pi^2 s^2
+    (1/h - 1)^2) at the record's longest lag, by Poisson's summation formula; the Gaussian's tails
+    are cut where they hold as much. An UnsupportedShot for more than :data:`MOST_BINS` bins of
+    standard deviation.
     """
     deviation = np.atleast_1d(DEVIATION_OF_FWHM * np.asarray(fwhm, float) * duration)
     if deviation.max(initial=0.0) > MOST_BINS:
@@ -130,12 +118,8 @@ def coherent_share(
 ) -> np.ndarray:
     """Share of the beat's power in the pure line, exp(-2 pi dnu tau), (n,), 0..1.
 
-    Parameters
-    ----------
-    line_width : (n,) ndarray
-        FWHM dnu of the laser's Lorentzian line [Hz].
-    delay, duration : (n,) ndarray
-        Echo delay tau [s]; length of the record [s], which counts where it is shorter.
+    By the FWHM dnu of the laser's Lorentzian line [Hz], the echo's delay tau [s], and the length of
+    the record [s], which counts where it is shorter.
     """
     return np.exp(-2 * np.pi * np.asarray(line_width) * np.minimum(delay, duration))
 
@@ -143,10 +127,7 @@ def coherent_share(
 def density_under_line(*, line_width: np.ndarray, delay: np.ndarray) -> np.ndarray:
     """Power density of the pedestal under a line of power 1, 2 (1 - e^-g (1 + g)) / Gamma [1/Hz].
 
-    Parameters
-    ----------
-    line_width, delay : ndarray
-        dnu [Hz], > 0, and tau [s]; g = Gamma tau.
+    dnu [Hz], > 0, and tau [s]; g = Gamma tau.
     """
     gamma = 2 * np.pi * np.asarray(line_width, float)
     g = gamma * delay
@@ -162,17 +143,9 @@ def power_under_line(
     """Mean |X|^2 that the pedestal leaves in its line's bin, over |C|^2 of the line, (n,), >= 0.
 
     A line of weight C (|C| = a/2) has mean bin power |C|^2 times (coherent share x |W(0)|^2 +
-    this). It adds as noise does: circular, and new in every record.
+    this). It adds as noise does: circular, and new in every record. Arguments as of
+    :func:`coherent_share`.
 
-    Parameters
-    ----------
-    line_width, delay, duration : (n,) ndarray
-        As of :func:`coherent_share`.
-    window : Window
-        The record's window.
-
-    Notes
-    -----
     sum_j r_j [e^{-Gamma T_j} - e^{-Gamma tau}], r the window's autocorrelation, is taken as it
     stands where few lags are left of it; else as the integral over the lag, by Gauss and Legendre's
     rule, and what its kinks at no lag and at the delay alias to, in closed form: within 2e-5 for
@@ -231,14 +204,8 @@ def seen_line(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Line and pedestal in the line's bin as |X| sees them, but for the phase of all the record.
 
-    Of looks that are added in amplitude the phase of a record counts too: each has its own.
-
-    Parameters
-    ----------
-    line_width, delay, duration, window
-        As of :func:`power_under_line`.
-    looks : int
-        Records that are added in amplitude.
+    Of looks that are added in amplitude the phase of a record counts too: each has its own. Other
+    arguments as of :func:`power_under_line`.
 
     Returns
     -------
@@ -310,35 +277,16 @@ def walked_phase(
 ) -> np.ndarray:
     """Phase theta(t) - theta(t - tau) [rad] of a laser over a record, but for its first sample's.
 
-    Parameters
-    ----------
-    steps : (walk_steps,) ndarray
-        Standard normal numbers.
-    per_sample : float
-        Variance of theta's change from sample to sample, Gamma / fs.
-    delay : float
-        tau [samples].
-    whole : bool
-        With the first sample's as well, for a delay shorter than the record.
-
-    Returns
-    -------
-    (L,) ndarray
-        0 at first, or all of it.
-
-    Notes
-    -----
-    Each step between samples is taken in two, before and after the place in it at which delayed
-    samples lie: so delays need not be whole.
+    `steps` (walk_steps,) are standard normal numbers, `per_sample` the variance of theta's change
+    from sample to sample, Gamma / fs, `delay` is tau [samples]; with `whole` the first sample's as
+    well, for a delay shorter than the record. Each step between samples is taken in two, before and
+    after the place in it at which delayed samples lie: so delays need not be whole.
     """
     before, after = steps.reshape(2, -1)
     part = delay - math.floor(delay)
-    before, after = (
-        before * math.sqrt(per_sample * (1 - part)),
-        after * math.sqrt(per_sample * part),
-    )
-    length = before.size - math.floor(delay)
-    length = max(length, before.size // 2)
+    before = before * math.sqrt(per_sample * (1 - part))
+    after = after * math.sqrt(per_sample * part)
+    length = max(before.size - math.floor(delay), before.size // 2)
     now = (before + after)[before.size - length + 1 :]
     then = before[1:length] + after[: length - 1]
     phase = np.concatenate([[0.0], np.cumsum(now - then)])
@@ -419,11 +367,8 @@ def act(shots: Shots, scene: Scene) -> Shots:
     if str(scene.parameters[_SHAPE]) == "gaussian":
         return replace(shots, gaussian_width=width + np.zeros(shots.size))
     delay = 2 * shots.range / SPEED_OF_LIGHT
-    timing = {
-        "line_width": width + np.zeros(shots.size),
-        "delay": delay,
-        "duration": shots.record_duration,
-    }
+    width = width + np.zeros(shots.size)
+    timing = {"line_width": width, "delay": delay, "duration": shots.record_duration}
     if shots.looks.added > 1 and np.any(delay > shots.record_duration):
         raise UnsupportedShot(
             f"{_WIDTH} leaves of looks that are added what their phases have in common, which is "
@@ -436,7 +381,7 @@ def act(shots: Shots, scene: Scene) -> Shots:
     return replace(
         shots,
         beat_scale=shots.beat_scale * np.sqrt(share),
-        laser_width=timing["line_width"],
+        laser_width=width,
         pedestal=power * 2 * in_phase / shots.window.energy,
     )
 

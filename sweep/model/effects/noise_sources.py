@@ -197,10 +197,7 @@ def _current(p: Mapping[str, np.ndarray]) -> np.ndarray:
     return current_variance(
         relative_intensity_noise=p[_RIN],
         common_mode_rejection=p[_REJECTION],
-        electrical_bandwidth=link.electrical_bandwidth(
-            detector_bandwidth=p[RECEIVER + "detector_bandwidth"],
-            amplifier_bandwidth=p[RECEIVER + "amplifier_bandwidth"],
-        ),
+        electrical_bandwidth=link.electrical_bandwidth(p, RECEIVER),
         **{name: p[RECEIVER + name] for name in own},
     )
 
@@ -209,7 +206,7 @@ def intensity_size(points: Points) -> Size | None:
     """Intensity noise, exactly; the threshold is set on it."""
     if points.architecture == "direct" or not points.has(_RIN):
         return None
-    current = _current(points.numbers)
+    current = _current(points.parameters)
     return Size(noise=current * points.receiver.per_ampere / points.noise_variance)
 
 
@@ -284,7 +281,7 @@ def rounding_size(points: Points) -> Size | None:
     """Return the noise of rounding, without clipping; the threshold follows it."""
     if not points.has(_BITS):
         return None
-    return Size(noise=_rounding(points.numbers, points.word(RECORD)) / points.noise_variance)
+    return Size(noise=_rounding(points.parameters, points.word(RECORD)) / points.noise_variance)
 
 
 def add_rounding(shots: Shots, scene: Scene) -> Shots:

@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sweep.model.effects.catalogue import EFFECTS
-from sweep.model.effects.effect import MODES, Effect, Size
+from sweep.model.effects.effect import Effect, Size
 from sweep.model.effects.points import Points
 
 _LN_10 = math.log(10.0)
@@ -69,18 +69,13 @@ def plan(
         Largest value in each tile, (tiles,), of values that broadcast over the points.
     modes : mapping, optional
         Name to ``auto`` (by default), ``on`` or ``off``. An effect that the scene has nothing of
-        is left out, even if it is on. With one that is off go those that are within it.
+        is left out, even if it is on. With one that is off go those that are within it; a
+        ValueError where one of these is on.
     tolerance : float
         On the sum of the changes by all that is left out, 0..1: of pd in the three segments
         together, of log10 of a false alarm's probability, of a relative magnitude.
     effects : sequence of Effect, optional
         Those to choose from, all by default.
-
-    Raises
-    ------
-    ValueError
-        For a mode that is none of these, a name that is no effect's, or an effect that is on
-        within one that is off.
     """
     names = tuple(effect.name for effect in effects)
     decided = _decided(effects, modes or {})
@@ -111,12 +106,6 @@ def sizes_of(points: Points, effects: Sequence[Effect] = EFFECTS) -> dict[str, S
 
 def _decided(effects: Sequence[Effect], modes: Mapping[str, str]) -> dict[str, str]:
     """Effects that are on or off whatever their sizes, and what these take with them."""
-    names = [effect.name for effect in effects]
-    if unknown := sorted(set(modes) - set(names)):
-        raise ValueError(f"no effect {', '.join(unknown)}: choose from {', '.join(names)}")
-    for name, mode in modes.items():
-        if mode not in MODES:
-            raise ValueError(f"{name}: no mode {mode!r}: choose from {', '.join(MODES)}")
     decided = {name: mode for name, mode in modes.items() if mode != "auto"}
     for name, parent in _within(effects):
         if decided.get(parent) == "off":
@@ -142,12 +131,11 @@ def _kept(
     decided: Mapping[str, str],
     tolerance: float,
 ) -> np.ndarray:
-    """Effects to keep, (effects, tiles) bool.
+    """Effects to keep, (effects, tiles) bool, of those that the scene has anything of, `there`.
 
     The smallest are left out first, as long as their sum is within what the tolerance leaves; an
     effect never before those within it, last ones first where they are alike. Those that cost
-    nothing, as a number added to the noise does, are never left out. ``there`` says of which
-    effects the scene has anything.
+    nothing, as a number added to the noise does, are never left out.
     """
     place = {effect.name: row for row, effect in enumerate(effects)}
     mode = np.array([decided.get(name, "") for name in place])
@@ -179,18 +167,10 @@ def changes(
 ) -> dict[str, np.ndarray]:
     """Change of pd, log10 pfa or |X| by each effect, whichever is most, 0..1, over the points.
 
-    Of pd it is the sum of the changes in all segments, which bounds that of their product.
-
-    Parameters
-    ----------
-    sizes : mapping
-        Of the effects that there are, by name.
-    points : Points
-        Those.
-    leaking : mapping, optional
-        Where leakage is asked for, of each effect whether it moves light from bins to others. Bins
-        that leak are then taken to be off by as many sigmas as the largest; that counts up to the
-        leakage's own size.
+    Of pd it is the sum of the changes in all segments, which bounds that of their product. Where
+    leakage is asked for, `leaking` tells of each effect whether it moves light from bins to others:
+    bins that leak are then taken to be off by as many sigmas as the largest; that counts up to the
+    leakage's own size.
     """
     low, high = plausible(sizes, points)
     b = points.looks.scaled(points.threshold)

@@ -61,16 +61,11 @@ def turned(
     angles: np.ndarray,
     velocity_across: ArrayLike = (0.0, 0.0),
 ) -> Turned:
-    """Geometry of beams that are off by some angles.
+    """Geometry of beams that are off by some angles (..., 2) [rad].
 
-    Parameters
-    ----------
-    range, grazing_angle, radial_velocity : array_like
-        Of the beam's axis as aimed [m, rad, m/s]; broadcast against the angles' leading axes.
-    angles : (..., 2) ndarray
-        a, positive towards grazing (upwards), and b [rad].
-    velocity_across : (..., 2) array_like
-        The instrument's velocity along the directions of a and b [m/s].
+    Range, grazing angle and velocity [m, rad, m/s] are those of the axis as aimed; they broadcast
+    against the angles' leading axes. The angles are a, positive towards grazing (upwards), and b,
+    and `velocity_across` (..., 2) the instrument's velocity along their directions [m/s].
     """
     aimed, off = np.asarray(grazing_angle, float), np.asarray(angles, float)
     angle = np.hypot(off[..., 0], off[..., 1])
@@ -142,16 +137,11 @@ def size(points: Points) -> Size | None:
 
 def turn(p: dict[str, np.ndarray], realisation: Realisation) -> dict[str, np.ndarray]:
     """Range, grazing angle and velocities of beams that are off; no echo where they miss."""
-    angles_off = angles(realisation, p[_JITTER])
-    across = np.zeros_like(angles_off)
+    off = angles(realisation, p[_JITTER])
+    across = np.zeros_like(off)
     across[:, 0] = -p["target.transverse_velocity"]  # towards the near side is off grazing
-    seen = turned(
-        range=p["target.range"],
-        grazing_angle=p["target.grazing_angle"],
-        radial_velocity=p["target.radial_velocity"],
-        angles=angles_off,
-        velocity_across=across,
-    )
+    aimed = {name: p[f"target.{name}"] for name in Turned._fields}
+    seen = turned(angles=off, velocity_across=across, **aimed)
     hits = np.isfinite(seen.range)
     return p | {
         "target.range": np.where(hits, seen.range, 1.0),

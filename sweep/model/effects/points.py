@@ -80,15 +80,10 @@ def by_power(change: np.ndarray) -> np.ndarray:
 class Points:
     """Some points that share every word.
 
-    Parameters
-    ----------
-    parameters : mapping
-        Dotted path to word, number or array, for every parameter, those that effects bring among
-        them. Arrays broadcast against each other and have as many axes each.
-    footprint : Extent, optional
-        What rays have found; by default that of a flat plane.
-    rotating : bool
-        Whether any surface belongs to a body that turns.
+    `parameters` are words, numbers or arrays by dotted path, those that effects bring among them;
+    arrays broadcast against each other and have as many axes each. `footprint` is what rays have
+    found, by default that of a flat plane; `rotating` tells whether any surface belongs to a body
+    that turns.
     """
 
     def __init__(
@@ -98,11 +93,8 @@ class Points:
         *,
         rotating: bool = False,
     ) -> None:
-        self._words = {path: v for path, v in parameters.items() if isinstance(v, str)}
-        self._numbers = {
-            path: np.asarray(v) for path, v in parameters.items() if path not in self._words
-        }
-        self.ndim = max((v.ndim for v in self._numbers.values()), default=0)
+        self.parameters = {path: np.asarray(value) for path, value in parameters.items()}
+        self.ndim = max((v.ndim for v in self.parameters.values()), default=0)
         self._footprint, self.rotating = footprint, rotating
         self.architecture = self.word(RECEIVER + "architecture")
         self.fft_size = self.whole(PROCESSING + "fft_size")
@@ -113,9 +105,9 @@ class Points:
         self.smears: dict[str, Smear] = {}
         """Of the effects that smear lines, by name."""
         number = self.whole(resolution.BEAMLETS)
-        self.number, self.pattern = (
-            (number, ground.pattern(self._words)) if number else resolution.finest(self._words)
-        )
+        self.number, self.pattern = resolution.finest(self.parameters)
+        if number:
+            self.number, self.pattern = number, ground.pattern(self.parameters)
         direct = self.architecture == "direct"
         self.order = waveform.order_of(self.architecture, self.word(waveform.ORDER))
         self.sample_rate = self[PROCESSING + "sample_rate"]
@@ -140,38 +132,19 @@ class Points:
 
     def __getitem__(self, path: str) -> np.ndarray:
         """Return a parameter that is a number."""
-        return self._numbers[path]
-
-    @property
-    def numbers(self) -> Mapping[str, np.ndarray]:
-        """All parameters that are numbers."""
-        return self._numbers
-
-    @property
-    def parameters(self) -> dict[str, np.ndarray]:
-        """All parameters as shots have them."""
-        return self._numbers | {path: np.asarray(word) for path, word in self._words.items()}
+        return self.parameters[path]
 
     def word(self, path: str) -> str:
         """Return a parameter that is a word."""
-        return self._words[path]
+        return str(self.parameters[path])
 
     def whole(self, path: str) -> int:
-        """Return a whole number that all points share.
-
-        Raises
-        ------
-        ValueError
-            The points' values differ.
-        """
-        value = self._numbers[path]
-        if value.ndim and (value != value.flat[0]).any():
-            raise ValueError(f"points that are planned together must share {path}")
-        return int(value.flat[0])
+        """Return a whole number that all points share."""
+        return int(self.parameters[path].flat[0])
 
     def has(self, *paths: str) -> bool:
         """Return true if any of some numbers is other than 0 anywhere."""
-        return any(bool(self._numbers[path].any()) for path in paths)
+        return any(bool(self.parameters[path].any()) for path in paths)
 
     def _there(self, of_all: Sequence[Any]) -> list[Any]:
         """Values of the segments that there are: up, Doppler, down."""
@@ -180,12 +153,8 @@ class Points:
 
     def columns(self, *values: np.ndarray | float) -> np.ndarray:
         """Values by segment, one behind the other."""
-        arrays = [np.asarray(value, float) for value in values]
-        ones = (1,) * self.ndim
-        out = np.empty((len(arrays), *np.broadcast_shapes(ones, *(a.shape for a in arrays))))
-        for k, value in enumerate(arrays):
-            out[k] = value
-        return out
+        like = np.zeros((1,) * self.ndim)
+        return np.stack(np.broadcast_arrays(like, *values)[1:]).astype(float)
 
     # The instrument
 
@@ -198,8 +167,6 @@ class Points:
             acquisition_delay=self.start,
             sample_rate=self.sample_rate,
         )
-        if length.ndim and (length != length.flat[0]).any():
-            raise ValueError("points that are planned together must share the record's length")
         return window(canonical_name(self.word(PROCESSING + "window")), int(length.flat[0]))
 
     @cached_property
@@ -250,11 +217,8 @@ class Points:
         """Threshold over sigma."""
         from sweep.model import detection
 
-        return np.asarray(
-            detection.threshold(
-                tnr=tnr_of(self._words | self._numbers), bin_deviation=np.asarray(1.0)
-            )
-        )
+        tnr = tnr_of(self.parameters)
+        return np.asarray(detection.threshold(tnr=tnr, bin_deviation=np.asarray(1.0)))
 
     # The target
 
@@ -308,7 +272,7 @@ class Points:
     @cached_property
     def approach(self) -> np.ndarray:
         """Speed at which the range along the beam falls [m/s]."""
-        return np.asarray(approach(self._numbers))
+        return np.asarray(approach(self.parameters))
 
     @property
     def look_period(self) -> np.ndarray:

@@ -53,16 +53,10 @@ class Clipping(NamedTuple):
 
 
 def clipping(*, amplitude: ArrayLike, deviation: ArrayLike, full_scale: ArrayLike) -> Clipping:
-    """Gain of line and noise by clipping.
+    """Gain of line and noise by clipping, from voltages at the ADC [V], > 0, (n,) or scalars.
 
-    Parameters
-    ----------
-    amplitude : array_like
-        Of the beat at the ADC [V], > 0; (n,) or scalar, as all.
-    deviation : array_like
-        Of the noise at the ADC [V], > 0.
-    full_scale : array_like
-        Largest voltage that does not clip, to either side [V], > 0.
+    They are the beat's amplitude, the noise's deviation, and the largest voltage that does not
+    clip, to either side.
     """
     given = (np.asarray(value, float) for value in (amplitude, deviation, full_scale))
     a, s, v = (value[..., None] for value in np.broadcast_arrays(*given))
@@ -112,12 +106,8 @@ MOST_BEYOND = 1e6
 def act(shots: Shots, scene: Scene) -> Shots:
     """Line and noise as clipping leaves them.
 
-    The record is taken for one sine with the power of all lines.
-
-    Raises
-    ------
-    UnsupportedShot
-        For records that exceed full scale more than :data:`MOST_BEYOND` times.
+    The record is taken for one sine with the power of all lines. An UnsupportedShot for records
+    that exceed full scale more than :data:`MOST_BEYOND` times.
     """
     full_scale = np.asarray(scene.parameters[_FULL_SCALE], float)
     limited = full_scale > 0
@@ -148,25 +138,20 @@ def beat_amplitude(shots: Shots) -> np.ndarray:
 
     In the segment that passes the receiver best: at its lowest frequency.
     """
-    beats = [
-        waveform.beat_frequency(
-            sign,
-            carrier=carrier,
-            chirp_rate=shots.chirp_rate,
-            range=shots.range,
-            radial_velocity=np.asarray(shots.beta * SPEED_OF_LIGHT / 2),
-        )
-        for sign, carrier in zip(waveform.SIGNS, shots.carriers, strict=True)
-    ]
+    shape = {
+        "chirp_rate": shots.chirp_rate, "range": shots.range,
+        "radial_velocity": np.asarray(shots.beta * SPEED_OF_LIGHT / 2),
+    }  # fmt: skip
+    chirps = zip(waveform.SIGNS, shots.carriers, strict=True)
+    beats = [waveform.beat_frequency(sign, carrier=carrier, **shape) for sign, carrier in chirps]
     gain = link.transfer(
-        np.min(np.abs(beats), axis=0),
+        np.min(np.abs(beats), axis=0), transimpedance=np.ones(1),
         detector_bandwidth=shots.detector_bandwidth,
         amplifier_bandwidth=shots.amplifier_bandwidth,
-        transimpedance=np.ones(1),
-    )
-    together = shots.relative_echo
-    together = together if shots.architecture == "direct" else np.sqrt(together)
-    return np.asarray(shots.beat_scale * together * np.abs(gain))
+    )  # fmt: skip
+    echo = shots.relative_echo
+    echo = echo if shots.architecture == "direct" else np.sqrt(echo)
+    return np.asarray(shots.beat_scale * echo * np.abs(gain))
 
 
 def size(points: Points) -> Size | None:

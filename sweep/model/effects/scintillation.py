@@ -83,14 +83,8 @@ def rytov_variance(
 
     2.25 k^(7/6) integral of C_n^2 (L - z)^(5/6) [(z/L)^(5/6) for a spherical wave] over z from
     source to receiver; 1.23 and 0.50 C_n^2 k^(7/6) L^(11/6) in even turbulence. By a rule of
-    Gauss and Jacobi, which holds the powers exactly; paths may span 20 km of height.
-
-    Parameters
-    ----------
-    wave : str
-        ``plane`` or ``spherical``.
-    wavelength, range, start_height, end_height : array_like
-        [m], (n,) or scalar; start is the wave's source.
+    Gauss and Jacobi, which holds the powers exactly; paths may span 20 km of height. `wave` is
+    ``plane`` or ``spherical``, all else in [m], (n,) or scalar; it starts at the wave's source.
     """
     share, weights = _rule(wave)
     h0, h1 = (np.asarray(h, float)[..., None] for h in (start_height, end_height))
@@ -121,15 +115,7 @@ def log_variances(
     turbulence, and 1 + 0.86 sigma_R^(-4/5) for a plane wave in strong. As it serves any strength
     the published fit averages too little over wide apertures: in weak turbulence it is 1.3 times
     Kolmogorov's integral where k D^2 / 4 L is 1, and 2 (plane) or 1.5 (spherical) where it is 10.
-
-    Parameters
-    ----------
-    wave : str
-        ``plane`` or ``spherical``.
-    rytov_variance : array_like
-        Of that wave, >= 0, (n,) or scalar, as all.
-    wavelength, range, aperture : array_like
-        [m]; the diameter of the aperture that averages, 0 for a point.
+    The Rytov variance is that of `wave`; the aperture's diameter [m] is 0 for a point.
     """
     v = np.asarray(rytov_variance, float)
     k = 2 * math.pi / np.asarray(wavelength, float)
@@ -150,19 +136,10 @@ _STEEPEST, _MOST_BENT = 0.5, 0.5
 def factors(
     distribution: str, legs: Sequence[LogVariances], realisation: Realisation
 ) -> np.ndarray:
-    """Random factors of unit mean on the echo's power, (n,).
+    """Random factors of unit mean on the echo's power, (n,), of legs that are independent.
 
     Numbers 2 i and 2 i + 1 of the stream are leg i's large and small eddies, turned into factors
     by the inverse of their distribution.
-
-    Parameters
-    ----------
-    distribution : str
-        ``log_normal`` or ``gamma_gamma``.
-    legs : sequence of LogVariances
-        Those of one to two ways, (n,) each or scalar; they are independent.
-    realisation : Realisation
-        Which draws.
     """
     from sweep.model import philox
 
@@ -200,10 +177,6 @@ def _inverse(distribution: str, chance: np.ndarray, variance: np.ndarray) -> np.
     z = special.ndtri(chance)
     if distribution == "log_normal":
         return np.asarray(np.exp(np.sqrt(variance) * z - variance / 2))
-    if distribution != "gamma_gamma":
-        raise ValueError(
-            f"no distribution {distribution!r}: take one of {', '.join(DISTRIBUTIONS)}"
-        )
     spread = np.expm1(variance)
     shape = 1 / np.maximum(spread, _LEAST_SPREAD)
     cube = (1 - spread / 9 + np.sqrt(spread) / 3 * z) ** 3

@@ -11,24 +11,19 @@ coherent when the round trip has normal phases of deviation 4 pi sigma_h / lambd
 the footprint's phases follow its geometry, and a random phase where they do not. kappa = 0 is a
 Swerling-1 target, any other a Rician one.
 
-The three segments of a shot see the same heights, and frequencies that differ by B at the most, so
-that one g_b serves all three: amplitudes at frequencies df apart have the correlation
-exp(-(4 pi sigma_h df / c)^2 / 2), 1 to 1e-6 for 1 GHz and heights of 10 um (the roughness matters
-up to lambda or so, beyond which kappa is 0). Depth beyond roughness lies in the beamlets' ranges,
-and what it does between the segments in their lines' phases. With the instrument moving across the
-beam the Doppler shifts differ over the footprint, which turns the beamlets against each other from
-one segment to the next. Motion between segments has that in the lines' phases; where it is left
-out it is done here, but for coherent footprints with a share kappa left, whose segments are then
-more alike than they are.
+The three segments of a shot see the same heights, so that one g_b serves all three: amplitudes at
+frequencies df apart have the correlation exp(-(4 pi sigma_h df / c)^2 / 2), 1 to 1e-6 for 1 GHz and
+heights of 10 um. With the instrument moving across the beam the Doppler shifts differ over the
+footprint, which turns the beamlets against each other from one segment to the next. Motion between
+segments has that in the lines' phases; where it is left out it is done here, but for coherent
+footprints with a share kappa left, whose segments are then more alike than they are.
 
-It acts on the lines' amplitudes alone, before their spectrum; the mean echo, and so its shot
-noise, stays.
+It acts on the lines' amplitudes alone; the mean echo, and so its shot noise, stays.
 
 **Fading**: developed speckle (kappa = 0) without draws, the default for surfaces. A sum of circular
-complex Gaussian amplitudes is one itself, in every bin, however wide the footprint; its mean power
-is what beamlets make that add as powers. A bin then crosses the threshold with Swerling's first
-chance, and two segments' bins as two correlated ones do. The segments share a speckle as far as it
-has not moved on between them: their amplitudes have the correlation
+complex Gaussian amplitudes is one itself, in every bin; its mean power is what beamlets make that
+add as powers. A bin then crosses the threshold with Swerling's first chance, and two segments' bins
+as two correlated ones do, with the correlation
 
     mu(dt) = sum_b P_b exp(2 pi i f beta_b dt) / sum_b P_b
 
@@ -55,22 +50,11 @@ _FURTHEST = 5.0
 million draws."""
 
 
-_OF_DIRECT = (
-    "speckle is simulated for homodyne and heterodyne receivers: what direct detection sees "
-    "depends on how many speckles its aperture averages, of which nothing is known"
-)
-
-
 def coherent_share(*, roughness: ArrayLike, wavelength: ArrayLike) -> np.ndarray:
     """Share kappa of the mean echo power that keeps its phase, 0..1.
 
-    Parameters
-    ----------
-    roughness : array_like
-        Standard deviation of the surface's height along the line of sight [m], >= 0: of a plane,
-        that of the height across it times the sine of the grazing angle. Infinite: all speckle.
-    wavelength : array_like
-        [m]
+    The roughness [m] is the standard deviation of the surface's height along the line of sight: of
+    a plane, that across it times the sine of the grazing angle. Infinite: all speckle.
     """
     phase = 4 * math.pi * np.asarray(roughness, float) / np.asarray(wavelength, float)
     return np.asarray(np.exp(-(phase**2)))
@@ -81,17 +65,9 @@ def factors(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Factors g_b on the beamlets' amplitudes: |g_b| and phase [cycles], (n, beamlets) each.
 
-    Parameters
-    ----------
-    realisation : Realisation
-        A factor depends on key, number of the draw and number of the beamlet, on nothing else:
-        pair b of ``STREAM_SPECKLE`` is z_b, number b of ``STREAM_FOOTPRINT_PHASE`` the phase of
-        u_b.
-    beamlets : int
-    coherent_share : (n,) ndarray
-        kappa, 0..1.
-    random_phases : bool
-        Whether the coherent share has an independent uniform phase in each beamlet.
+    A factor depends on key, number of the draw and number of the beamlet alone: pair b of
+    ``STREAM_SPECKLE`` is z_b, number b of ``STREAM_FOOTPRINT_PHASE`` the phase of u_b, uniform with
+    `random_phases`, else 0. `coherent_share` is kappa, (n,).
     """
     from sweep.model import philox
 
@@ -148,14 +124,14 @@ _SMALLEST = 1e-300
 def draw(shots: Shots, scene: Scene, realisation: Realisation) -> Shots:
     """Draw a footprint of its own for each point, with speckled amplitudes of its beamlets.
 
-    Raises
-    ------
-    ValueError
-        For direct detection. It adds up the intensities of all speckles in the aperture, in each of
-        which beamlets interfere: that is no factor on each beamlet's own echo.
+    A ValueError for direct detection. It adds up the intensities of all speckles in the aperture,
+    in each of which beamlets interfere: that is no factor on each beamlet's own echo.
     """
     if shots.architecture == "direct":
-        raise ValueError(_OF_DIRECT)
+        raise ValueError(
+            "speckle is simulated for homodyne and heterodyne receivers: what direct detection "
+            "sees depends on how many speckles its aperture averages, of which nothing is known"
+        )
     share = coherent_share(
         roughness=scene.parameters[_ROUGHNESS],
         wavelength=scene.parameters["instrument.laser.wavelength"],
@@ -195,10 +171,7 @@ def fading_size(points: Points) -> Size | None:
 
 
 def fade(shots: Shots, scene: Scene) -> Shots:
-    """Set detection in developed speckle, where the spec asks for it and no phases are in common.
-
-    Direct detection averages over the speckles in its aperture, of which nothing is known.
-    """
+    """Set detection in developed speckle, where the spec wants it and no phases are in common."""
     from sweep.model.detection import Fading
 
     law = str(scene.parameters[_LAW])

@@ -65,20 +65,8 @@ class Tree(NamedTuple):
 def build(vertices: np.ndarray, faces: np.ndarray) -> Tree:
     """Tree of a mesh: leaves along Hilbert's curve, eight neighbours to a node, level by level.
 
-    Parameters
-    ----------
-    vertices : (n, 3) float64
-        Coordinates [m], finite, within float32's range; best centred.
-    faces : (m, 3) int
-        Vertices of each triangle, m >= 1.
-
-    Raises
-    ------
-    ValueError
-        There is no triangle.
+    Vertices (n, 3) float64 [m] are finite and best centred; faces (m, 3) int, m >= 1.
     """
-    if len(faces) == 0:
-        raise ValueError("a mesh without triangles has no hierarchy: no ray could hit it")
     corners = [vertices[faces[:, k]] for k in range(3)]
     low, high = np.minimum.reduce(corners), np.maximum.reduce(corners)
     slack = _SLACK * float(np.abs(vertices).max())
@@ -184,17 +172,9 @@ def nearest(tree, origins, directions, distance, face):
     entered where the interval of the directions may reach it, and a leaf's triangles are tested
     against all rays together. Where they spread too far, each ray walks alone.
 
-    Parameters
-    ----------
-    tree : Tree
-    origins : (n, 3) float64
-        In the tree's frame [m]. A ray is what lies at distance > 0.
-    directions : (n, b, 3) float64
-    distance : (n, b) float64
-        Nearest distance known before (inf: none), in lengths of the direction; replaced where a
-        triangle is nearer.
-    face : (n, b) int64
-        Triangle's index in the mesh where `distance` was replaced, else left as it is.
+    Origins (n, 3) [m] are in the tree's frame, directions (n, b, 3). `distance` (n, b), in lengths
+    of the direction, is the nearest known before (inf: none), and is replaced where a triangle is
+    nearer; so is `face` (n, b), by the triangle's index in the mesh. A ray lies at distances > 0.
     """
     room = np.empty((3, directions.shape[1])), np.empty((6, 3)), np.empty(WIDTH)
     stack = np.empty(_STACK, np.int64), np.empty(_STACK)
@@ -264,16 +244,12 @@ def _walk(tree, o, d, distance, face, room, stack, budget):
 def _set_up(d, shears, planes):
     """Axis of the largest component of all directions (b, 3), -1 where they differ; what it makes.
 
-    Parameters
-    ----------
-    shears : (3, >= b)
-        Written: directions over that component, the other two axes in cyclic order, and 1 over it.
-    planes : (6, 3)
-        Written: constants of the box test across each axis for directions between `low` and
-        `high` along it. The rays o + t d can reach between the box's lower and upper plane only
-        if  t high >= lower - o  and  t low <= upper - o: each bounds t from below or from above,
-        by the sign of its factor. The factors' reciprocals, and what is added to make the two
-        bounds idle from below, and from above.
+    `shears` (3, >= b): directions over that component, the other two axes in cyclic order, and 1
+    over it. `planes` (6, 3): constants of the box test across each axis for directions between
+    `low` and `high` along it. The rays o + t d can reach between the box's lower and upper plane
+    only if  t high >= lower - o  and  t low <= upper - o: each bounds t from below or from above,
+    by the sign of its factor. They are the factors' reciprocals, and what is added to make the two
+    bounds idle from below, and from above.
     """
     axis = -1
     for b in range(d.shape[0]):

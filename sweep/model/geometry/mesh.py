@@ -13,50 +13,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sweep.model.ground import LAWS
-
 
 @dataclass(frozen=True)
 class Surface:
-    """Optical properties of one kind of surface.
-
-    Parameters
-    ----------
-    name : str
-        What it is called in a study.
-    reflectance : float
-        What its law takes as such, 0..1.
-    law : str
-        Reflectance law, one of :data:`sweep.model.ground.LAWS`.
-    roughness : float
-        Standard deviation of the height within a beamlet's spot [m], >= 0: against the
-        wavelength it decides on speckle.
-    """
+    """Optical properties of one kind of surface."""
 
     name: str
     reflectance: float
+    """What its law, one of :data:`sweep.model.ground.LAWS`, takes as such, 0..1."""
     law: str = "lambert"
-    roughness: float = 0.0
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.reflectance <= 1:
-            raise ValueError(f"{self.name}: the reflectance must lie within 0 and 1")
-        if self.law not in LAWS:
-            laws = ", ".join(LAWS)
-            raise ValueError(f"{self.name}: no reflectance law {self.law!r}: choose from {laws}")
-        if not self.roughness >= 0:
-            raise ValueError(f"{self.name}: the roughness must be at least 0 m")
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
     """Triangles around an origin of their own, so that far-off coordinates keep their digits.
 
-    Raises
-    ------
-    ValueError
-        The arrays' shapes do not fit, there is no triangle, a vertex is not finite or does not
-        exist.
+    A ValueError for shapes that do not fit, no triangle, or a vertex that is not finite or missing.
     """
 
     vertices: np.ndarray
@@ -82,15 +54,7 @@ class Mesh:
 
 
 def merge(meshes: Sequence[Mesh]) -> Mesh:
-    """All triangles of several meshes of one frame as one mesh, in the order given.
-
-    Raises
-    ------
-    ValueError
-        There is no mesh.
-    """
-    if not meshes:
-        raise ValueError("there is no mesh to merge")
+    """All triangles of several meshes of one frame as one mesh, in the order given."""
     corners = [m.origin + f(m.vertices, axis=0) for m in meshes for f in (np.min, np.max)]
     origin = round_centre(np.array(corners))
     starts = np.cumsum([0, *(len(m.vertices) for m in meshes)])
@@ -201,31 +165,20 @@ def _cross(a: Pair, b: Pair) -> Pair:
 
 
 def normals(corners: np.ndarray) -> Pair:
-    """Compute normals (3, n) of facets by their winding, of twice their areas' lengths.
+    """Compute normals (3, n) of facets by their winding, twice their areas long.
 
-    Parameters
-    ----------
-    corners : (3, 3, n) float64
-        First, second and third corner; their x, y, z.
+    `corners` (3, 3, n) are first, second and third corner; their x, y, z.
     """
     a, b, c = (exact(corner) for corner in corners)
     return _cross(less(b, a), less(c, a))
 
 
 def distances(corners: np.ndarray, normal: Pair, height: Pair, o: Pair, d: Pair) -> Pair:
-    """Distances of facets' planes along rays, in lengths of `d`.
+    """Distances of facets' planes along rays from `o` along `d` (3, n), in lengths of `d`.
 
-    A plane seen so flatly that it runs through the facet within rounding is met somewhere
-    on the facet: the distance stays between those of its corners.
-
-    Parameters
-    ----------
-    corners, normal
-        As of :func:`normals`.
-    height : Pair
-        Products (n,) of the normals with a corner less the origin.
-    o, d : Pair
-        Origins and directions (3, n) of the rays.
+    `height` (n,) is the product of the normals with a corner less the origin. A plane seen so
+    flatly that it runs through the facet within rounding is met somewhere on the facet: the
+    distance stays between those of its corners.
     """
     along = dot(normal, d)
     with np.errstate(all="ignore"):  # parallel to a plane

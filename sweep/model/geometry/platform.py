@@ -20,11 +20,9 @@ from sweep.model.geometry.quaternion import rotate
 if TYPE_CHECKING:
     from scipy.interpolate import PPoly
 
-_VERTICAL = 1e-9
-"""Horizontal share of the speed under which a movement has no heading."""
+_VERTICAL, _STILL = 1e-9, 1e-100
+"""Horizontal share of the speed, and horizontal speed [m/s], under which there is no heading."""
 
-_MOST_SCALED = 1000
-"""Powers of two by which velocities are scaled: no larger number has an inverse."""
 
 Vector = Sequence[float] | np.ndarray
 
@@ -37,87 +35,53 @@ What a law of attitude makes of times (n,) [s], velocities and accelerations (n,
 
 @dataclass(frozen=True)
 class Nadir:
-    """Level, so that a beam along -z points straight down.
-
-    Parameters
-    ----------
-    heading : float or None
-        Angle of the forward axis from the world's x, counter-clockwise from above [rad]; None
-        follows the track over the ground, which a vertical movement does not have.
-    """
+    """Level, so that a beam along -z points straight down."""
 
     heading: float | None = 0.0
+    """Angle of the forward axis from the world's x, counter-clockwise from above [rad]; None
+    follows the track over the ground, which a vertical movement does not have."""
 
     def turn(self, t: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray) -> Turn:
         """Attitude and angular velocity."""
         if self.heading is not None:
             return np.tile(quat.about(2, self.heading), (len(t), 1)), np.zeros((len(t), 3))
-        _, heading, yaw_rate, scale = _track(velocity, acceleration)
-        return quat.about(2, heading), _rate(yaw_rate, scale)[:, None] * [0.0, 0.0, 1.0]
+        heading, yaw_rate = _track(velocity, acceleration)
+        return quat.about(2, heading), yaw_rate[:, None] * [0.0, 0.0, 1.0]
 
 
 @dataclass(frozen=True)
 class AlongTrack:
-    """Forward axis along the velocity, wings level but for a bank.
-
-    Parameters
-    ----------
-    roll : float
-        Left side up [rad], constant.
-    """
+    """Forward axis along the velocity, wings level but for a bank."""
 
     roll: float = 0.0
+    """Left side up [rad], constant."""
 
     def turn(self, t: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray) -> Turn:
         """Attitude and angular velocity."""
-        unit, heading, yaw_rate, scale = _track(velocity, acceleration)
-        level = np.hypot(unit[:, 0], unit[:, 1])
-        speed2 = (unit**2).sum(axis=1)
-        pitch = np.arctan2(unit[:, 2], level)
-        level_rate = (unit[:, :2] * acceleration[:, :2]).sum(axis=1) / level
-        pitch_rate = (acceleration[:, 2] * level - unit[:, 2] * level_rate) / speed2
-        yaw_rate, pitch_rate = _rate(yaw_rate, scale), _rate(pitch_rate, scale)
+        heading, yaw_rate = _track(velocity, acceleration)
+        level = np.hypot(velocity[:, 0], velocity[:, 1])
+        pitch = np.arctan2(velocity[:, 2], level)
+        level_rate = (velocity[:, :2] * acceleration[:, :2]).sum(axis=1) / level
+        pitch_rate = acceleration[:, 2] * level - velocity[:, 2] * level_rate
+        pitch_rate /= (velocity**2).sum(axis=1)
         left = np.column_stack([-np.sin(heading), np.cos(heading), np.zeros(len(t))])
         rate = yaw_rate[:, None] * [0.0, 0.0, 1.0] - pitch_rate[:, None] * left
         return quat.from_heading(heading=heading, pitch=pitch, roll=self.roll), rate
 
 
-def _track(
-    velocity: np.ndarray, acceleration: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Velocities times powers of two, heading [rad], its rate for these, and the powers.
-
-    So scaled, squares of velocities are numbers however slow the movement is.
-    """
-    _, exponent = np.frexp(np.abs(velocity).max(axis=1))
-    scale = np.ldexp(1.0, np.clip(-exponent, -_MOST_SCALED, _MOST_SCALED))
-    unit = velocity * scale[:, None]
-    vx, vy = unit[:, 0], unit[:, 1]
+def _track(velocity: np.ndarray, acceleration: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Heading [rad] and its rate [rad/s], (n,) each."""
+    vx, vy = velocity[:, 0], velocity[:, 1]
     level = np.hypot(vx, vy)
-    if not (level > _VERTICAL * np.linalg.norm(unit, axis=1)).all():
+    speed = np.linalg.norm(velocity, axis=1)
+    if not (level > np.maximum(_VERTICAL * speed, _STILL)).all():
         raise ValueError("a vertical movement (or none) has no heading to follow: state one")
-    rate = (vx * acceleration[:, 1] - vy * acceleration[:, 0]) / level**2
-    return unit, np.arctan2(vy, vx), rate, scale
-
-
-def _rate(rate: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Rate of an angle between velocities [rad/s], (n,), from that of scaled ones."""
-    with np.errstate(over="ignore"):
-        found = rate * scale
-    if not np.isfinite(found).all():
-        raise ValueError("so slow a movement that turns has no heading to follow: state one")
-    return found
+    return np.arctan2(vy, vx), (vx * acceleration[:, 1] - vy * acceleration[:, 0]) / level**2
 
 
 @dataclass(frozen=True, eq=False)
 class Fixed:
-    """One attitude throughout.
-
-    Parameters
-    ----------
-    quaternion : (4,) array_like
-        (w, x, y, z), body to world; scaled to length 1.
-    """
+    """One attitude throughout: (w, x, y, z), body to world, scaled to length 1."""
 
     quaternion: Vector
 
@@ -129,20 +93,12 @@ class Fixed:
 
 @dataclass(frozen=True, eq=False)
 class Spin:
-    """Turning at a constant rate about an axis that is fixed in the body and in the world.
-
-    Parameters
-    ----------
-    rate : (3,) array_like
-        Angular velocity in the world frame [rad/s].
-    quaternion : (4,) array_like
-        Attitude at `time`.
-    time : float
-        When the body has that attitude [s].
-    """
+    """Turning at a constant rate about an axis that is fixed in the body and in the world."""
 
     rate: Vector
+    """(3,): angular velocity in the world frame [rad/s]."""
     quaternion: Vector = (1.0, 0.0, 0.0, 0.0)
+    """Attitude at `time` [s]."""
     time: float = 0.0
 
     def turn(self, t: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray) -> Turn:
@@ -155,16 +111,9 @@ class Spin:
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """Attitudes at given times, joined by turns at a constant rate the shorter way (slerp).
+    """Attitudes (n, 4) at rising times (n,) [s], joined by the shorter turns at constant rates.
 
-    Before the first and after the last the attitude stays.
-
-    Parameters
-    ----------
-    time : (n,) array_like
-        Rising times [s].
-    quaternion : (n, 4) array_like
-        Attitudes there; q and -q are one.
+    Slerp; before the first and after the last the attitude stays. q and -q are one.
     """
 
     time: Vector
@@ -195,15 +144,7 @@ class Track:
 
 @dataclass(frozen=True, eq=False)
 class Mounted:
-    """An instrument turned with respect to the body that carries it.
-
-    Parameters
-    ----------
-    carrier : Attitude
-        Law of the body.
-    quaternion : (4,) array_like
-        Instrument to body frame.
-    """
+    """An instrument turned, from its frame to the body's, with respect to its carrier."""
 
     carrier: Attitude
     quaternion: Vector
@@ -219,7 +160,6 @@ _SLACK = 1e-9
 
 
 Attitude = Nadir | AlongTrack | Fixed | Spin | Track | Mounted
-"""A law of attitude."""
 
 
 class Motion(NamedTuple):
@@ -246,13 +186,7 @@ class State(NamedTuple):
 
 
 def _within(t: np.ndarray, start: float, stop: float) -> np.ndarray:
-    """Return times as floats, those just off the path's ends clipped to it.
-
-    Raises
-    ------
-    ValueError
-        Where one is not on the path.
-    """
+    """Return times, those just off the path's ends clipped to it; a ValueError for others."""
     t = np.atleast_1d(np.asarray(t, float))
     slack = _SLACK * max(stop - start, 1.0)
     if not ((t >= start - slack) & (t <= stop + slack)).all():
@@ -264,12 +198,7 @@ def _within(t: np.ndarray, start: float, stop: float) -> np.ndarray:
 class ConstantAcceleration:
     """Path of a point under a constant acceleration; a straight line where that is 0.
 
-    Parameters
-    ----------
-    position, velocity, acceleration : (3,) array_like
-        At time 0 [m, m/s, m/s^2].
-    duration : float
-        Length in time [s], > 0.
+    Position, velocity and acceleration (3,) at time 0 [m, m/s, m/s^2]; duration [s], > 0.
     """
 
     position: Vector
@@ -301,19 +230,10 @@ def straight(
     initial_speed: float,
     final_speed: float | None = None,
 ) -> ConstantAcceleration:
-    """Straight line between two points, the speed changing at a constant rate.
+    """Straight line between two points (3,) [m], the speed changing at a constant rate.
 
-    Parameters
-    ----------
-    begin, end : (3,) array_like
-        First and last position [m].
-    initial_speed, final_speed : float
-        Speeds there [m/s], >= 0 and not both 0; the final one is the initial one by default.
-
-    Raises
-    ------
-    ValueError
-        For equal points, or speeds that never cover the distance.
+    The speeds [m/s] are >= 0 and not both 0; the final one is the initial one by default. A
+    ValueError for equal points, or speeds that never cover the distance.
     """
     final = initial_speed if final_speed is None else final_speed
     first = np.asarray(begin, float)
@@ -329,22 +249,13 @@ def straight(
 
 @dataclass(frozen=True, eq=False)
 class Waypoints:
-    """Path through given positions at given times.
-
-    Parameters
-    ----------
-    time : (n,) array_like
-        Rising times [s], at least two.
-    position : (n, 3) array_like
-        Positions there [m].
-    smooth : bool
-        A cubic spline, whose velocity and acceleration are steady (through two or three points,
-        the line or parabola); False joins the points by straight lines at constant velocities.
-    """
+    """Path through positions (n, 3) [m] at rising times (n,) [s], at least two."""
 
     time: Vector
     position: Sequence[Sequence[float]] | np.ndarray
     smooth: bool = True
+    """A cubic spline, whose velocity and acceleration are steady (through two or three points,
+    the line or parabola); False joins the points by straight lines at constant velocities."""
     _curve: PPoly = field(init=False, repr=False)
     _origin: np.ndarray = field(init=False, repr=False)
 
@@ -380,13 +291,7 @@ class Waypoints:
 
 
 def rising_times(time: Vector) -> np.ndarray:
-    """Return times as an array.
-
-    Raises
-    ------
-    ValueError
-        Where they are fewer than two, not finite or not strictly rising.
-    """
+    """Return times as an array; a ValueError for fewer than two, or where they do not rise."""
     t = np.asarray(time, float)
     if t.ndim != 1 or len(t) < 2 or not np.isfinite(t).all() or not (np.diff(t) > 0).all():
         raise ValueError("times must be two or more finite numbers that rise")
@@ -399,21 +304,12 @@ Path = ConstantAcceleration | Waypoints
 
 @dataclass(frozen=True, eq=False)
 class Flight:
-    """A body on a path, with an attitude, carrying the instrument.
-
-    Parameters
-    ----------
-    path : Path
-        Movement of the body's reference point.
-    attitude : Attitude
-        How the body is turned.
-    lever_arm : (3,) array_like
-        Position of the instrument in the body frame [m].
-    """
+    """A body whose reference point is on a path, with an attitude, carrying the instrument."""
 
     path: Path
     attitude: Attitude
     lever_arm: Vector = (0.0, 0.0, 0.0)
+    """(3,): position of the instrument in the body frame [m]."""
 
     @property
     def start(self) -> float:
@@ -428,10 +324,7 @@ class Flight:
     def state(self, t: np.ndarray) -> State:
         """Pose at times (n,) [s] from start to stop.
 
-        Raises
-        ------
-        ValueError
-            For a time outside the path, or an attitude that the movement leaves undefined.
+        A ValueError for a time outside the path, or an attitude that the movement leaves undefined.
         """
         motion = self.path.motion(t)
         times = _within(t, self.start, self.stop)

@@ -32,13 +32,7 @@ def conjugate(q: np.ndarray) -> np.ndarray:
 
 
 def normalise(q: np.ndarray) -> np.ndarray:
-    """Quaternion of length 1, (..., 4).
-
-    Raises
-    ------
-    ValueError
-        Where one has no length, or is not finite.
-    """
+    """Quaternion of length 1, (..., 4); a ValueError where one has no length, or is not finite."""
     q = np.asarray(q, float)
     length = np.linalg.norm(q, axis=-1, keepdims=True)
     if not (np.isfinite(length) & (length > 0)).all():
@@ -89,16 +83,11 @@ def from_heading(
     pitch: np.ndarray | float = 0.0,
     roll: np.ndarray | float = 0.0,
 ) -> np.ndarray:
-    """Attitude of a body (x forward, y left, z up), (..., 4).
+    """Attitude of a body (x forward, y left, z up), (..., 4), by angles [rad].
 
-    Parameters
-    ----------
-    heading : array_like
-        Angle of the forward axis from the world's x, counter-clockwise from above [rad].
-    pitch : array_like
-        Nose up [rad]: a right-handed turn about -y, after the heading.
-    roll : array_like
-        Left side up [rad]: a right-handed turn about x, last.
+    The heading is that of the forward axis from the world's x, counter-clockwise from above; then
+    the pitch lifts the nose, a right-handed turn about -y; last the roll lifts the left side, one
+    about x.
     """
     turned = multiply(about(2, heading), about(1, -np.asarray(pitch, float)))
     return multiply(turned, about(0, roll))

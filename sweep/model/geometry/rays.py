@@ -17,8 +17,6 @@ from sweep.model.geometry import quaternion
 from sweep.model.geometry.bvh import build, nearest
 from sweep.model.geometry.mesh import Mesh, distances, dot, exact, less, normals
 
-_UNIT_TOLERANCE = 1e-9
-
 _AT_ONCE = 4096
 """Rays that are looked at together: so many that what is made of them stays at hand."""
 
@@ -56,23 +54,10 @@ class Bundle(NamedTuple):
 
 
 class Caster:
-    """One or several rigid bodies, ready to be cast at.
-
-    Parameters
-    ----------
-    bodies : Mesh or sequence of Mesh
-        The bodies, numbered from 0; coordinates in each body's frame.
-
-    Raises
-    ------
-    ValueError
-        There is no body.
-    """
+    """One or several rigid bodies, numbered from 0, ready to be cast at."""
 
     def __init__(self, bodies: Mesh | Sequence[Mesh]):
         self.meshes = (bodies,) if isinstance(bodies, Mesh) else tuple(bodies)
-        if not self.meshes:
-            raise ValueError("there is no body to cast rays at")
         self._trees = [build(mesh.vertices, mesh.faces) for mesh in self.meshes]
 
     def bundle(
@@ -94,13 +79,8 @@ class Caster:
             frame.
         poses : sequence of Pose or None, optional
             Of each body, None for one that rests in the world's frame; default all at rest.
-
-        Raises
-        ------
-        ValueError
-            Shapes do not fit, a number is not finite, or a direction is not of length 1.
         """
-        start, along = _rays(origins, directions)
+        start, along = (np.ascontiguousarray(a, np.float64) for a in (origins, directions))
         frames = self._frames(poses, len(start))
         face, body = self._first_hits(frames, start, along)
         hit = face >= 0
@@ -150,12 +130,7 @@ class Caster:
     def _met(self, frames, origins, directions, rays, hit):
         """Ranges of facets that rays meet, high and low [m], normals (m, 3), cosines to these.
 
-        Parameters
-        ----------
-        rays : ((m,), (m,)) int64
-            Bundle and beamlet of each ray.
-        hit : ((m,), (m,)) int
-            Its triangle and body.
+        `rays` are bundle and beamlet of each, ((m,), (m,)), `hit` its triangle and body.
         """
         found = np.empty((6, len(rays[0])))
         for number, (mesh, frame) in enumerate(zip(self.meshes, frames, strict=True)):
@@ -169,8 +144,6 @@ class Caster:
     def _frames(self, poses, n):
         """Frame of each body."""
         poses = [None] * len(self.meshes) if poses is None else poses
-        if len(poses) != len(self.meshes):
-            raise ValueError(f"{len(self.meshes)} bodies need as many poses, not {len(poses)}")
         return [
             _Frame(mesh.origin, *((None, None) if pose is None else _turned(pose, n)))
             for mesh, pose in zip(self.meshes, poses, strict=True)
@@ -243,34 +216,10 @@ def _met_on(mesh, frame, bundle, origins, directions, face):
     return np.concatenate([[high, low], unit, [x + y + z]])
 
 
-def _rays(origins, directions):
-    """Origins and directions as contiguous float64, checked."""
-    origins = np.ascontiguousarray(origins, dtype=np.float64)
-    directions = np.ascontiguousarray(directions, dtype=np.float64)
-    shape = (len(origins), *directions.shape[1:-1], 3)
-    if origins.ndim != 2 or directions.ndim != 3 or directions.shape != shape:
-        raise ValueError(
-            f"origins {origins.shape} and directions {directions.shape} do not fit each other"
-        )
-    if 0 in directions.shape[1:] or origins.shape[1] != 3:
-        raise ValueError("a ray has an origin of three coordinates; a bundle, at least one beamlet")
-    if not np.isfinite(origins).all():
-        raise ValueError("a ray's origin is finite")
-    length = np.einsum("nbk,nbk->nb", directions, directions)
-    if not (np.abs(length - 1.0) < 2.0 * _UNIT_TOLERANCE).all():
-        raise ValueError("a ray's direction is a vector of length 1")
-    return origins, directions
-
-
 def _turned(pose, n):
     """Rotation matrices (n, 3, 3) and positions (n, 3) of a pose."""
     attitude = np.atleast_2d(quaternion.normalise(pose.attitude))
     position = np.atleast_2d(np.asarray(pose.position, dtype=np.float64))
-    count = max(len(attitude), len(position))
-    if count not in (1, n) or attitude.shape[1] != 4 or position.shape[1] != 3:
-        raise ValueError(f"a pose is one for all or one for each of {n} rays or bundles")
-    if not np.isfinite(position).all():
-        raise ValueError("a body's position is finite")
     columns = quaternion.rotate(attitude[:, None], np.eye(3))
     rotation = np.broadcast_to(np.swapaxes(columns, 1, 2), (n, 3, 3))
     return rotation, np.broadcast_to(position, (n, 3))

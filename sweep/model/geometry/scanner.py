@@ -67,12 +67,8 @@ def squares(elements: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
 
     A square is what a quarter turn about nadir makes of one pair of angles. The widest comes
     first and the narrowest last, each counter-clockwise: for the two elements of [T Fig. 5.2] the
-    corners at 22.5 deg, the two squares that are askew, and the corners at 7.5 deg.
-
-    Returns
-    -------
-    (4^n, 3) ndarray, (4^n / 4, 4) int64 ndarray
-        Unit vectors, square by square, and the beams of each square.
+    corners at 22.5 deg, the two squares that are askew, and the corners at 7.5 deg. Returns unit
+    vectors (4^n, 3), square by square, and the beams of each square, (4^n / 4, 4) int64.
     """
     angles = stacked_angles(elements)
     if angles.min() >= 0 or len(np.unique(np.round(angles, 12))) < len(angles) or 0 in angles:
@@ -102,26 +98,18 @@ class Shots(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class BeamCycle:
-    """Beams at fixed angles, fired in a cycle of patterns.
-
-    Parameters
-    ----------
-    beams_at : (b, 3) array_like
-        Directions of the beams in the body frame; scaled to length 1.
-    patterns : sequence of sequences of int
-        Beams of each measurement cycle, in the order in which they fire; the cycles take the
-        patterns in turn. All of one length.
-    rate : float
-        Measurement cycles a second [Hz], > 0.
-    interval : float or None
-        Time from one beam of a cycle to the next [s]: 0 fires them at once (several telescopes),
-        None spreads them evenly over the cycle (one steered beam).
-    """
+    """Beams at fixed angles, fired in a cycle of patterns."""
 
     beams_at: Sequence[Sequence[float]] | np.ndarray
+    """(b, 3): directions of the beams in the body frame; scaled to length 1."""
     patterns: Sequence[Sequence[int]] | np.ndarray
+    """Beams of each measurement cycle as they fire; cycles take the patterns, all as long, in
+    turn."""
     rate: float
+    """Measurement cycles a second [Hz], > 0."""
     interval: float | None = None
+    """Time from one beam of a cycle to the next [s]: 0 fires them at once (several telescopes),
+    None spreads them evenly over the cycle (one steered beam)."""
     _steps: tuple[np.ndarray, np.ndarray, float] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -192,15 +180,9 @@ def raster(
 ) -> BeamCycle:
     """Grid of directions, visited row by row, from right to left and from aft forward.
 
-    Parameters
-    ----------
-    columns, rows, half_angles
-        Directions across (y) and along (x), at least 1 each; reach of the grid across and along,
-        to each side of nadir [rad].
-    rate : float
-        Frames a second [Hz].
-    both_ways : bool
-        Every other row runs backwards; False starts each at the right.
+    `columns` lie across (y), `rows` along (x), at least 1 each; `half_angles` [rad] are the reach
+    of both to each side of nadir. `rate` counts frames a second [Hz]. Every other row runs
+    backwards; without `both_ways` each starts at the right.
     """
     across = half_angles[0] * np.linspace(-1, 1, columns) if columns > 1 else np.zeros(1)
     along = half_angles[1] * np.linspace(-1, 1, rows) if rows > 1 else np.zeros(1)
@@ -213,30 +195,20 @@ def raster(
 
 @dataclass(frozen=True)
 class LineScan:
-    """Beams side by side along the track, swept together from side to side.
-
-    Parameters
-    ----------
-    half_angle : float
-        Reach of the sweep to each side of nadir [rad], 0 <= . < pi/2.
-    line_rate : float
-        Lines a second [Hz]; a sweep one way is a line.
-    rate : float
-        Measurements a second of each beam [Hz].
-    along : tuple of float
-        Each beam's fixed angle from nadir towards forward [rad].
-    wave : str
-        ``triangle`` at a constant rate, or ``sine`` for a resonant mirror.
-    interval : float
-        Time from one beam of a measurement to the next [s]; 0 fires them at once.
-    """
+    """Beams side by side along the track, swept together from side to side."""
 
     half_angle: float
+    """Reach of the sweep to each side of nadir [rad], 0 <= . < pi/2."""
     line_rate: float
+    """Lines a second [Hz]; a sweep one way is a line."""
     rate: float
+    """Measurements a second of each beam [Hz]."""
     along: tuple[float, ...] = (0.0,)
+    """Each beam's fixed angle from nadir towards forward [rad]."""
     wave: str = "triangle"
+    """``triangle`` at a constant rate, or ``sine`` for a resonant mirror."""
     interval: float = 0.0
+    """Time from one beam of a measurement to the next [s]; 0 fires them at once."""
 
     def __post_init__(self) -> None:
         if not (0 <= self.half_angle < math.pi / 2 and self.along):
@@ -299,17 +271,9 @@ def beamlet_rays(
 ) -> np.ndarray:
     """Return unit vectors of every beamlet in the world frame, (n, b, 3).
 
-    Parameters
-    ----------
-    attitude : (n, 4) ndarray
-        Unit quaternions, body to world.
-    axis : (n, 3) ndarray
-        Unit vectors along the beams, in the body frame.
-    across, along : (b,) ndarray
-        Tangents of the angles off the axis towards the two vectors of :func:`transverse_of`, in
-        units of `sigma`.
-    sigma : float or (n, 1) ndarray
-        Standard deviation of the beam on each axis [rad].
+    `attitude` (n, 4) turns body to world, `axis` (n, 3) are the beams there. `across` and `along`
+    (b,) are tangents of angles off the axis towards the two vectors of :func:`transverse_of`, in
+    units of the beam's standard deviation `sigma` on each axis [rad], (n, 1) or scalar.
     """
     vectors = rotate(attitude[:, None], np.stack([*transverse_of(axis), axis], axis=1))
     first, second, centre = np.moveaxis(vectors, 0, 2)[..., None]

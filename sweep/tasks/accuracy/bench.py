@@ -1,20 +1,11 @@
 """A sample of points that rungs are tried on, by the machinery of a run, or the thesis's way.
 
-The thesis's way to a spectrum: lines put on an oversampled grid, the window by an FFT.
-[T 3.3.1] convolves "the spectra of the mixed signals" with the window's transform "with much
-higher sampling rate in the frequency domain than the FFT bin spacing", by an FFT "typically of
-size 2^11 or 2^12", and samples what comes out at the bins. Here: a grid of 16 cells a bin around
-the beam's centre, each beamlet's line put into the nearest cell, one FFT, a product with the
-transform of the window's own, and back.
-
-It can be done better, which is here too. If powers add, the grid holds real numbers, and half of
-their transforms is enough (`real`). Only the bins are asked for, so that a transform of one
-sixteenth of the size is enough for the way back (`folded`). And a line in the nearest cell is up to
-1/32 bin off: 2e-2 of the peak at worst. Shared out among ten cells by Lagrange's polynomial of
-degree 9 it is where it belongs, to 1e-12 for a window that falls off to its ends.
-
-It is here to be compared with (`sweep accuracy`), and is as fast as it can fairly be made. It skips
-changes of lines within a record (range walk, line width), and leakage beyond the grid.
+[T 3.3.1] convolves the spectra with the window's transform "with much higher sampling rate in the
+frequency domain than the FFT bin spacing", by an FFT "typically of size 2^11 or 2^12". The grid has
+16 cells a bin around the beam's centre, and each beamlet's line goes into the nearest cell. One FFT
+follows, a product with the transform of the window's own, and the way back. The improvements
+`real`, `folded` and `degree` are those of docs/accuracy.md. Changes of lines within a record (range
+walk, line width) are skipped, and leakage beyond the grid.
 """
 
 from __future__ import annotations
@@ -41,8 +32,7 @@ from sweep.model.lines import BLOCK, IM, PLACE, RE, place_lines
 from sweep.model.preparation import Shots
 from sweep.spec import Axis, Spec
 from sweep.tasks.accuracy.rungs import WRITTEN, Declared, Rung
-from sweep.tasks.effect_selection import EffectSelection, Selected
-from sweep.tasks.grid import Grid
+from sweep.tasks.grid import EffectSelection, Grid, Selected
 from sweep.tasks.grid_study import evaluate_points
 
 Look = Callable[[Shots], np.ndarray]
@@ -65,18 +55,12 @@ AS_WRITTEN = Rung(name="as written", kind=WRITTEN)
 class Seen(NamedTuple):
     """Results of a rung at n points; nan for those that it lacks."""
 
-    pd: np.ndarray
-    """(n, 4): probability of detection: up, Doppler, down, shot."""
-    log10_pfa: np.ndarray
-    """(n, k): log10 of probabilities of false alarm."""
-    leakage: np.ndarray
-    """(n, 2): probability of leakage in the chirps, up and down."""
-    magnitude: np.ndarray
-    """(n, k): |X| of the peak bins, in a unit of all rungs."""
-    standard_error: np.ndarray
-    """(n,): of the worst of pd, where it is a mean over draws."""
-    sigma: np.ndarray
-    """(n,): noise of a bin, per quadrature, in the magnitudes' unit."""
+    pd: np.ndarray  # (n, 4): probability of detection: up, Doppler, down, shot
+    log10_pfa: np.ndarray  # (n, k): log10 of probabilities of false alarm
+    leakage: np.ndarray  # (n, 2): probability of leakage in the chirps, up and down
+    magnitude: np.ndarray  # (n, k): |X| of the peak bins, in a unit of all rungs
+    standard_error: np.ndarray  # (n,): of the worst of pd, where it is a mean over draws
+    sigma: np.ndarray  # (n,): noise of a bin, per quadrature, in the magnitudes' unit
     beamlets: np.ndarray
     """(n,): of each point; of a flight all rays that are cast, whatever is made of them."""
 
@@ -88,8 +72,7 @@ class Trial:
     seen: Seen
     seconds: float
     """Processor time of a point, planning included: what others use of the machine is no part."""
-    planning: float
-    """A point."""
+    planning: float  # a point
 
 
 class Bench(ABC):
@@ -97,14 +80,10 @@ class Bench(ABC):
 
     unit = "points"
     spec: Declared
-    size: int
-    """Points of the sample."""
-    whole: int
-    """Points of the study, each computed once: draws of a flight are none of their own."""
-    least_parts: int
-    """Parts of a sample, at the least: whole ones are kept where it is broken off."""
-    most_times: int
-    """Points of the longest stretch that may be timed."""
+    size: int  # points of the sample
+    whole: int  # points of the study, each computed once: draws of a flight are none of their own
+    least_parts: int  # parts of a sample, at the least: whole ones are kept where it is broken off
+    most_times: int  # points of the longest stretch that may be timed
 
     def __init__(self) -> None:
         self._names: dict[str, frozenset[str]] = {}
@@ -122,22 +101,6 @@ class Bench(ABC):
         return tuple(e.name for e in EFFECTS if e.name in own and e.stage not in AFTER_THE_LINES)
 
     @abstractmethod
-    def parts(self, points: int) -> list[np.ndarray]:
-        """Return the sample in parts of about so many points: places in it."""
-
-    @abstractmethod
-    def try_on(self, rung: Rung, part: np.ndarray, times: int) -> Trial:
-        """Compute a rung on a part of the sample, timed on so many points if possible."""
-
-    @abstractmethod
-    def truth(self, rung: Rung, place: int) -> tuple[Seen, Seen]:
-        """Compute a point in the time domain, and with the rung's effects that the truth has."""
-
-    @abstractmethod
-    def coordinates(self) -> dict[str, tuple[np.ndarray, dict[str, Any]]]:
-        """Coordinates of the sample's points: values and attributes by name."""
-
-    @abstractmethod
     def _flags(self, rung: Rung) -> np.ndarray:
         """Effects that a rung calls for at each point of the sample."""
 
@@ -146,10 +109,9 @@ class Bench(ABC):
 
 
 def spread(shape: tuple[int, ...], number: int) -> np.ndarray:
-    """Numbers of points of a grid, in C order over it, spread evenly along every axis.
+    """Numbers of points of a grid, in C order, spread evenly along every axis by Halton's sequence.
 
-    Any first part of it is spread as well, so that a part of the sample stands for all. They follow
-    Halton's sequence, without repetition; all are taken where there are fewer.
+    Any first part of them is spread as well, so that a part of the sample stands for all.
     """
     total = math.prod(shape)
     if not shape or total <= 1:
@@ -237,8 +199,8 @@ class GridBench(Bench):
     def try_on(self, rung: Rung, part: np.ndarray, times: int) -> Trial:
         """Compute a rung on a part of the sample, timed on so many points or on the part.
 
-        The cost of a point depends on its neighbours, as they share intermediate results. So points
-        are timed together with those that the block computes next.
+        Points are timed with those that the block computes next, which share intermediate
+        results.
         """
         numbers = self._numbers[part]
         outputs, spent, planning = self._run(rung, numbers)
@@ -313,10 +275,7 @@ class GridBench(Bench):
         return grid.numbers(block, order.take(follows, mode="wrap"))
 
     def _planned(self, rung: Rung, numbers: np.ndarray) -> tuple[np.ndarray, float]:
-        """Return flags of points (n,), and the time that planning takes one.
-
-        A plan serves a whole tile, so that a point takes its share.
-        """
+        """Return flags of points (n,), and the time that planning takes one, its share."""
         tiles = self._selection_of(rung).tiles
         own, _ = tiles.locate(numbers)
         met, where = np.unique(own, return_inverse=True)
@@ -345,25 +304,12 @@ _ROWS = 32
 def find_on_grid(
     shots: Shots, *, degree: int = 0, size: int = SIZE, real: bool = False, folded: bool = False
 ) -> np.ndarray:
-    """Largest bins of each segment's spectrum, as :func:`sweep.model.shot.find`; no leakage.
+    """Largest bins of each segment's spectrum, (3, 6, n) as of :func:`sweep.model.shot.find`.
 
-    Parameters
-    ----------
-    shots : Shots
-        n points.
-    degree : int
-        Of the polynomial that shares a line out: 0, to the nearest cell, or 9, among ten.
-    size : int
-        Cells of the grid at the least, a power of two; points whose lines spread too far for it
-        get a larger one.
-    real, folded : bool
-        Whether powers are transformed as the real numbers that they are; whether the way back is to
-        the bins alone.
-
-    Returns
-    -------
-    (3, 6, n) ndarray
-        By segment and :data:`sweep.model.segments.SEGMENT_FIELDS`.
+    A line is shared out by a polynomial of a ``degree`` of 0, to the nearest cell, or 9, among
+    ten. A grid has ``size`` cells at the least, a power of two, and more where a point's lines
+    spread farther. ``real`` transforms powers as real numbers; ``folded`` goes back to the bins
+    alone. There is no leakage.
     """
     found = np.full((3, 6, shots.size), np.nan)
     table, sizes = shots.point_table(), grid_sizes(shots, size)
@@ -450,10 +396,7 @@ def _real_bins(grid: np.ndarray, kernel: np.ndarray, folded: bool) -> np.ndarray
 def _kernel(
     name: str, length: int, fft_size: int, cells: int, power: bool, real: bool
 ) -> np.ndarray:
-    """Transform of the window's own transform, that of mid-record, on a grid of cells.
-
-    From the FFT of its samples with sixteen times as many: no closed form is used.
-    """
+    """Transform of the window's own, of mid-record, on a grid of cells; no closed form is used."""
     place = np.concatenate([np.arange(cells // 2), np.arange(-cells // 2, 0)])
     transform = fft.fft(windows.samples(name, length), CELLS * fft_size)[place]
     transform *= np.exp(1j * np.pi * place * (length / fft_size / CELLS))

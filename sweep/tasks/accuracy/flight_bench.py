@@ -33,9 +33,9 @@ from sweep.tasks.accuracy.bench import (
     spread,
 )
 from sweep.tasks.accuracy.rungs import Rung
-from sweep.tasks.effect_selection import TILE_SHOTS, Selected
 from sweep.tasks.eyepoint_study import world_of
 from sweep.tasks.flight_study import FlightStudy, Part
+from sweep.tasks.grid import TILE_SHOTS, Selected
 from sweep.tasks.study import Results
 
 #: Places along the axes at which each scanner is looked at.
@@ -47,10 +47,8 @@ class Tiles:
     """Shots of one scanner, in whole tiles, at one place of the axes."""
 
     part: Part
-    index: np.ndarray
-    """Numbers of the shots, rising."""
-    start: int
-    """Place in the sample of the first of the stretch that they are of."""
+    index: np.ndarray  # numbers of the shots, rising
+    start: int  # place in the sample of the first of the stretch that they are of
 
     @property
     def tile(self) -> np.ndarray:
@@ -65,10 +63,7 @@ class Tiles:
         return [np.concatenate([tiles[k] for k in part]) for part in parts]
 
     def around(self, rows: np.ndarray, number: int) -> np.ndarray:
-        """Rows of whole tiles, those of some shots and what follows, round the end, rising.
-
-        As many tiles as make so many shots, or all.
-        """
+        """Rows of whole tiles of so many shots: those of some and what follows, round the end."""
         tiles, counts = np.unique(self.tile, return_counts=True)
         own = np.unique(self.tile[rows])
         order = np.roll(np.arange(tiles.size), -int(np.searchsorted(tiles, own[0])))
@@ -79,8 +74,8 @@ class Tiles:
 class FlightBench(Bench):
     """A sample of the shots of a flight: whole tiles, as effects are planned in them.
 
-    The time counts rays, plans, spectra and probabilities; draws, points and navigation cost the
-    same whatever the accuracy, and are left out.
+    The time counts rays, plans, spectra and probabilities; draws, points and navigation cost
+    the same whatever the accuracy.
     """
 
     unit = "shots"
@@ -190,10 +185,7 @@ class FlightBench(Bench):
         return self._studies[rung.name]
 
     def _see(self, rung: Rung, tiles: Tiles) -> tuple[Eyepoints, float]:
-        """Eyepoints of shots, and the time that casting their rays took [s].
-
-        Rays are cast once for all rungs of the same geometry.
-        """
+        """Eyepoints of shots, cast once for rungs of a geometry, and the time that it took [s]."""
         caster = self._study(rung).caster(tiles.part.scanner)
         which_shots = caster.id, tiles.start, tiles.index.tobytes()
         if which_shots not in self._cast:

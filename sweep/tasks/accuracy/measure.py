@@ -17,7 +17,7 @@ from sweep.storage import opening
 from sweep.storage.atomic_replace import real
 from sweep.storage.locations import Location
 from sweep.tasks import store
-from sweep.tasks.accuracy.bench import Bench, GridBench, Seen, Trial, spread
+from sweep.tasks.accuracy.bench import GridBench, Seen, Trial, spread
 from sweep.tasks.accuracy.flight_bench import FlightBench
 from sweep.tasks.accuracy.rungs import (
     ADAPTIVE,
@@ -34,6 +34,8 @@ from sweep.tasks.errors import StoreError, TaskError
 from sweep.tasks.progress import Interrupts, Progress, chosen, working
 from sweep.tasks.studies import ACCURACY, study_of
 from sweep.tasks.study import ArrayLayout, Study, described
+
+AnyBench = GridBench | FlightBench
 
 POINTS, TIME_LIMIT = 200, 60.0
 """Points of a sample; time that trying may take [s]."""
@@ -92,30 +94,12 @@ def measure(
 ) -> bool:
     """Try a ladder of settings on a sample of a study's points, and store what they came to.
 
-    Parameters
-    ----------
-    spec, points
-        The study; points of the sample.
-    store_path
-        Path of the store to make; it is there whole, or not at all.
-    time_limit
-        Time that trying may take [s], about.
-    overwrite
-        Whether to put the new store in the place of one that is there.
-    progress
-        As of :func:`sweep.tasks.driver.run`.
+    The store is there whole, or not at all. Trying takes about a ``time_limit`` [s];
+    ``progress`` is as of :func:`sweep.tasks.driver.run`. False where it was interrupted before
+    any point was through: there is no store then.
 
-    Returns
-    -------
-    bool
-        Whether any point was through before it was interrupted; without one there is no store.
-
-    Raises
-    ------
-    StoreError, TaskError
-        Where a store is in the way or can't be written; where the study draws whole spectra.
-    SceneError
-        Where a file of a scene is missing, changed or unfit.
+    StoreError where a store is in the way or can't be written, TaskError where the study draws
+    whole spectra, SceneError where a file of a scene is missing, changed or unfit.
     """
     if getattr(spec.draws, "whole_spectra", False):
         raise TaskError(
@@ -127,11 +111,11 @@ def measure(
     told = chosen(progress)
     with Interrupts() as interrupts:
         with working("choosing points", told):
-            bench: Bench
-            if isinstance(spec, SceneSpec):
-                bench = FlightBench(spec, points)
-            else:
-                bench = GridBench(spec, points)
+            bench = (
+                FlightBench(spec, points)
+                if isinstance(spec, SceneSpec)
+                else GridBench(spec, points)
+            )
         try:
             measured = Measurement(
                 bench, time_limit=time_limit, told=told, interrupts=interrupts
@@ -155,10 +139,7 @@ def _refuse_in_the_way(path: Location, overwrite: bool) -> None:
 
 
 def storing(study: Study) -> float:
-    """Processor time that making a study's store and writing all of its blocks takes [s].
-
-    Of blocks of zeros, which pack faster than results do: it is no more than what results take.
-    """
+    """Processor time that making a study's store takes [s], and writing its blocks, of zeros."""
     block = study.n_blocks // 2
     results = {
         name: np.zeros([s.stop - s.start for s in region], study.layouts[name].dtype)
@@ -192,22 +173,15 @@ class Measured:
     """Results of the trials, by rung and point of the sample."""
 
     ladder: Ladder
-    seen: list[Seen]
-    """One a rung, (points, ...) each."""
-    done: np.ndarray
-    """Places in the sample of the points that every rung was tried on."""
-    seconds: np.ndarray
-    """(rungs, rounds): a point, planning included."""
-    planning: np.ndarray
-    """(rungs, rounds): a point."""
-    times: np.ndarray
-    """(rungs,): points of a stretch that is timed."""
+    seen: list[Seen]  # one a rung, (points, ...) each
+    done: np.ndarray  # places in the sample of the points that every rung was tried on
+    seconds: np.ndarray  # (rungs, rounds): a point, planning included
+    planning: np.ndarray  # (rungs, rounds): a point
+    times: np.ndarray  # (rungs,): points of a stretch that is timed
     truth: dict[int, tuple[Seen, Seen]]
     """By place in the sample: in the time domain, and as the reference has it."""
-    truth_beamlets: int
-    """Of both, where their number is not the reference's; else 0."""
-    stopped: str
-    """Why the sample is not whole; empty where it is."""
+    truth_beamlets: int  # of both, where their number is not the reference's; else 0
+    stopped: str  # Why the sample is not whole; empty where it is
 
 
 class Nothing(Exception):
@@ -217,12 +191,12 @@ class Nothing(Exception):
 class Measurement:
     """Rungs tried on a sample in turn, so that what drifts falls on all of them alike.
 
-    Each round takes them in an order of its own: a short trial takes longer after a long one, which
-    leaves nothing of it at hand. All may take `time_limit` [s], about.
+    Each round takes them in an order of its own: a short trial takes longer after a long one.
+    All may take a time limit [s], about.
     """
 
     def __init__(
-        self, bench: Bench, *, time_limit: float, told: Progress, interrupts: Interrupts
+        self, bench: AnyBench, *, time_limit: float, told: Progress, interrupts: Interrupts
     ) -> None:
         self._bench, self._limit = bench, time_limit
         self._told, self._interrupts = told, interrupts
@@ -234,13 +208,7 @@ class Measurement:
         self._orders = np.random.default_rng(0)
 
     def run(self) -> Measured:
-        """All rounds that the time allows, the first of them at least in part.
-
-        Raises
-        ------
-        Nothing
-            Broken off before any point was through.
-        """
+        """All rounds that the time allows; Nothing where no point was through before the end."""
         self._told.say(
             f"trying {len(self._rungs)} settings on {self._bench.size:,} {self._bench.unit}"
         )
@@ -298,10 +266,7 @@ class Measurement:
         self._begun = time.monotonic()
 
     def _planned_rounds(self, parts: list[np.ndarray]) -> int:
-        """Return the rounds that fit in, and the number of points that times rungs well.
-
-        As long for all of them, but for those that would take far longer.
-        """
+        """Return the rounds that fit in; set the points of a stretch that times each rung well."""
         times, enough = 1, LONG_ENOUGH * self._limit
         while self._timed(0, parts[0]) < enough / 2 and times < self._bench.most_times:
             times = min(2 * times, self._bench.most_times)
@@ -334,10 +299,7 @@ class Measurement:
     def _round(
         self, parts: list[np.ndarray], *, until: float, first: list[list[Trial]] | None = None
     ) -> list[list[Trial]]:
-        """Every rung on every part that there is time for; the first at least, if uninterrupted.
-
-        Those that take long are what they were in the first round.
-        """
+        """Every rung on every part that there is time for; long ones only in the first round."""
         done: list[list[Trial]] = []
         for part in parts:
             if done and time.monotonic() - self._begun > until * self._limit:
@@ -374,11 +336,8 @@ class Measurement:
         return found, beamlets
 
 
-def completed(rungs: Ladder, bench: Bench, tolerances: Iterable[float] = ()) -> Ladder:
-    """Return the ladder, with the effects of each tolerance fixed at every point.
-
-    ``tolerances``: as of :meth:`sweep.tasks.accuracy.rungs.Ladder.with_fixed`.
-    """
+def completed(rungs: Ladder, bench: AnyBench, tolerances: Iterable[float] = ()) -> Ladder:
+    """Return the ladder, with the effects of each tolerance fixed at every point."""
     if not any(rung.kind == ALL_ON for rung in rungs.rungs):
         return rungs  # of draws
     at = {tolerance_of(rung): rung for rung in rungs.rungs if rung.kind == ADAPTIVE}
@@ -435,7 +394,7 @@ def _chances_apart(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 class Content:
     """Content of the store: errors by rung and point, seconds by rung and round."""
 
-    def __init__(self, spec: Declared, bench: Bench, measured: Measured, stored: float) -> None:
+    def __init__(self, spec: Declared, bench: AnyBench, measured: Measured, stored: float) -> None:
         self._spec, self._bench, self._measured, self._stored = spec, bench, measured, stored
 
     @property

@@ -70,19 +70,11 @@ _EXACTLY = dict.fromkeys(
 
 @dataclass(frozen=True, kw_only=True)
 class Rung:
-    """A setting of a study.
+    """A setting of a study: values of fields of its spec by dotted path, as one would write them.
 
-    Parameters
-    ----------
-    name, kind
-        What it is called; one of the kinds above.
-    overrides
-        Values of fields of the spec by dotted path, as one would write them.
-    thesis
-        Options of :func:`sweep.tasks.accuracy.bench.find_on_grid`, where it finds the peaks.
-    rays_error
-        What the rays of a flight's shots may leave before they are cast with more; 0 where the
-        spec says that.
+    ``thesis`` has the options of :func:`sweep.tasks.accuracy.bench.find_on_grid`, where that
+    finds the peaks; ``rays_error`` is what a flight's rays may leave before there are more, 0
+    where the spec says that.
     """
 
     name: str
@@ -107,13 +99,7 @@ class Rung:
         return self.kind in (COUNTED, IN_NOISE)
 
     def of(self, spec: Declared) -> Declared:
-        """Return the spec with the overrides put onto it.
-
-        Raises
-        ------
-        SpecError
-            Where it then is no study any more.
-        """
+        """Return the spec with the overrides put onto it; SpecError where it is no study then."""
         if not self.overrides:
             return spec
         written = copy.deepcopy(spec.to_yaml_mapping())
@@ -131,8 +117,7 @@ class Ladder:
     """Rungs, the reference last, and what there is to say of them."""
 
     rungs: tuple[Rung, ...]
-    about: str
-    """What the reference is."""
+    about: str  # what the reference is
     notes: tuple[str, ...] = ()
     fixed: Callable[[float], dict[str, Any]] = lambda tolerance: {}
     """What else is fixed where effects are, to a tolerance."""
@@ -147,7 +132,8 @@ class Ladder:
     ) -> Ladder:
         """Add rungs that simulate everywhere the effects that a tolerance needs anywhere.
 
-        ``tolerances``: for lines and leakage, tried with each set; by default those of the sets.
+        ``tolerances``: for lines and leakage, tried with each set; by default those of the
+        sets.
         """
         as_at: dict[frozenset[str], float] = {}
         for tolerance, names in sets.items():
@@ -223,11 +209,7 @@ def _numbers(flight: bool) -> Iterator[Rung]:
 
 
 def _thesis_rungs(overrides: Mapping[str, Any], powers: bool) -> Iterator[Rung]:
-    """Return the thesis's way, with 2^11 or 2^12 cells, and its improvements.
-
-    Before them the same beamlets with the same effects in closed form, like for like. ``powers``:
-    whether beamlets add as such, which then are transformed as real numbers.
-    """
+    """Yield the same beamlets and effects in closed form, and by the thesis's way, improved too."""
     yield Rung(name="closed form, as thesis", kind=CLOSED_FORM, overrides=overrides)
     forms: list[tuple[str, str, int, dict[str, Any]]] = [
         *((THESIS, "", power, {}) for power in (11, 12)),
@@ -269,10 +251,7 @@ def _drawn_ladder(spec: Declared) -> Ladder:
 
 
 def _every_effect(spec: Declared) -> dict[str, Any]:
-    """Return all effects on, each with the scene's own parameters.
-
-    Segments that all begin at one range are a law, not an omission: it stays as it is written.
-    """
+    """All effects on; segments that all begin at one range are a law, which stays as written."""
     random, law = _draws(spec), SEGMENT_MOTION.name
     kept = law if spec.modes()[law] == OFF else ""
     return {

@@ -72,10 +72,7 @@ class _PBSCluster(_TriedAgain, PBSCluster):  # type: ignore[misc]
 
 
 def start(cluster: Batch, bounds: Bounds) -> Any:
-    """Return the cluster, with jobs for its least number of workers submitted.
-
-    RuntimeError, OSError where the batch system takes no jobs.
-    """
+    """Return the cluster, its least number of workers submitted; RuntimeError if refused."""
     kind = _SlurmCluster if isinstance(cluster, Slurm) else _PBSCluster
     started = kind(**options(cluster))
     try:
@@ -138,8 +135,8 @@ def options(cluster: Batch) -> dict[str, Any]:
 def lifetime_of(walltime: float) -> tuple[float, float]:
     """Mean time [s] after which a worker leaves its job, and how far that is spread each way.
 
-    The last leaves with 5 % of the walltime in hand (a minute at least, a quarter of very short
-    ones), for what it is at and for handing over.
+    The last leaves with 5 % of the walltime in hand: a minute at least, a quarter of very short
+    ones.
     """
     in_hand = max(0.05 * walltime, min(60.0, walltime / 4))
     return walltime - 1.5 * in_hand, in_hand / 2

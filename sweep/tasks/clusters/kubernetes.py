@@ -1,8 +1,4 @@
-"""Workers in pods, which the Dask operator of a Kubernetes cluster starts.
-
-The request is one custom resource, a `DaskCluster`, and where workers are to be kept between bounds
-a `DaskAutoscaler`; both are deleted in the end. Needs `pip install sweep[kubernetes]`.
-"""
+"""Workers in pods, which the Dask operator of a Kubernetes cluster starts: `sweep[kubernetes]`."""
 
 from __future__ import annotations
 
@@ -32,10 +28,7 @@ ROUTES = ["distributed.http.scheduler.api", "distributed.http.health"]
 
 @contextmanager
 def deployed(cluster: Kubernetes, bounds: Bounds) -> Iterator[str]:
-    """Address of the scheduler, while the cluster is there.
-
-    ClusterError where Kubernetes can't be reached, knows no Dask operator, or starts no scheduler.
-    """
+    """Address of the scheduler while the cluster is there; ClusterError where that can't be had."""
     try:
         from httpx import HTTPError
         from kr8s import APITimeoutError, NotFoundError, ServerError

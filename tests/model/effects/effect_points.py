@@ -48,7 +48,7 @@ def points_of(parameters, footprint=None, **further):
 
 def planned(points, modes, tolerance, effects=EFFECTS, edges=None):
     """The plan of points, each by itself or in stretches between edges."""
-    number = max(np.size(value) for value in points.numbers.values())
+    number = max(np.size(value) for value in points.parameters.values())
 
     def tiles(values):
         each = np.broadcast_to(values, (number,))

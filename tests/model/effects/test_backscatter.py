@@ -11,16 +11,17 @@ from sweep.model.effects.atmosphere import (
     exponential,
     layer,
     optical_depth,
+    returned,
 )
-from sweep.model.effects.atmosphere import backscattered as power
 
-BEAM = {
-    "laser_power": 1.0, "aperture": 25e-3, "optical_efficiency": 0.8, "beam_divergence": 50e-6,
-    "lidar_ratio": 50.0,
-}  # fmt: skip
 AREA = np.pi * 0.0125**2
 NEAR = 500.0
 """Aperture over divergence [m]."""
+
+
+def power(profile, near=NEAR, **path):
+    """Of 1 W, 0.8 of which passes the optics, with a lidar ratio of 50 sr."""
+    return 0.8 * AREA / 50 * returned(profile, near=near, **path)
 
 
 def even(extinction):
@@ -39,15 +40,15 @@ def test_even_air_has_the_closed_form_of_exponential_integrals(extinction, lengt
     a, z = extinction, NEAR
     integral = np.exp(-2j * a * z) * (exp1(-2j * a * z) - exp1(2 * a * (length - 1j * z)))
     expected = 0.8 * AREA * a / 50 * integral.imag / z
-    found = power(even(a), start_height=7.0, end_height=7.0, range=length, **BEAM)
+    found = power(even(a), start_height=7.0, end_height=7.0, range=length)
     assert found == pytest.approx(expected, rel=1e-8)
 
 
 def test_diffraction_limited_overlap_is_that_of_the_coherent_lidar():
     """r_0 = pi D^2 / (4 lambda): the nearest air gives 1/r_0^2, whatever its distance."""
     divergence = 4 * 1.55e-6 / (np.pi * 25e-3)
-    beam = BEAM | {"beam_divergence": divergence}
-    found = power(even(1e-6), start_height=7.0, end_height=7.0, range=1.0, **beam)
+    near = 25e-3 / divergence
+    found = power(even(1e-6), near, start_height=7.0, end_height=7.0, range=1.0)
     limit = np.pi * 25e-3**2 / (4 * 1.55e-6)
     assert limit == pytest.approx(316.7, rel=1e-3)
     assert found == pytest.approx(0.8 * AREA * 2e-8 / limit**2, rel=1e-4)
@@ -83,6 +84,6 @@ def test_slant_paths_agree_with_adaptive_quadrature_over_range():
         total, error = quad(
             local, 0, length, points=breaks or None, limit=400, epsabs=0, epsrel=1e-9
         )
-        found = power(profile, start_height=start, end_height=end, range=length, **BEAM)
+        found = power(profile, start_height=start, end_height=end, range=length)
         expected = 0.8 * AREA / 50 * total
         assert found == pytest.approx(expected, rel=1e-8, abs=2 * 0.8 * AREA / 50 * error)

@@ -183,14 +183,6 @@ def test_noise_that_the_threshold_does_not_follow_changes_false_alarms():
     assert found == pytest.approx(moved, rel=0.01)
 
 
-@pytest.mark.parametrize(
-    ("modes", "words"), [({"a": "maybe"}, "no mode"), ({"z": "on"}, "no effect z")]
-)
-def test_what_is_not_known_is_refused(modes, words):
-    with pytest.raises(ValueError, match=words):
-        given_plan(Given(np.ones(1), 1.0), modes, 0.1, catalogue({"a": np.array([0.1])}))
-
-
 def test_effects_come_after_those_they_are_within():
     names = [effect.name for effect in EFFECTS]
     for effect in EFFECTS:

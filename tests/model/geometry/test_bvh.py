@@ -161,8 +161,3 @@ def test_triangles_that_no_plane_can_part_are_still_divided():
         towards = unit(corners[1234].mean(axis=0) - origin)
         distance, _ = walk_alone(tree, origin[None], towards[None])
         assert 0.0 < distance[0] < np.inf
-
-
-def test_nothing_to_build_from_is_refused():
-    with pytest.raises(ValueError, match="without triangles"):
-        build(np.zeros((3, 3)), np.empty((0, 3), dtype=np.int32))
