@@ -20,12 +20,15 @@ from sweep.model.geometry.mesh import Surface
 from sweep.model.ground import Footprints
 from sweep.model.groups import Groups, groups
 from sweep.model.marcum import at_least_one
+from sweep.model.noisy_spectra import Methods
 from sweep.model.outputs import POINTS, STATISTICS
 from sweep.model.preparation import Parameters, Shots, as_arrays
 from sweep.model.ray_error import ray_error
 from sweep.model.realisations import random_effects
 from sweep.model.returns import Returns, draw_returns
+from sweep.model.sampling import SPECTRA
 from sweep.model.shot import prepare_cast
+from sweep.model.spectra_returns import is_fixed, spectra_returns, without_chances
 
 STRETCH = 1 << 20
 """Numbers held at once beside the result: what a stretch of shots needs while it is computed."""
@@ -43,6 +46,7 @@ def cloud(
     first_draw: int = 0,
     draws: int = 1,
     method: str = "probabilities",
+    methods: Methods = Methods(),  # noqa: B008  # a tuple
     returns: int = 4,
     effects: Collection[str] = CORE,
     flags: np.ndarray | None = None,
@@ -59,7 +63,10 @@ def cloud(
     keys : (n, 2) uint64 ndarray
         Random key of each shot.
     first_draw, draws, method
-        As of :func:`sweep.model.returns.draw_returns`.
+        As of :func:`sweep.model.returns.draw_returns`; or method ``spectra``
+        (:mod:`sweep.model.spectra_returns`).
+    methods : Methods
+        Detectors and estimators by their names in the parameters, which look at spectra.
     returns : int
         Strongest groups of bins that are looked at in a segment, and points at the most of a
         shot and draw; at least 1.
@@ -86,9 +93,15 @@ def cloud(
         own = None if flags is None else flags[part]
         called = effects, own, keys[part]
         shots, rays, found = _groups(seen, parameters, surfaces, returns, called)
-        drawn = draw_returns(
-            shots, found, keys=keys[part], first_draw=first_draw, draws=draws, method=method
-        )
+        numbers = {"first_draw": first_draw, "draws": draws}
+        if method == SPECTRA:
+            if not is_fixed(parameters):
+                found = without_chances(found)
+            drawn = spectra_returns(
+                shots, found, keys=keys[part], parameters=parameters, methods=methods, **numbers
+            )
+        else:
+            drawn = draw_returns(shots, found, keys=keys[part], method=method, **numbers)
         left = np.zeros(shots.size)
         if estimates_rays:
             left = ray_error(shots, rays, found.bin[:, :, 0], found.magnitude[:, :, 0])
@@ -168,6 +181,8 @@ def _points(eyepoints: Eyepoints, drawn: Returns, beamlets: int) -> dict[str, np
     reported = {name: getattr(drawn, name) for name in POINTS if name in Returns._fields}
     return reported | {
         "position": eyepoints.position[:, None, None] + along,
+        "radial_velocity_compensated": drawn.radial_velocity_interpolated
+        - eyepoints.own_velocity[:, None, None],
         "surface": np.where(known, eyepoints.surface[at], -1),
         "true_range": np.where(known, far, np.nan),
         "true_radial_velocity": np.where(known, closing, np.nan),

@@ -259,10 +259,10 @@ def _count(rows, ends, levels, chances, how, seen, mixing, counts):
 
 
 @njit(cache=True, error_model="numpy")
-def fading_of_draws(key, draws, mixing, out):
-    """Factors of the strongest group, as of :func:`fading_factors`, (3, m) of m draws."""
+def fading_of_draws(key, draws, group, mixing, out):
+    """Factors of a group, as of :func:`fading_factors`, (3, m) of m draws."""
     for d in range(draws.size):
-        out[:, d] = fading_factors((key[0], key[1]), draws[d], 0, mixing)
+        out[:, d] = fading_factors((key[0], key[1]), draws[d], group, mixing)
 
 
 @njit(cache=True, error_model="numpy")

@@ -96,13 +96,13 @@ def stray(
     `points` are results of :func:`sweep.model.clouds.cloud`, of the n shots of `eyepoints` and some
     draws, from `first_draw` on; `keys` (n, 2) the random key of each shot; `seed` the study's, for
     errors that shots share. New are range, radial velocity and their standard errors, by whole bins
-    and interpolated, and position. The truth stays.
+    and interpolated, the compensated velocity, and position. The truth stays.
     """
     n, draws = points["flags"].shape[:2]
     number = np.arange(first_draw, first_draw + draws)
     clock, wavelength = _drawn(np.array([INSTRUMENT]), number, seed)[0].T
-    every, own = np.unique(eyepoints.beam, return_inverse=True)
-    turned = floor.pointing * _drawn(every.astype(float), number, seed)[own]
+    every, whose = np.unique(eyepoints.beam, return_inverse=True)
+    turned = floor.pointing * _drawn(every.astype(float), number, seed)[whose]
     shaken = uniforms(np.repeat(keys, draws, axis=0), np.tile(number, n), STREAM_ERROR_FLOOR, 2)
     shaken = floor.vibration * normals(shaken)[:, 0].reshape(n, draws, 1)
     direction, velocity = eyepoints.direction[:, None], eyepoints.velocity[:, None]
@@ -125,6 +125,8 @@ def stray(
     known = direction + off
     known /= np.sqrt(_dot(known, known))
     reach = new["range_interpolated"][..., None] * known[:, :, None]
+    own = eyepoints.own_velocity[:, None, None]
+    new["radial_velocity_compensated"] = new["radial_velocity_interpolated"] - own
     new["position"] = eyepoints.position[:, None, None] + reach
     return new
 

@@ -78,6 +78,11 @@ class Eyepoints(NamedTuple):
         """Reference beamlet, the first that hits anything, (n,)."""
         return np.asarray((self.surface >= 0).argmax(axis=1))
 
+    @property
+    def own_velocity(self) -> np.ndarray:
+        """Velocity of the instrument along its beams, as commanded, (n,) [m/s]."""
+        return _dot(self.velocity, self.direction)
+
     def some(self, shots: slice | np.ndarray) -> "Eyepoints":
         """Return some of the shots, by a slice, indices or a mask; neighbours are not copied."""
         places = np.arange(len(self.time))[shots]

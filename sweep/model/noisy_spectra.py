@@ -8,7 +8,8 @@ The signal has the magnitudes that :func:`sweep.model.segments.spectrum` gives, 
 effects. Where beamlets add as powers these are root mean squares, and have no phases: the signal
 is then given those of a lone tone at its place, bin by bin. For footprints of less than a bin that
 is what the spectrum is; in wider ones estimators see a smoother peak than speckle would make. In
-developed speckle all bins of a draw fade together.
+developed speckle all bins of a draw fade together. Where a shot of a flight has several echoes,
+each has the phases of a tone of its own, and its own fading.
 A phase common to all bins makes no difference to circular noise and is left out.
 
 The phase of a laser of Lorentzian line width walks randomly: of each draw a walk is taken, at every
@@ -83,10 +84,17 @@ class Signal(NamedTuple):
     """Where a lone tone of these magnitudes about the largest bin stands [bins]."""
     cnr: float
     """Power of the signal over that of the noise in the record, before the FFT."""
+    echo: np.ndarray | None = None
+    """(N/2 + 1,) int64: number of the echo that each bin is nearest to; None where all are one."""
 
 
-def signal_of(shots: Shots, i: int, segment: int) -> Signal:
-    """Spectrum of point i's segment without noise: 0 up, 1 Doppler, 2 down."""
+def signal_of(
+    shots: Shots, i: int, segment: int, echoes: Sequence[int] | np.ndarray = ()
+) -> Signal:
+    """Spectrum of point i's segment without noise: 0 up, 1 Doppler, 2 down.
+
+    ``echoes``: strongest bins of the echoes of several surfaces, where there are several.
+    """
     _, magnitude = segment_spectrum(shots, i, segment)
     if (laser := _laser(shots, i))["line_width"] > 0:  # as it is before its phase walks
         kept = seen_line(window=shots.window, looks=shots.looks.added, **laser)[0][0]
@@ -110,6 +118,14 @@ def signal_of(shots: Shots, i: int, segment: int) -> Signal:
         phases[first : last + 1] = phases[k] * np.exp(
             -1j * np.pi * apart * (window.length / shots.fft_size)
         )
+    echo = None
+    if len(echoes) > 1:
+        echo = np.abs(np.arange(half + 1)[:, None] - np.asarray(echoes)).argmin(axis=1)
+        for number, own in enumerate(echoes):
+            if not first <= own <= last:
+                beyond = magnitude[abs(own - 1)], magnitude[min(own + 1, 2 * half - own - 1)]
+                at = own + sub_bin(beyond[0], magnitude[own], beyond[1], tables)
+                phases = np.where(echo == number, _tone_phases(at, shots), phases)
     return Signal(
         spectrum=magnitude * phases,
         strongest=k,
@@ -117,6 +133,7 @@ def signal_of(shots: Shots, i: int, segment: int) -> Signal:
         last=last,
         frequency=place,
         cnr=float(power / shots.noise_variance[i]),
+        echo=echo,
     )
 
 
@@ -176,11 +193,14 @@ def noise_of(
     return np.array([fft.rfft(each, shots.fft_size) for each in record])
 
 
-def fading_of(shots: Shots, i: int, *, key: np.ndarray, draws: np.ndarray) -> np.ndarray:
-    """Factors on point i's signal by which it fades, (3, m) by segment; 1 where it does not."""
+def fading_of(
+    shots: Shots, i: int, *, key: np.ndarray, draws: np.ndarray, echo: int = 0
+) -> np.ndarray:
+    """Factors on an echo of point i by which it fades, (3, m) by segment; 1 where it does not."""
     factors = np.ones((3, draws.size))
     if shots.fading is not None:
-        fading_of_draws(key, draws, np.ascontiguousarray(shots.fading.mixing()[:, i]), factors)
+        mixing = np.ascontiguousarray(shots.fading.mixing()[:, i])
+        fading_of_draws(key, draws, echo, mixing, factors)
     return factors
 
 
@@ -199,10 +219,20 @@ def spectra_of(view: "View", segment: int, draws: np.ndarray) -> Iterator[np.nda
         numbers = draws + k * _LOOK
         given = {"key": view.key, "draws": numbers}
         if id(shots) not in known:
-            known[id(shots)] = signal_of(shots, view.i, segment)
+            signal = view.signals[segment]
+            if shots is not view.shots or signal is None:
+                signal = signal_of(shots, view.i, segment, view.echoes_of(segment))
+            known[id(shots)] = signal
+        signal = known[id(shots)]
         own = numbers if looks.independent else draws
-        factors = fading_of(shots, view.i, key=view.key, draws=own)[segment]
-        spectra = drawn_of(shots, view.i, segment, known[id(shots)], **given) * factors[:, None]
+        factors = fading_of(shots, view.i, key=view.key, draws=own)[segment][:, None]
+        if signal.echo is not None:
+            each = (
+                fading_of(shots, view.i, key=view.key, draws=own, echo=number)[segment]
+                for number in range(int(signal.echo.max()) + 1)
+            )
+            factors = np.stack(list(each), axis=1)[:, signal.echo]
+        spectra = drawn_of(shots, view.i, segment, signal, **given) * factors
         spectra = spectra + noise_of(shots, view.i, segment, **given)
         if looks.added == 1:
             yield spectra
@@ -227,6 +257,13 @@ class View(NamedTuple):
     setting: Setting
     detect: Detector
     estimate: Estimator
+    echoes: np.ndarray | None = None
+    """(3, k) int64: strongest bins of the shot's echoes in each segment, -1 for none."""
+
+    def echoes_of(self, segment: int) -> np.ndarray:
+        """Strongest bins of the echoes in a segment; none where echoes are not told apart."""
+        bins = np.empty(0, np.int64) if self.echoes is None else self.echoes[segment]
+        return bins[bins >= 0]
 
 
 class Found(NamedTuple):
@@ -241,7 +278,10 @@ class Found(NamedTuple):
     """[bins]"""
 
 
-def view_of(shots: Shots, i: int, p: Parameters, key: np.ndarray, methods: Methods) -> View:
+def view_of(
+    shots: Shots, i: int, p: Parameters, key: np.ndarray, methods: Methods,
+    echoes: np.ndarray | None = None,
+) -> View:  # fmt: skip
     """View of one of some shots, by the parameters p of its point, those of `DEFAULTS`."""
     training, rank = int(p[DETECTOR + "training"]), int(p[DETECTOR + "rank"])
     setting = Setting(
@@ -255,18 +295,21 @@ def view_of(shots: Shots, i: int, p: Parameters, key: np.ndarray, methods: Metho
         rank=rank or math.ceil(0.75 * training),  # 0 stands for three quarters
         pfa=float(p[DETECTOR + "pfa"]),
     )
-    signals = tuple(
-        signal_of(shots, i, s) if there else None for s, there in enumerate(shots.segments)
-    )
-    return View(
-        shots, i, key, signals, looks_of(shots), setting,
+    view = View(
+        shots, i, key, (), looks_of(shots), setting,
         methods.detectors[str(p[DETECTOR + "kind"])],
         methods.estimators[str(p[ESTIMATOR + "kind"])],
+        echoes,
     )  # fmt: skip
+    signals = tuple(
+        signal_of(shots, i, s, view.echoes_of(s)) if there else None
+        for s, there in enumerate(shots.segments)
+    )
+    return view._replace(signals=signals)
 
 
-def look(spectra: Sequence[np.ndarray], signal: Signal, view: View) -> Found:
-    """Detect and estimate in spectra (m, N/2 + 1) of a segment, of one or several looks."""
+def flagged(spectra: Sequence[np.ndarray], view: View) -> tuple[np.ndarray, np.ndarray]:
+    """Mean power of a segment's looks, and the bins that are flagged, (m, N/2 + 1) each."""
     powers = [each.real**2 + each.imag**2 for each in spectra]
     power = powers[0] if len(powers) == 1 else np.mean(powers, axis=0)
     if view.shots.looks.combine == BINARY:
@@ -274,6 +317,18 @@ def look(spectra: Sequence[np.ndarray], signal: Signal, view: View) -> Found:
         flags = np.asarray(votes >= view.shots.looks.votes)
     else:
         flags = np.array(view.detect(power, view.setting), bool)
+    return power, flags
+
+
+def placed(spectra: Sequence[np.ndarray], peak: np.ndarray, view: View) -> np.ndarray:
+    """Frequencies (m,) [bins] of peaks in a segment's spectra: the mean of the looks' estimates."""
+    places = [view.estimate(each, peak, view.setting) for each in spectra]
+    return places[0] if len(places) == 1 else np.asarray(np.mean(places, axis=0))
+
+
+def look(spectra: Sequence[np.ndarray], signal: Signal, view: View) -> Found:
+    """Detect and estimate in spectra (m, N/2 + 1) of a segment, of one or several looks."""
+    power, flags = flagged(spectra, view)
     shots, bins, half = view.shots, np.arange(power.shape[1]), power.shape[1] - 1
     low, high = max(signal.strongest - 1, 0), min(signal.strongest + 2, half + 1)
     if shots.detection == "any_bin" and signal.last >= signal.first:
@@ -288,7 +343,7 @@ def look(spectra: Sequence[np.ndarray], signal: Signal, view: View) -> Found:
     start, end = start + 1, np.nonzero(edges < 0)[1] + 1
     false = (start > signal.last) | (end <= signal.first)
     false &= (start <= half - shots.searched_from) & (end > shots.searched_from)
-    alarms, flagged = (
+    alarms, bins_flagged = (
         np.bincount(row[false], weights, len(power)).astype(np.int64)
         for weights in (None, (end - start)[false])
     )
@@ -296,9 +351,7 @@ def look(spectra: Sequence[np.ndarray], signal: Signal, view: View) -> Found:
     first, last = np.ones((len(power), 1)), np.full((len(power), 1), power.shape[1] - 1)
     first[row[own], 0], last[row[own], 0] = start[own], end[own]
     peak = np.where((first <= bins) & (bins < last), power, -1.0).argmax(axis=1)
-    places = [view.estimate(each, peak, view.setting) for each in spectra]
-    place = places[0] if len(places) == 1 else np.mean(places, axis=0)
-    return Found(detected, alarms, flagged, place)
+    return Found(detected, alarms, bins_flagged, placed(spectra, peak, view))
 
 
 def counted(view: View, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -324,12 +377,12 @@ def counted(view: View, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     counts = np.array([
         up.detected, down.detected, doppler.detected, both, *alarm, alarm[0] & alarm[1]
     ], np.int64)  # fmt: skip
-    flagged, alarms = sum(f.flagged for f in found), sum(f.alarms for f in found)
+    false, alarms = sum(f.flagged for f in found), sum(f.alarms for f in found)
     least = resolved_bound(view)
     squares = [np.full(draws.size, bound**2) for bound in least]
     whole = both & (doppler.detected | (view.signals[1] is None))
     errors = [np.where(whole, error, np.nan) for error in _errors(view, found)]
-    return counts, np.array([flagged / max(searched, 1), alarms, *errors, *squares])
+    return counts, np.array([false / max(searched, 1), alarms, *errors, *squares])
 
 
 def resolved_bound(view: View) -> Deviation:

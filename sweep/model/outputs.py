@@ -273,6 +273,7 @@ STATISTICS: dict[str, Output] = _over(("shot",), {
 })  # fmt: skip
 """Probabilities of each shot, before any draw.
 
+Where spectra are held against another detector than the fixed threshold, chances are nan.
 Where nothing is seen false alarms are those of the noise alone, and all else is nan; so is
 ``pd_doppler`` without a Doppler segment.
 """
@@ -306,6 +307,11 @@ POINTS: dict[str, Output] = _over(("shot", "draw", "return_number"), {
     ),
     "radial_velocity_interpolated_standard_error": Output(
         "m s-1", "standard error of the interpolated radial velocity"
+    ),
+    "radial_velocity_compensated": Output(
+        "m s-1", "interpolated radial velocity less the platform's own along the beam",
+        "platform_velocity on beam_direction; of what is at rest its error, of what moves its own, "
+        f"{CLOSING}",
     ),
     "snr": Output("1", "signal-to-noise ratio of the weaker of up and down peak"),
     "pd": Output("1", "probability that both peaks are detected", "nan for a false peak"),

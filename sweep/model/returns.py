@@ -122,21 +122,10 @@ def draw_returns(
     method : str
         ``probabilities`` or ``noise``.
     """
-    noisy = method == "noise"
-    n, _, most = found.bin.shape
-    drawn = Drawn(
-        np.full((n, draws, most, 2, 4), np.nan), np.full((n, draws, most), -1),
-        np.full((n, draws, most, 3), ABSENT, np.int8),
-        np.zeros((n, draws, most), np.uint8), np.full((n, draws, most), -1, np.int32),
-    )  # fmt: skip
-    known = _known(shots, found)
+    noisy, n = method == "noise", shots.size
+    known, drawn = known_of(shots, found), Drawn.nothing(found, draws)
     one = np.exp(shots.looks.log_alarm(known.levels[:, 1:2]))
-    how = How(
-        int(first_draw), noisy, shots.incoherent, bool(shots.segments[1]), shots.fft_size // 2,
-        shots.complex_record,
-        shots.real_ends, shots.echo_rule[1], echo_filter(shots, Seen.nothing(0)),
-        shots.looks.number if shots.looks.several else 1, shots.looks.independent,
-    )  # fmt: skip
+    how = How.of(shots, first_draw, noisy)
     tables = interpolator(shots.window, shots.fft_size)
     counted = np.nan_to_num(shots.counted_bins(found.exempted.T).T)
     nothing = np.arange(n), Seen.nothing(n)._replace(others=counted)
@@ -149,7 +138,7 @@ def draw_returns(
         _draw(keys[part], of_part, some._replace(alarm=alarm), seen, tables, own)
         for column, values in zip(drawn, own, strict=True):
             column[part] = values
-    return _measured(shots, found, drawn)
+    return measured(shots, found, drawn)
 
 
 class How(NamedTuple):
@@ -175,6 +164,16 @@ class How(NamedTuple):
     """Records whose powers are averaged."""
     apart: bool
     """Each has its own speckle."""
+
+    @classmethod
+    def of(cls, shots: Shots, first_draw: int, noisy: bool) -> "How":
+        """Draw some shots from a draw on."""
+        return cls(
+            int(first_draw), noisy, shots.incoherent, bool(shots.segments[1]), shots.fft_size // 2,
+            shots.complex_record,
+            shots.real_ends, shots.echo_rule[1], echo_filter(shots, Seen.nothing(0)),
+            shots.looks.number if shots.looks.several else 1, shots.looks.independent,
+        )  # fmt: skip
 
 
 class Known(NamedTuple):
@@ -218,8 +217,19 @@ class Drawn(NamedTuple):
     flags: np.ndarray
     beamlet: np.ndarray
 
+    @classmethod
+    def nothing(cls, found: Groups, draws: int) -> "Drawn":
+        """No returns of shots with these groups."""
+        n, _, most = found.bin.shape
+        return cls(
+            np.full((n, draws, most, 2, 4), np.nan), np.full((n, draws, most), -1),
+            np.full((n, draws, most, 3), ABSENT, np.int8),
+            np.zeros((n, draws, most), np.uint8), np.full((n, draws, most), -1, np.int32),
+        )  # fmt: skip
 
-def _known(shots: Shots, found: Groups) -> Known:
+
+def known_of(shots: Shots, found: Groups) -> Known:
+    """Return what is known of shots and their groups before any draw."""
     n = shots.size
     lines, amplitude = beamlet_lines(shots), shots.amplitude[shots.row]
     if shots.complex_record:
@@ -275,7 +285,7 @@ def _columns(shots: Shots, values: np.ndarray | float, dims: int = 1) -> np.ndar
     return np.broadcast_to(values, shots.size).reshape(-1, *[1] * dims)
 
 
-def _measured(shots: Shots, found: Groups, drawn: Drawn) -> Returns:
+def measured(shots: Shots, found: Groups, drawn: Drawn) -> Returns:
     """Compute returns from pairs of peaks; flag those that misread their common beamlet."""
     carrier, bandwidth, duration, rate, deepest, walk = (
         _columns(shots, column, 3)
@@ -342,28 +352,38 @@ def _draw(keys, how, known, seen, tables, out):
                     number[s] = draw_peaks(
                         address, (i, s), how, known, seen, tables, peaks[s], which[s], up
                     )
-            if how.doppler:
-                confirmed, count = pair_peaks(
-                    peaks[0, : number[0], FINE], peaks[1, : number[1], FINE],
-                    peaks[2, : number[2], FINE], known.at_start[i], 2.0 * how.half, how.signed,
-                    TOLERANCE, pairs,
-                )  # fmt: skip
-            else:
-                confirmed = count = pair_by_strength(number[0], number[2], how.signed, pairs)
-            for r in range(min(count, most)):
-                u, k, v, out.code[i, d, r] = pairs[r]
-                group, centres = out.group[i, d, r], np.zeros(3)
-                group[0], group[2] = which[0, u], which[2, v]
-                centres[0], centres[2] = peaks[0, u, FINE], peaks[2, v, FINE]
-                if k >= 0:
-                    group[1], centres[1] = which[1, k], peaks[1, k, FINE]
-                both = out.peaks[i, d, r]
-                for f in range(4):  # slices would compile an error message of shapes
-                    both[0, f], both[1, f] = peaks[0, u, f], peaks[2, v, f]
-                flag, out.beamlet[i, d, r] = judge(
-                    group, centres, known.bins[i], known.lines[i], known.amplitude[i]
-                )
-                out.flags[i, d, r] = flag | (UNCONFIRMED if r >= confirmed else 0)
+            report((i, d), how, known, (peaks, which, number), pairs, out)
+
+
+@njit(cache=True, error_model="numpy")
+def report(at, how, known, found, pairs, out):
+    """Pair the peaks of one point (i, draw) into returns, and judge each.
+
+    ``found``: peaks (3, most + 1, 4) of the three segments, their groups, and their numbers.
+    """
+    (i, d), (peaks, which, number) = at, found
+    if how.doppler:
+        confirmed, count = pair_peaks(
+            peaks[0, : number[0], FINE], peaks[1, : number[1], FINE],
+            peaks[2, : number[2], FINE], known.at_start[i], 2.0 * how.half, how.signed,
+            TOLERANCE, pairs,
+        )  # fmt: skip
+    else:
+        confirmed = count = pair_by_strength(number[0], number[2], how.signed, pairs)
+    for r in range(min(count, out.flags.shape[2])):
+        u, k, v, out.code[i, d, r] = pairs[r]
+        group, centres = out.group[i, d, r], np.zeros(3)
+        group[0], group[2] = which[0, u], which[2, v]
+        centres[0], centres[2] = peaks[0, u, FINE], peaks[2, v, FINE]
+        if k >= 0:
+            group[1], centres[1] = which[1, k], peaks[1, k, FINE]
+        both = out.peaks[i, d, r]
+        for f in range(4):  # slices would compile an error message of shapes
+            both[0, f], both[1, f] = peaks[0, u, f], peaks[2, v, f]
+        flag, out.beamlet[i, d, r] = judge(
+            group, centres, known.bins[i], known.lines[i], known.amplitude[i]
+        )
+        out.flags[i, d, r] = flag | (UNCONFIRMED if r >= confirmed else 0)
 
 
 @njit(cache=True, error_model="numpy")

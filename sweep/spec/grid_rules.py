@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -31,6 +31,9 @@ from sweep.spec.mistakes import ABSENT, Finding
 from sweep.spec.parts import OFF, ON, rules_of
 from sweep.spec.sections import SPECTRA, Draws, Effects
 from sweep.units import QuantityError
+
+if TYPE_CHECKING:
+    from sweep.spec.scene import SceneDraws
 
 RANGE = "target.range"
 DURATION = "instrument.chirp.duration"
@@ -516,7 +519,7 @@ def without_draws(grid: Grid) -> Iterator[Finding]:
         yield grid.finding(parameter.path, rule, remedy)
 
 
-def not_in_flights(grid: Grid, method: str) -> Iterator[Finding]:
+def not_in_flights(grid: Grid, draws: SceneDraws) -> Iterator[Finding]:
     """Random effects and methods that are asked for in a flight, and that only grids draw.
 
     All other random effects are drawn; a target's own parameters are told where they stand.
@@ -527,15 +530,11 @@ def not_in_flights(grid: Grid, method: str) -> Iterator[Finding]:
         if (effect.turn or of_target) and effect.is_random and grid.modes.get(effect.name) == ON:
             instead = ": beams wander by platform.jitter" if effect.turn is not None else ""
             yield _of_mode(effect.name, rule, f"leave it out{instead}")
-    yield from _noise_of_looks(grid, method)
+    yield from spectra_findings(draws, grid)
     voted = {looks.NUMBER: _several, looks.COMBINE: _is(looks.BINARY)}
     if grid.has_point(voted | {"footprint.speckle": _is("developed")}):
         rule = "counts records, and flights draw no powers of echoes that fade in several"
         yield grid.finding(looks.COMBINE, rule, "take power, or footprint.speckle: none")
-    rule = "looks at whole spectra, which flights over scenes do not draw"
-    for path in _methods(grid):
-        if path in grid.values:
-            yield grid.finding(path, rule, "leave it out, or study a flat target")
 
 
 def _of_mode(effect: str, rule: str, remedy: str) -> Finding:
@@ -562,7 +561,7 @@ def is_method(path: str) -> bool:
     return path.startswith((DETECTOR, ESTIMATOR))
 
 
-def spectra_findings(draws: Draws, grid: Grid) -> Iterator[Finding]:
+def spectra_findings(draws: Draws | SceneDraws, grid: Grid) -> Iterator[Finding]:
     """Methods without spectra to look at, spectra without draws, CFAR windows that do not fit."""
     yield from _noise_of_looks(grid, draws.method)
     if not draws.whole_spectra:

@@ -21,7 +21,7 @@ from sweep.spec.grounds import (
     generator,
 )
 from sweep.spec.parts import Files, Part
-from sweep.spec.sections import sunlight
+from sweep.spec.sections import SPECTRA, sunlight
 
 if TYPE_CHECKING:
     from sweep.scenes.meshes import Facets
@@ -269,11 +269,22 @@ class SceneDraws(Part):
 
     number: int = of.count("Draws", "1000", at_most="1e9", default=1)
     method: str = of.choice(
-        "Draw against the probabilities, or add noise to the bins",
-        ("probabilities", "noise"),
+        "Draw against the probabilities, add noise to the bins, or draw whole spectra of each "
+        "shot for instrument.processing.detector and .estimator to look at",
+        ("probabilities", "noise", SPECTRA),
         "probabilities",
     )
     returns: int = of.count("Points kept of a shot at most", "4", at_most="64", default=4)
+
+    @property
+    def any(self) -> bool:
+        """True, as a point cloud has one draw at the least."""
+        return True
+
+    @property
+    def whole_spectra(self) -> bool:
+        """True if a detector and an estimator look at whole spectra."""
+        return self.method == SPECTRA
 
 
 class Navigation(Part):

@@ -293,15 +293,12 @@ STORED = frozenset(
 """Names of a store's arrays and dimensions."""
 
 _OTHER = "make another study of it"
-_SPECTRA = ("looks at whole spectra, which flights do not draw", "study a flat target")
 _BEAMS = (beam.DIVERGENCE, beam.WAIST, beam.QUALITY, beam.FOCUS, beam.RECEIVED_WAIST, beam.COUPLING)
 _MOVES = ("moves the beamlets, and a study casts its rays once", _OTHER)
 _REASONS = {
     "footprint.speckle": ("", ""),  # which moves no beamlet
     "target.": ("is given by the scene, shot by shot", "change the scene or the flight"),
     **dict.fromkeys((*_BEAMS, "footprint."), _MOVES),
-    "instrument.processing.detector.": _SPECTRA,
-    "instrument.processing.estimator.": _SPECTRA,
     "accuracy.": ("says how closely to compute, the same for a whole study", _OTHER),
 }
 

@@ -74,7 +74,7 @@ class SceneSpec(Study):
         return [
             *scene_findings(written, base),
             *axis_findings(written, grid.axes),
-            *not_in_flights(grid, draws.method),
+            *not_in_flights(grid, draws),
             *scene_figure_findings(written, grid.axes if axes_are_whole else None),
         ]
 
@@ -99,7 +99,9 @@ class SceneSpec(Study):
 
     def parameters(self) -> dict[str, float | int | str]:
         """SI values of all parameters by dotted path; of those on axes, the value off the axis."""
-        parameters = {p: v for p, v in super().parameters().items() if not is_method(p)}
+        parameters = super().parameters()
+        if not self.draws.whole_spectra:
+            parameters = {p: v for p, v in parameters.items() if not is_method(p)}
         rays = rays_needed(parameters, Accuracy.of(parameters))
         return parameters | {
             "target.solar_irradiance": self.scene.solar_irradiance,

@@ -237,7 +237,7 @@ class FlightStudy(GrowingStudy):
     def compile(self) -> None:
         """Compile the radiometry and the navigation, on the first cycle of each scanner."""
         for blocks in self.grids:
-            part = blocks.part(0)
+            part = blocks.part(0)._replace(draws=range(1))
             cycle = range(blocks.shots_a_cycle)
             shots, eyepoints = self._seen(part.scanner, cycle)
             numbers = np.array(cycle)
@@ -341,7 +341,10 @@ class FlightStudy(GrowingStudy):
         from sweep.model.clouds import cloud
         from sweep.model.error_floor import stray
         from sweep.model.philox import point_keys
+        from sweep.tasks.user_code import methods
 
+        spectra = self.spec.draws.whole_spectra
+        looks = {"methods": methods(self.parameters_at(part))} if spectra else {}
         seed, first = int(self.spec.seed), part.draws.start + draws.start
         keys = point_keys(numbers[:, None].astype(float), domain=DOMAIN, seed=seed)
         found = cloud(
@@ -352,6 +355,7 @@ class FlightStudy(GrowingStudy):
             first_draw=first,
             draws=draws.stop - draws.start,
             method=self.spec.draws.method,
+            **looks,
             returns=int(self.spec.draws.returns),
             effects=effects,
             flags=flags,

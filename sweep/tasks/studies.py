@@ -209,7 +209,7 @@ def ignored(older: Declared, spec: Declared) -> tuple[str, ...]:
     The tolerance, where neither study varies it, and what looks at spectra where none are
     drawn.
     """
-    looks = isinstance(spec, Spec) and spec.draws.whole_spectra
+    looks = spec.draws.whole_spectra
     ours = [path for path in spec.parameters() if is_method(path) and not looks]
     fixed = _tolerance(older) is not None and _tolerance(spec) is not None
     return (*ours, TOLERANCE) if fixed else tuple(ours)

@@ -94,6 +94,23 @@ def test_each_surface_in_a_footprint_gives_its_point(table_4_1, method):
                 np.testing.assert_allclose(got[name][shot][own], closing, atol=bins * VELOCITY_BIN)
 
 
+@METHODS
+def test_without_the_platforms_motion_a_target_at_rest_stands_still(table_4_1, method):
+    """An oblique flight: what is left is the table's own 5 m/s, and 0 for the ground."""
+    seen = _edge([ON_GROUND, ON_TABLE], lift=5.0, velocity=(70.0, -30.0, -20.0))
+    got = _cloud(seen, _strong(table_4_1, power=1e-2), draws=DRAWS, method=method, returns=1)
+    left, stated = (
+        got[f"radial_velocity_{name}"][..., 0]
+        for name in ("compensated", "interpolated_standard_error")
+    )
+    assert np.isfinite(left).all()
+    error = left - [[0.0], [5.0]]
+    assert np.abs(error.mean(axis=1)).max() < 0.02 * VELOCITY_BIN
+    # What is stated counts the spread of the footprint's lines, which all draws share, as well.
+    spread = error.std(axis=1) / stated.mean(axis=1)
+    assert (spread > 0.9).all() and (spread < 1 + 5 / np.sqrt(2 * DRAWS)).all()
+
+
 @pytest.mark.parametrize("phases", ["coherent", "incoherent"])
 def test_shots_that_are_computed_together_are_as_alone_whatever_effects_each_has(table_4_1, phases):
     """Bit for bit, all combinations of effects that shots are not kept apart for."""

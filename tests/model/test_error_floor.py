@@ -103,6 +103,7 @@ def test_points_stray_by_what_they_state_together_or_each_by_itself(name):
         for shot in range(8):
             there = name == "clock" or key == "radial_velocity"
             assert _spread_is(error[shot], own[shot]) if there else not error[shot].any()
+    np.testing.assert_allclose(found["radial_velocity_compensated"][..., 0], closing, atol=1e-9)
     alike = np.corrcoef(closing)
     number = np.arange(8) % 4
     together = {

@@ -71,8 +71,14 @@ def test_they_are_no_part_of_studies_that_draw_no_spectra():
     assert drawn[0].id != drawn[1].id
 
 
-def test_flights_draw_no_whole_spectra():
+def test_flights_have_them_where_they_draw_whole_spectra():
     mapping = flight()
     mapping["instrument"]["processing"]["estimator"] = {"kind": "candan"}
-    with pytest.raises(SpecError, match="which flights over scenes do not draw"):
+    with pytest.raises(SpecError, match=r"which draws.method 'probabilities' does not draw"):
+        SceneSpec.from_mapping(mapping)
+    mapping["draws"] = {"method": "spectra", "number": 2}
+    path = "instrument.processing.estimator.kind"
+    assert SceneSpec.from_mapping(mapping).parameters()[path] == "candan"
+    mapping["instrument"]["receiver"]["record"] = "complex"
+    with pytest.raises(SpecError, match="draws whole spectra of real records"):
         SceneSpec.from_mapping(mapping)

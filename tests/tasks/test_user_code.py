@@ -1,5 +1,6 @@
 """Functions of the user's: run when allowed, held to their word, never by reading."""
 
+import copy
 import os
 import sys
 import textwrap
@@ -8,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from small import Said, quiet, small
+from small_flights import SCENE, small_scene
 
 import sweep
 from sweep.tasks import plan as planned
@@ -92,6 +94,28 @@ def test_code_runs_only_where_its_module_is_allowed(mine, tmp_path):
     own, built_in = (sweep.open(tmp_path / f"{n}.zarr") for n in "ab")
     np.testing.assert_array_equal(own.pd_shot, built_in.pd_shot)
     np.testing.assert_array_equal(own.range_rmse, built_in.range_rmse)
+
+
+def test_a_flight_runs_allowed_functions_and_finds_what_built_in_ones_find(mine, tmp_path):
+    def flown(detector, estimator):
+        processing = {"detector": {"kind": detector}, "estimator": {"kind": estimator}}
+        instrument = copy.deepcopy(SCENE["instrument"])
+        instrument["processing"] |= {"fft_size": "2^9"} | processing
+        draws = {"method": "spectra", "number": 2, "returns": 2}
+        scanners = {"three": SCENE["scanners"]["three"] | {"rate": "0.5 Hz"}}
+        return small_scene(instrument=instrument, draws=draws, scanners=scanners, axes={})
+
+    spec = flown(f"{mine}:detect", f"{mine}:estimate")
+    with pytest.raises(CodeError, match=f"--allow-code {mine}"):
+        quiet(spec, tmp_path / "a.zarr")
+    user_code.allow([mine])
+    assert quiet(spec, tmp_path / "a.zarr").complete
+    assert quiet(flown("fixed", "peak_bin"), tmp_path / "b.zarr").complete
+    own, built_in = (sweep.open_scene(tmp_path / f"{n}.zarr")["three"] for n in "ab")
+    assert (built_in.flags > 0).any()
+    np.testing.assert_array_equal(own.range_interpolated, built_in.range_interpolated)
+    np.testing.assert_array_equal(own.flags, built_in.flags)
+    assert built_in.pd_shot.notnull().any() and not own.pd_shot.notnull().any()
 
 
 def test_opening_a_store_runs_nothing(mine, tmp_path):

@@ -1,0 +1,159 @@
+"""Returns of a flight's shots that a detector and an estimator find in whole spectra, draw by draw.
+
+Spectra are those of :mod:`sweep.model.noisy_spectra`, as grids have them: a shot is a point, with
+the echoes of all the surfaces that it sees. Flagged bins that are adjacent make a peak, placed by
+the estimator; the strongest of them are paired, judged and measured as all others of a flight
+(:mod:`sweep.model.returns`). A peak belongs to an echo whose bins it touches: those from the first
+to the last of half the echo's largest magnitude, and a main lobe's half-width to either side (the
+strongest and one to either side of it by ``peak_bin``). An echo has one peak, the strongest. All
+others are false, as many as there are.
+
+A draw is looked at by itself, so that a user's function answers the same however draws are cut.
+
+Standard errors are those of three bins' interpolation, whatever the estimator, which an instrument
+does not know better; those of ``peak_bin`` count its rounding.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from sweep.model.detectors import FIXED, main_lobe
+from sweep.model.estimators import DEFAULTS, DETECTOR, ESTIMATOR, PEAK_BIN
+from sweep.model.groups import Groups
+from sweep.model.interpolation import interpolator, sub_bin_error
+from sweep.model.noisy_spectra import Methods, Signal, View, flagged, placed, spectra_of, view_of
+from sweep.model.pairing import FALSE
+from sweep.model.preparation import Parameters, Shots
+from sweep.model.returns import Drawn, How, Returns, known_of, measured, put, report
+
+
+class Peak(NamedTuple):
+    """Adjacent bins that a detector flags."""
+
+    bin: int
+    """The strongest of them."""
+    group: int
+    """Echo whose bins they touch, or FALSE."""
+
+
+def is_fixed(parameters: Parameters) -> bool:
+    """Tell whether spectra are held against the threshold that closed forms know."""
+    return str(parameters.get(DETECTOR + "kind", FIXED)) == FIXED
+
+
+def without_chances(found: Groups) -> Groups:
+    """Strip groups of the probabilities of a threshold that nothing is held against."""
+    pd, leakage = (np.full_like(chances, np.nan) for chances in (found.pd, found.leakage))
+    return found._replace(pd=pd, leakage=leakage)
+
+
+def spectra_returns(
+    shots: Shots,
+    found: Groups,
+    *,
+    keys: np.ndarray,
+    parameters: Parameters,
+    methods: Methods,
+    first_draw: int = 0,
+    draws: int = 1,
+) -> Returns:
+    """Draw returns of every shot, draw by draw.
+
+    Parameters
+    ----------
+    shots, found, keys, first_draw, draws
+        As of :func:`sweep.model.returns.draw_returns`.
+    parameters : mapping
+        Scalars; those of :data:`sweep.model.estimators.DEFAULTS` that are not given are these.
+    methods : Methods
+        Detectors and estimators by their names in the parameters.
+    """
+    p, most = {**DEFAULTS, **parameters}, found.bin.shape[2]
+    known, drawn = known_of(shots, found), Drawn.nothing(found, draws)
+    how, tables = How.of(shots, first_draw, True), interpolator(shots.window, shots.fft_size)
+    peaks, which = np.zeros((3, most + 1, 4)), np.empty((3, most + 1), np.int64)
+    pairs, looks = np.empty((most + 1, 4), np.int64), math.sqrt(shots.looks.number)
+    rounded = math.sqrt(1 / 12) if str(p[ESTIMATOR + "kind"]) == PEAK_BIN else 0.0
+    for i in range(shots.size):
+        view = view_of(shots, i, p, keys[i], methods, found.bin[i])
+        sigma, _, under_lines = known.levels[i]
+        echoes = [_bins_of(view, s, signal) for s, signal in enumerate(view.signals)]
+        for d in range(draws):
+            number = np.zeros(3, np.int64)
+            for s, signal in enumerate(view.signals):
+                if signal is None:
+                    continue
+                spectra = list(spectra_of(view, s, np.array([first_draw + d])))
+                power, listed = peaks_of(spectra, signal, echoes[s], view, most + 1)
+                bins = np.array([peak.bin for peak in listed], np.int64)
+                alike = [np.repeat(each, bins.size, axis=0) for each in spectra]
+                places = placed(alike, bins, view) if bins.size else np.empty(0)
+                for k, (peak, place) in enumerate(zip(listed, places.tolist(), strict=True)):
+                    ratio = math.sqrt(power[peak.bin]) / sigma
+                    delta = min(max(place - peak.bin, -0.5), 0.5)
+                    error = sub_bin_error(delta, ratio / under_lines, tables) / looks
+                    wide = known.spread[i, s, peak.group] if peak.group >= 0 else 0.0
+                    error = math.hypot(error, rounded)
+                    put(peaks[s, k], peak.bin, place, error, ratio, wide, how, tables)
+                    which[s, k] = peak.group
+                number[s] = bins.size
+            report((i, d), how, known, (peaks, which, number), pairs, drawn)
+    return measured(shots, found, drawn)
+
+
+def _bins_of(view: View, segment: int, signal: Signal | None) -> np.ndarray:
+    """First and last bin of each echo in a segment, (echoes, 2)."""
+    places = view.echoes_of(segment)
+    if signal is None or not places.size:
+        return np.empty((0, 2), np.int64)
+    if view.shots.detection != "any_bin":
+        return np.stack([places - 1, places + 1], axis=1)
+    if places.size == 1:
+        return np.array([[signal.first, signal.last]])
+    setting, magnitude = view.setting, np.abs(signal.spectrum)
+    beside = math.ceil(main_lobe(setting.window) * setting.fft_size / setting.window.length)
+    found = []
+    for place in places:
+        low = np.flatnonzero(magnitude < 0.5 * magnitude[place])
+        after = int(np.searchsorted(low, place))
+        first = low[after - 1] + 1 if after else 0
+        last = low[after] - 1 if after < low.size else magnitude.size - 1
+        found.append((first - beside, last + beside))
+    return np.array(found)
+
+
+def peaks_of(
+    spectra: Sequence[np.ndarray], signal: Signal, echoes: np.ndarray, view: View, most: int
+) -> tuple[np.ndarray, list[Peak]]:
+    """Power (N/2 + 1,) of one draw of a segment, and the peaks in it, strongest first.
+
+    ``spectra``: (1, N/2 + 1) each, of one or several looks; ``echoes``: first and last bins.
+    """
+    (power,), (flags,) = flagged(spectra, view)
+    half = power.size - 1
+    if view.shots.real_ends and signal.last >= signal.first:  # an echo on DC or Nyquist
+        flags[1] |= flags[0] and signal.first == 0
+        flags[-2] |= flags[-1] and signal.last == half
+    flags[[0, -1]] = False
+    edges = np.diff(flags.astype(np.int8))
+    starts, ends = np.flatnonzero(edges > 0) + 1, np.flatnonzero(edges < 0) + 1
+    found: list[Peak] = []
+    seen: set[int] = set()
+    least = view.shots.searched_from
+    if not starts.size:
+        return power, []
+    strength = np.maximum.reduceat(np.where(flags, power, 0.0), starts)
+    for run in np.argsort(-strength, kind="stable"):
+        start, end = int(starts[run]), int(ends[run])
+        own = np.flatnonzero((echoes[:, 0] < end) & (start <= echoes[:, 1]))
+        group = int(own[0]) if own.size else FALSE
+        if group in seen or (group == FALSE and (start > half - least or end <= least)):
+            continue
+        seen |= {group} - {FALSE}
+        found.append(Peak(start + int(power[start:end].argmax()), group))
+        if len(found) == most:
+            break
+    return power, found

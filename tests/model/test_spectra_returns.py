@@ -1,0 +1,129 @@
+"""Detectors and estimators in flights: what grids have of a shot, and of several surfaces."""
+
+import numpy as np
+import pytest
+from engine import keys
+from small_scenes import flight, instrument, observed, plate
+
+from sweep.model.clouds import cloud
+from sweep.model.estimators import DETECTOR, ESTIMATOR
+from sweep.model.geometry.mesh import Surface
+from sweep.model.noisy_spectra import Methods
+from sweep.model.pairing import FALSE_ALARM, TRUE, UNCONFIRMED
+from sweep.model.sampling import simulate
+
+EFFECTS = ("footprint", "doppler")
+HEIGHT, CLOSING = 412.0, 20.0
+NUMBER = 600
+
+
+def _given(table_4_1, tnr=10.0, power=1.6e-3, **methods):
+    parameters = instrument(
+        table_4_1, fft_size=2**11, power=power, tnr=tnr, beamlets=7, detection="any_bin",
+        noise_bins="correlated",
+    )  # fmt: skip
+    return parameters | methods
+
+
+def _flown(parameters, *, first=1000, draws=NUMBER, bodies=None, x=0.0, **given):
+    given = {"effects": EFFECTS} | given
+    path = flight(position=(x, 0.0, HEIGHT), velocity=(0.0, 0.0, -CLOSING))
+    seen = observed(path, bodies=bodies, number=7)
+    return cloud(
+        seen, parameters=parameters, surfaces=[Surface("ground", 0.1), Surface("table", 0.1)],
+        keys=keys(1), first_draw=first, draws=draws, method="spectra", **given,
+    )  # fmt: skip
+
+
+def _grid(parameters, methods=None):
+    """A flat target of the same range, velocity and reflectance, with other draws."""
+    target = {
+        "target.range": np.array([HEIGHT]), "target.radial_velocity": CLOSING,
+        "target.grazing_angle": np.pi / 2, "target.reflectance": 0.1,
+        "target.reflectance_law": "lambert",
+    }  # fmt: skip
+    return simulate(
+        parameters | target, EFFECTS, keys=keys(1), batch_sizes=[NUMBER], method="spectra",
+        **({} if methods is None else {"methods": methods}),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["peak_bin", "jacobsen", "centroid", "maximum_likelihood"])
+def test_an_estimators_bias_and_scatter_are_those_of_a_grid(table_4_1, kind):
+    """The same shot, seen in other draws: 5 sigma of means and of root mean squares."""
+    parameters = _given(table_4_1, power=1.0, **{ESTIMATOR + "kind": kind})
+    got, grid = _flown(parameters), _grid(parameters)
+    assert got["snr_up"][0] == pytest.approx(grid["snr_up"][0], rel=1e-9)
+    for name in ("range", "radial_velocity"):
+        error = (got[f"{name}_interpolated"] - got[f"true_{name}"])[0, :, 0]
+        assert np.isfinite(error).all() and (got["flags"][0, :, 0] == TRUE).all()
+        bias, rmse = grid[f"{name}_bias"][0], grid[f"{name}_rmse"][0]
+        scatter = np.sqrt(max(rmse**2 - bias**2, 0.0))
+        apart = 5 * scatter * np.sqrt(2 / NUMBER)
+        assert error.mean() == pytest.approx(bias, abs=apart + 1e-6)
+        assert error.std() == pytest.approx(scatter, rel=5 / np.sqrt(NUMBER), abs=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["fixed", "ca_cfar", "os_cfar", "goca_cfar"])
+def test_a_detector_detects_as_often_as_in_a_grid(table_4_1, kind):
+    chosen = {DETECTOR + "kind": kind, DETECTOR + "pfa": 1e-4}
+    parameters = _given(table_4_1, tnr=6.0, power=1e-2, **chosen)
+    got, grid = _flown(parameters), _grid(parameters)
+    found = np.isin(got["flags"], (TRUE, TRUE | UNCONFIRMED)).any(axis=2).mean()
+    pd = grid["pd_shot"][0]
+    assert 0.1 < pd < 0.95
+    assert found == pytest.approx(pd, abs=5 * np.sqrt(2 * pd * (1 - pd) / NUMBER))
+    # Closed forms know the fixed threshold alone.
+    assert np.isfinite(got["pd_shot"]).all() == (kind == "fixed")
+    if kind == "fixed":
+        assert got["pd_shot"][0] == pytest.approx(pd, abs=5 * np.sqrt(pd * (1 - pd) / NUMBER))
+
+
+def test_functions_of_ones_own_see_every_draw_alone(table_4_1):
+    """A detector that flags one bin off the echo, and an estimator that says so."""
+
+    def here(power, setting):
+        return np.arange(power.shape[1])[None] == 300
+
+    def there(spectrum, peak, setting):
+        assert spectrum.shape == (1, setting.fft_size // 2 + 1) and (peak == 300).all()
+        return peak + 0.25
+
+    own = Methods({"mine:here": here}, {"mine:there": there})
+    chosen = {DETECTOR + "kind": "mine:here", ESTIMATOR + "kind": "mine:there"}
+    got = _flown(_given(table_4_1, **chosen), draws=3, methods=own)
+    assert (got["flags"][0, :, 0] & FALSE_ALARM).all() and not got["flags"][0, :, 1:].any()
+    # Up and down beat alike: no range, and a velocity of 300.25 bins; or the reverse.
+    bins = 299792458.0 * 600e6 / (4 * 2**11 * 2e12), 1550e-9 * 600e6 / 2**12
+    far, closing = (np.abs(got[f"{n}_interpolated"][0, :, 0]) for n in ("range", "radial_velocity"))
+    read = far / bins[0] + closing / bins[1]
+    np.testing.assert_allclose(read, 300.25, rtol=1e-3)
+
+
+def test_both_surfaces_of_a_footprint_are_seen_and_fade_each_for_itself(table_4_1):
+    """Both are seen as often as by chance, and their strengths are not correlated; 5 sigma."""
+    bodies = [plate(x=(-1e3, 30.0)), plate(x=(0.0, 30.0), surface=1, height=120.0)]
+    changes = {ESTIMATOR + "kind": "candan", "footprint.speckle": "developed"}
+    parameters = _given(table_4_1, power=0.3, **changes)
+    effects = (*EFFECTS, "several_returns", "fading")
+    got = _flown(parameters, bodies=bodies, x=1e-4, effects=effects, draws=2000)
+    seen = [(got["surface"] == number).any(axis=2)[0] for number in (0, 1)]
+    one, other = (each.mean() for each in seen)
+    apart = 5 * np.sqrt(one * other * (1 - one * other) / 2000)
+    assert (seen[0] & seen[1]).mean() == pytest.approx(one * other, abs=apart)
+    both = seen[0] & seen[1]
+    snr = [np.where(got["surface"][0] == k, got["snr"][0], 0.0).max(axis=1)[both] for k in (0, 1)]
+    # One fading of both would have them rise and fall as one.
+    assert abs(np.corrcoef(*snr)[0, 1]) < 5 / np.sqrt(both.sum()) < 0.2
+    true = got["flags"] == TRUE
+    off = np.abs(got["range_interpolated"] - got["true_range"])[true]
+    assert np.median(off) < 0.5 * 299792458.0 * 600e6 / (4 * 2**11 * 2e12)
+
+
+def test_any_split_of_draws_gives_the_same_bytes(table_4_1):
+    parameters = _given(table_4_1, **{ESTIMATOR + "kind": "chirp_z"})
+    whole = _flown(parameters, draws=6)
+    part = _flown(parameters, first=1002, draws=3)
+    for name, values in part.items():
+        expected = whole[name][:, 2:5] if values.ndim > 1 else whole[name]
+        np.testing.assert_array_equal(values, expected, err_msg=name)
