@@ -174,6 +174,10 @@ class Shots:
     """Amplitude at the negative frequency that I and Q leave of a line's, 0..1, (n,)."""
     fading: "Fading | None" = None
     """Of echoes in developed speckle."""
+    leak_amplitude: np.ndarray | None = None
+    """Amplitude of the leaked light's beat [V], (n,) or scalar; None without one."""
+    leak_delay: np.ndarray | float = 0.0
+    """Its delay [s]."""
     image: bool = False
     """Whether the lines' images at negative frequencies are summed."""
     leakage: bool = False

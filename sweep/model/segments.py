@@ -6,6 +6,7 @@ at spectra (detection, groups, draws, pictures) looks at runs.
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -15,6 +16,7 @@ from numba import njit
 from sweep.model import line_shape
 from sweep.model.crossings import MOST_TERMS, crossing_series
 from sweep.model.detection import found_pair
+from sweep.model.effects.circulator_leak import beside_leak
 from sweep.model.effects.line_width import gaussian_shifts
 from sweep.model.ground import different_rows
 from sweep.model.leakage import MOST_POINTS, inspect, of_bins
@@ -170,9 +172,10 @@ def runs_of(
         floor = table[12] * table[10] if leaks == BIN_BY_BIN else np.inf
         lowest, done = np.minimum(levels, floor), 0
         while done < together.part.size:
-            held = keep or (shots.looks.several and bool(leaks))
+            held = keep or (shots.looks.several and bool(leaks)) or shots.leak_amplitude is not None
             runs, number = _some(shots, table, lowest, together, leaks, done, held)
-            yield _of_looks(shots, runs, bool(leaks)) if shots.looks.several else runs
+            runs = _of_looks(shots, runs, bool(leaks)) if shots.looks.several else runs
+            yield runs if shots.leak_amplitude is None else beside_leak(shots, runs)
             done += number
 
 
@@ -195,7 +198,7 @@ def _of_looks(shots: Shots, runs: Runs, leakage: bool) -> Runs:
 
 
 def spectrum(shots: Shots, i: int, segment: int, *, level: float = 0.0) -> tuple:
-    """Bins of a segment in which the signal stands above a level, and |X| there, without noise.
+    """Bins of a segment in which the echo stands above a level, and |X| there, without noise.
 
     Parameters
     ----------
@@ -211,6 +214,7 @@ def spectrum(shots: Shots, i: int, segment: int, *, level: float = 0.0) -> tuple
     bins : (m,) int ndarray
     magnitude : (m,) ndarray
     """
+    shots = replace(shots, leak_amplitude=None)
     (runs,) = runs_of(shots, points=np.array([i]), least=np.array([level]), leakage=False)
     low = int(runs.low[segment, 0])
     magnitude = runs.run(segment, 0).copy()

@@ -1,4 +1,4 @@
-"""Files of a scene: what is wrong with one, what tells it from others, tables of waypoints."""
+"""Files of a scene: what is wrong with one, what tells it from others, CSV tables."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import csv
 import hashlib
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import unquote
@@ -79,7 +79,7 @@ COLUMNS = {
 _POSITION = ("time", "x", "y", "z")
 _QUATERNION = ("qw", "qx", "qy", "qz")
 _ANGLES = ("heading", "pitch", "roll")
-_HEADING = re.compile(r"\s*([A-Za-z]+)\s*(?:[\[(]([^\])]*)[\])])?\s*")
+_HEADING = re.compile(r"\s*([A-Za-z_]+)\s*(?:[\[(]([^\])]*)[\])])?\s*")
 _EXAMPLE = "time [s], x [m], y [m], z [m], heading [deg], pitch [deg], roll [deg]"
 
 
@@ -101,20 +101,57 @@ def read_waypoints(path: str | Path) -> Table:
     up), of which those left out are 0. Lines that begin with # are passed over. SceneError for
     a file that is missing or no such table.
     """
+    table = read_columns(path, COLUMNS, _POSITION, _EXAMPLE)
+    position = np.column_stack([table[name] for name in "xyz"])
+    return Table(table["time"], position, _attitude(Path(path), table))
+
+
+def read_columns(
+    path: str | Path, columns: Mapping[str, str], required: Collection[str], example: str
+) -> dict[str, np.ndarray]:
+    """Columns of a CSV table in SI, by name, (n,) each; the times rise.
+
+    The first row names the columns and their units: ``time [us]``. Lines that begin with # are
+    passed over.
+
+    Parameters
+    ----------
+    columns : mapping
+        SI unit of each column that there may be, ``time`` among them; empty for a pure number.
+    required : collection of str
+        Columns that must be there.
+    example : str
+        A good header.
+
+    Raises
+    ------
+    SceneError
+        For a file that is missing or no such table; names the line and what to write.
+    """
     path = existing(path)
     lines = _lines(path)
     if len(lines) < 3:
-        remedy = f"write a header ({_EXAMPLE}) and a line for each"
-        raise SceneError(path, "holds fewer than two waypoints", remedy)
-    factors = _header(path, lines[0][1])
+        remedy = f"write a header ({example}) and a line for each"
+        raise SceneError(path, "holds fewer than two lines of numbers", remedy)
+    factors: dict[str, float] = {}
+    for cell in lines[0][1]:
+        match = _HEADING.fullmatch(cell)
+        name = match[1].lower() if match else ""
+        if match is None or name not in columns:
+            raise SceneError(path, f"has an unknown column '{cell.strip()}'", f"use {example}")
+        if name in factors:
+            raise SceneError(path, f"has two columns '{name}'", "leave one out")
+        factors[name] = _factor(path, name, columns[name], (match[2] or "").strip())
+    missing = [name for name in required if name not in factors]
+    if missing:
+        raise SceneError(path, f"has no column '{missing[0]}'", f"add it: {example}")
     rows = np.array([_row(path, number, cells, len(factors)) for number, cells in lines[1:]])
     table = {name: rows[:, i] * factor for i, (name, factor) in enumerate(factors.items())}
     falls = np.flatnonzero(np.diff(table["time"]) <= 0)
     if len(falls):
         line = lines[falls[0] + 2][0]
         raise SceneError(path, f"line {line}: the time does not rise", "sort the lines by time")
-    position = np.column_stack([table[name] for name in "xyz"])
-    return Table(table["time"], position, _attitude(path, table))
+    return table
 
 
 def _lines(path: Path) -> list[tuple[int, list[str]]]:
@@ -131,26 +168,8 @@ def _lines(path: Path) -> list[tuple[int, list[str]]]:
     ]
 
 
-def _header(path: Path, cells: list[str]) -> dict[str, float]:
-    """Columns in their order, with the factor that makes each SI."""
-    factors: dict[str, float] = {}
-    for cell in cells:
-        match = _HEADING.fullmatch(cell)
-        name = match[1].lower() if match else ""
-        if match is None or name not in COLUMNS:
-            raise SceneError(path, f"has an unknown column '{cell.strip()}'", f"use {_EXAMPLE}")
-        if name in factors:
-            raise SceneError(path, f"has two columns '{name}'", "leave one out")
-        factors[name] = _factor(path, name, (match[2] or "").strip())
-    missing = [name for name in _POSITION if name not in factors]
-    if missing:
-        raise SceneError(path, f"has no column '{missing[0]}'", f"add it: {_EXAMPLE}")
-    return factors
-
-
-def _factor(path: Path, name: str, unit: str) -> float:
+def _factor(path: Path, name: str, si: str, unit: str) -> float:
     """Factor that makes a column SI."""
-    si = COLUMNS[name]
     if not si:
         if unit not in ("", "1"):
             raise SceneError(path, f"gives '{name}' a unit", "quaternions have none")

@@ -15,7 +15,7 @@ import numpy as np
 from sweep.spec.fields import parameter_rules, parameter_suggestion, short_name
 from sweep.spec.generators import MOST_VALUES, Progression, Values, read_pieces, read_single
 from sweep.spec.mistakes import Finding, Findings, Location, rejected
-from sweep.spec.rules import Rule
+from sweep.spec.rules import Rule, SweepError
 
 RESERVED = ("batch", "draw", "point", "spec")
 """Names of dimensions that a store may have besides its axes."""
@@ -147,6 +147,8 @@ def _rule_at(path: str, location: Location) -> Rule:
     rule = parameter_rules().get(path)
     if rule is None:
         raise rejected(location, "is no parameter", parameter_suggestion(path))
+    if isinstance(rule, SweepError):
+        raise rejected(location, "is one table for a whole study", "put it into the instrument")
     return rule
 
 

@@ -19,10 +19,12 @@ import numpy as np
 from sweep.model import beam, looks
 from sweep.model.constants import ELEMENTARY_CHARGE, PLANCK, SPEED_OF_LIGHT
 from sweep.model.detectors import FIXED
-from sweep.model.effects import iq_imbalance
+from sweep.model.effects import circulator_leak, iq_imbalance
 from sweep.model.effects.catalogue import EFFECTS
 from sweep.model.effects.effect import Effect, Parameter
 from sweep.model.effects.noise_sources import SUN_RADIUS
+from sweep.model.effects.phase_errors import ERROR_TABLE, NO_TABLE
+from sweep.model.effects.sweep_table import sweep_table
 from sweep.model.estimators import DEFAULTS, DETECTOR, ESTIMATOR
 from sweep.model.preparation import RECORD
 from sweep.spec.axes import Axis, place_on_grid
@@ -182,6 +184,7 @@ def grid_findings(grid: Grid) -> list[Finding]:
     return [
         *(list(_time_findings(grid)) or _window_findings(grid)),
         *_photon_findings(grid),
+        *_table_findings(grid),
         *_beam_findings(grid),
         *_nesting_findings(grid),
         *_need_findings(grid),
@@ -259,6 +262,17 @@ def _photon_findings(grid: Grid) -> Iterator[Finding]:
             f"grid, and does so by {-spare:.3g} A/W at its worst"
         )
         yield grid.finding(RESPONSIVITY, rule, "lower it; the gain of an avalanche is 'apd_gain'")
+
+
+def _table_findings(grid: Grid) -> Iterator[Finding]:
+    """Report a table of the sweep's error that does not cover the chirp."""
+    text = grid.values.get(ERROR_TABLE, NO_TABLE)
+    if text == NO_TABLE or not grid.knows(DURATION):
+        return
+    table, longest = sweep_table(text), float(grid.span(DURATION).max())
+    if table.first > 1e-9 * longest or table.last < (1 - 1e-9) * longest:
+        rule = f"must cover the chirp, 0 to {longest:g} s: it has {table.first:g} to {table.last:g}"
+        yield grid.finding(ERROR_TABLE, f"{rule} s", "add the rows that it lacks")
 
 
 # Beams
@@ -389,8 +403,11 @@ def _looks_findings(grid: Grid) -> Iterator[Finding]:
         yield grid.finding(DETECTOR + "kind", rule, remedy)
 
 
-def _noise_of_looks(grid: Grid, method: str) -> Iterator[Finding]:
-    """Noise added to the bins of several records."""
+def _drawn_noise(grid: Grid, method: str) -> Iterator[Finding]:
+    """Noise drawn where a line of leaked light stands, or in the bins of several records."""
+    if method != "probabilities" and grid.has_point({circulator_leak.PATH: _given}):
+        rule = "draws noise, and instrument.telescope.leak_path has a line that is not drawn"
+        yield Finding(("draws", "method"), rule, "take draws.method: probabilities", method)
     if method == "noise" and grid.has_point(
         {looks.NUMBER: _several, looks.COMBINE: _is_not(looks.COHERENT)}
     ):
@@ -434,45 +451,40 @@ NEEDS = (
     ),
     *(
         Need(
-            path,
-            _is_not(default),
-            RECORD,
-            _is("real"),
-            "is one of I and Q, and the record is real",
-            "set instrument.receiver.record: complex",
+            path, _is_not(default), RECORD, _is("real"),
+            "is one of I and Q, and the record is real", "set instrument.receiver.record: complex",
         )
         for path, default in ((iq_imbalance.GAIN, 1.0), (iq_imbalance.PHASE, 0.0))
     ),
     _above_zero("instrument.processing.bits", _given, FULL_SCALE),
-    _above_zero(
-        "atmosphere.profile", lambda profile: np.isin(profile, ("exponential", "layer")), EXTINCTION
+    Need(
+        circulator_leak.PATH, _given, circulator_leak.ISOLATION, lambda ratio: ratio >= 1e30,
+        "is that of light which leaks, and none does at an isolation of 300 dB",
+        "set instrument.telescope.isolation",
     ),
     Need(
-        "target.roughness",
-        _given,
-        beam.ARCHITECTURE,
-        _is("direct"),
+        circulator_leak.PATH, _given, looks.NUMBER, _several,
+        "is that of a line which is known in one record of each segment alone",
+        "take instrument.looks.number: 1",
+    ),
+    _above_zero("atmosphere.profile", lambda p: np.isin(p, ("exponential", "layer")), EXTINCTION),
+    Need(
+        "target.roughness", _given, beam.ARCHITECTURE, _is("direct"),
         "makes speckle, of which direct detection averages over an unknown number",
-        "take a coherent receiver",
-        if_on=True,
+        "take a coherent receiver", if_on=True,
     ),
     Need(
-        "target.roughness",
-        _given,
-        "footprint.speckle",
-        _is("developed"),
+        "target.roughness", _given, "footprint.speckle", _is("developed"),
         "says how rough the target is, which developed speckle takes to be without limit",
         "set footprint.speckle: none",
     ),
     Need(
-        "target.sun_distance",
-        lambda distance: (distance > 0) & (distance < SUN_RADIUS),
-        beam.WAVELENGTH,
-        _given,
+        "target.sun_distance", lambda distance: (distance > 0) & (distance < SUN_RADIUS),
+        beam.WAVELENGTH, _given,
         f"must be 0, for no sun, or at least the sun's radius, {SUN_RADIUS:g} m",
         "set it to 1 au or so",
     ),
-)
+)  # fmt: skip
 
 
 def _nesting_findings(grid: Grid) -> Iterator[Finding]:
@@ -563,7 +575,7 @@ def is_method(path: str) -> bool:
 
 def spectra_findings(draws: Draws | SceneDraws, grid: Grid) -> Iterator[Finding]:
     """Methods without spectra to look at, spectra without draws, CFAR windows that do not fit."""
-    yield from _noise_of_looks(grid, draws.method)
+    yield from _drawn_noise(grid, draws.method)
     if not draws.whole_spectra:
         remedy = f"set draws: {{method: {SPECTRA}, number: 1000}}, or leave it out"
         rule = f"looks at whole spectra, which draws.method {draws.method!r} does not draw"

@@ -23,6 +23,8 @@ from sweep.spec.scene import ErrorFloor, Navigation, Scene, SceneDraws, SceneSto
 LISTED_VALUES = 64
 MOST_TOLD = 8
 """Values of an axis that are told one by one."""
+LONGEST_TOLD = 200
+"""Characters of a word that are told."""
 ROOTS: Models = (
     Scene, Platform, ErrorFloor, Navigation, SceneDraws, SceneStorage, *models_at(AnyScanner)
 )  # fmt: skip
@@ -156,7 +158,7 @@ def _told(path: str, value: Any) -> str:
     if value is None:
         return "(none)"
     if isinstance(value, str):
-        return value
+        return value if len(value) <= LONGEST_TOLD else f"{value[:LONGEST_TOLD]} ..."
     if path in ("axes", "objects"):
         return ", ".join(value) or "(none)"
     if isinstance(value, list):

@@ -16,7 +16,7 @@ from sweep.model.effects.catalogue import EFFECTS, PARAMETERS
 from sweep.model.effects.effect import MODES, Parameter
 from sweep.scenes.files import SceneError, file_digest
 from sweep.spec.mistakes import Location
-from sweep.spec.rules import Choice, File, Mode, Numeric, Rule, Text
+from sweep.spec.rules import Choice, File, Mode, Numeric, Rule, SweepError, Text
 
 AUTO, ON, OFF = MODES
 Models = tuple[type[BaseModel], ...]
@@ -39,7 +39,7 @@ def with_parameters(path: str) -> Callable[[type[Section]], type[Section]]:
     """Return a decorator that adds effects' parameters to the section at a dotted path."""
     fields = {
         parameter.path.removeprefix(f"{path}."): (
-            Annotated[str if parameter.options else float, _rule_of(parameter)],
+            Annotated[str if parameter.options or parameter.table else float, _rule_of(parameter)],
             parameter.default,
         )
         for parameter in PARAMETERS
@@ -55,6 +55,8 @@ def with_modes(section: type[Section]) -> type[Section]:
 
 
 def _rule_of(parameter: Parameter) -> Rule:
+    if parameter.table:
+        return SweepError(about=parameter.about)
     if parameter.options:
         return Choice(about=parameter.about, options=parameter.options)
     return Numeric(

@@ -16,7 +16,9 @@ from typing import Any
 import yaml
 from pydantic import BaseModel, ValidationError
 
+from sweep.model.effects.phase_errors import ERROR_TABLE, NO_TABLE
 from sweep.model.threshold import PROCESSING, WAYS
+from sweep.scenes.files import SceneError, read_columns
 from sweep.spec.fields import parameter_rules
 from sweep.spec.figures import Figure, SceneFigure
 from sweep.spec.mistakes import (
@@ -234,6 +236,7 @@ def resolve_instrument(document: Document, base: Path) -> bool:
     reference, location = written, _INSTRUMENT
     overrides: dict[str, Any] = {}
     if isinstance(written, dict):
+        _read_error_table(document, written, base)
         key = next((key for key in ("like", "file") if key in written), "")
         if not key:
             return True
@@ -247,6 +250,7 @@ def resolve_instrument(document: Document, base: Path) -> bool:
         document.findings += error.findings
         return False
     own = read.value["instrument"] if inside else read.value
+    _read_error_table(document, own, Path(read.file).parent)
     document.value["instrument"] = merged(_without_threshold(own, overrides), overrides)
     kept = {place: at for place, at in document.places.items() if _is_leaf(document.value, place)}
     within = {place: at for place, at in read.places.items() if len(place) > inside}
@@ -258,6 +262,26 @@ def resolve_instrument(document: Document, base: Path) -> bool:
         Finding(("instrument", *f.location), f.rule, f.suggestion, f.written) for f in read.findings
     ]
     return True
+
+
+def _read_error_table(document: Document, instrument: dict[str, Any], base: Path) -> None:
+    """Put the rows of a CSV file of the sweep's error in the place of its path."""
+    chirp, (*_, name) = instrument.get("chirp"), ERROR_TABLE.split(".")
+    if not isinstance(chirp, dict) or not isinstance(chirp.get(name), str):
+        return
+    if (written := chirp[name]) == NO_TABLE:
+        return
+    columns, example = {"time": "s", "error": "Hz"}, "time [us], error [kHz]"
+    try:
+        table = read_columns(base / os.path.expanduser(written), columns, columns, example)
+    except SceneError as error:
+        rule = f"names a file that {error.rule}"
+        location = tuple(ERROR_TABLE.split("."))
+        document.findings.append(Finding(location, rule, error.remedy, written))
+        chirp[name] = NO_TABLE
+        return
+    rows = zip(table["time"].tolist(), table["error"].tolist(), strict=True)
+    chirp[name] = [[f"{time!r} s", f"{error!r} Hz"] for time, error in rows]
 
 
 def _instrument_of(reference: object, location: Location, base: Path) -> tuple[int, Document]:
@@ -369,7 +393,7 @@ def _finding(detail: dict[str, Any], root: type[BaseModel]) -> Finding:
     location = place.location
     if kind == BROKEN_RULE:
         context, path = detail["ctx"], dotted(location)
-        if isinstance(written, list) and path in parameter_rules():
+        if isinstance(written, list) and path in parameter_rules() and path != ERROR_TABLE:
             remedy = f"put several under axes: '{path}: [...]'"
             return Finding(location, "takes one value", remedy, written)
         shown = ABSENT if isinstance(written, dict) else written

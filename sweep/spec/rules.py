@@ -22,6 +22,8 @@ import numpy as np
 from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
+from sweep.model.effects.phase_errors import NO_TABLE
+from sweep.model.effects.sweep_table import sweep_table
 from sweep.model.window import ALIASES, COSINE_SUMS
 from sweep.scenes.files import file_digest
 from sweep.spec.mistakes import near_miss
@@ -445,6 +447,60 @@ def _read_element(rule: Rule, index: int, written: object) -> Any:
         value = written if isinstance(written, str | int | float) else type(written).__name__
         told = f"holds {value!r:.60} as value {index}, which {error.rule}"
         raise QuantityError(told, error.suggestion or f"write e.g. {rule.example}") from None
+
+
+_TIME = Numeric(
+    about="Time in the up-chirp", si_unit="s", example="10 us", at_least="-1e6 s", at_most="1e6 s"
+)
+_FREQUENCY_ERROR = Numeric(
+    about="Frequency error", si_unit="Hz", example="2 kHz", at_least="-1e15 Hz", at_most="1e15 Hz"
+)
+MOST_ROWS = 4096
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepError(Rule):
+    """A table of the sweep's frequency error over time; text inside, a row after the other."""
+
+    def read(self, written: object) -> str:
+        """Rows ``time error`` in SI, separated by commas; or none."""
+        if written == NO_TABLE:
+            return NO_TABLE
+        remedy = "write e.g. [[0 us, 0 Hz], [10 us, 2 kHz], [20 us, 1 kHz]], or a CSV file's path"
+        if not isinstance(written, list | tuple) or not 3 <= len(written) <= MOST_ROWS:
+            raise QuantityError(
+                f"must be a list of 3 to {MOST_ROWS} rows, a time and an error", remedy
+            )
+        rows = []
+        for i, row in enumerate(written):
+            if not isinstance(row, list | tuple) or len(row) != 2:
+                raise QuantityError(f"has a row {i} that is no time with its error", remedy)
+            rules = zip((_TIME, _FREQUENCY_ERROR), row, strict=True)
+            rows.append([_read_element(rule, i, value) for rule, value in rules])
+        if any(b[0] <= a[0] for a, b in pairwise(rows)):
+            raise QuantityError("has times that do not rise", "sort the rows by time")
+        text = ", ".join(f"{time!r} {error!r}" for time, error in rows)
+        try:
+            sweep_table(text)
+        except ValueError as error:
+            raise QuantityError(str(error), "smooth it, or give more rows") from None
+        return text
+
+    def written(self, value: Any) -> Any:
+        """Rows that read back as exactly `value`."""
+        if value == NO_TABLE:
+            return value
+        rules = (_TIME, _FREQUENCY_ERROR)
+        return [
+            [rule.written(float(number)) for rule, number in zip(rules, row.split(), strict=True)]
+            for row in value.split(",")
+        ]
+
+    def schema(self) -> Json:
+        """JSON Schema: rows, or text."""
+        pair = {"minItems": 2, "maxItems": 2, "items": {"type": "string"}}
+        rows = {"type": "array", "minItems": 3, "items": {"type": "array"} | pair}
+        return {"description": self.about, "anyOf": [rows, {"type": "string"}]}
 
 
 _FROM_NADIR = Numeric(

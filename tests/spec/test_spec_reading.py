@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 import yaml
 from hypothesis import given, settings
@@ -201,3 +202,47 @@ def test_an_endless_integer_of_pythons_is_refused_in_words():
 
     with pytest.raises(SpecError, match="seed: is a number of too many digits"):
         Spec.from_mapping({"seed": 10**5000})
+
+
+TABLE = "instrument.chirp.error_table"
+
+
+def test_a_table_of_the_chirps_error_is_the_same_in_a_spec_and_in_a_file_beside_it(tmp_path):
+    rows = [[f"{10 * k} us", f"{k * (50 - k)} Hz"] for k in range(51)]
+    inline = Spec.from_mapping(written({TABLE: rows}))
+    lines = [f"{10 * k},{k * (50 - k) / 1000!r}" for k in range(51)]
+    (tmp_path / "error.csv").write_text("\n".join(["# measured", "time [us], error [kHz]", *lines]))
+    named = load(write(tmp_path / "study.yaml", written({TABLE: "error.csv"})))
+    instrument = written({TABLE: "error.csv"})["instrument"]
+    write(tmp_path / "lidar.yaml", instrument)
+    (tmp_path / "below").mkdir()
+    beside = written() | {"instrument": "../lidar.yaml"}
+    kept = load(write(tmp_path / "below" / "study.yaml", beside))
+    values = [np.array([row.split() for row in s.parameters()[TABLE].split(",")], float)
+              for s in (inline, named, kept)]  # fmt: skip
+    np.testing.assert_allclose(values[1], values[0], rtol=1e-14, atol=1e-18)
+    assert named.id == kept.id != Spec.from_mapping(written()).id
+    again = Spec.from_stored(named.to_json())
+    assert again == named and again.id == named.id
+    assert Spec.from_mapping(written({TABLE: "none"})).id == Spec.from_mapping(written()).id
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        ([[f"{10 * k} us", f"{(-1) ** k} Hz"] for k in range(51)], "is not smooth"),
+        ([[f"{9 * k} us", f"{k} Hz"] for k in range(51)], "must cover the chirp"),
+        ([["0 us", "0 Hz"], ["0 us", "1 Hz"], ["1 ms", "2 Hz"]], "do not rise"),
+        ([["0 us", "0 Hz"], ["1 us"], ["1 ms", "2 Hz"]], "row 1"),
+        ([["0 us", "0 Hz"], ["1 us", "1 m"], ["1 ms", "2 Hz"]], "1 m"),
+        ("nowhere.csv", "does not exist"),
+    ],
+)
+def test_a_table_that_cannot_stand_for_the_chirp_is_refused_in_words(rows, words):
+    with pytest.raises(SpecError, match=words):
+        Spec.from_mapping(written({TABLE: rows}))
+
+
+def test_a_table_is_no_axis():
+    with pytest.raises(SpecError, match="one table for a whole study"):
+        Spec.from_mapping(written(axes={TABLE: ["none"]}))

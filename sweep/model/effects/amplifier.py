@@ -146,7 +146,7 @@ SPONTANEOUS_EMISSION = Effect(
         Parameter(
             path=_ISOLATION,
             about="Isolation of the detector from the light sent, by circulator and window; the "
-            "amplifier's emission passes it",
+            "amplifier's emission passes it, and with leak_path the light itself",
             default=1e30,
             example="50 dB",
             limits=("0 dB", "300 dB"),

@@ -8,6 +8,7 @@ from sweep.model import beam, looks, waveform
 from sweep.model.effects import (
     amplifier,
     atmosphere,
+    circulator_leak,
     doppler,
     footprint,
     iq_imbalance,
@@ -40,6 +41,7 @@ EFFECTS: tuple[Effect, ...] = (
     atmosphere.BACKSCATTER,
     noise_sources.RELATIVE_INTENSITY_NOISE,
     amplifier.SPONTANEOUS_EMISSION,
+    circulator_leak.CIRCULATOR_LEAK,
     noise_sources.QUANTISATION,
     phase_errors.RANGE_WALK,
     phase_errors.ACCELERATION,

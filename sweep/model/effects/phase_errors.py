@@ -30,6 +30,9 @@ over time, the beat (delayed wave less local oscillator) gains exactly
     psi(t) = E(t - tau(t)) - E(t),    tau(t) = tau_0 - beta t
 
 about -tau e(t): nothing at no range, and the more the farther. The Doppler segment has no sweep.
+An error that was measured comes as a table, of frequency errors by the time in the up-chirp. It is
+fitted once by a Chebyshev series (:mod:`sweep.model.effects.sweep_table`), whose integral over the
+delay is exact.
 
 Sizes: with w real and even about the record's middle, a phase error phi = o(x) + e(x), odd and even
 part (a constant does not matter), changes a line's spectrum W(y), real but for the factor
@@ -58,6 +61,7 @@ import numpy as np
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.effect import Effect, Parameter, Scene, Size, Sized
 from sweep.model.effects.points import NO_SMEAR, Points, Smear
+from sweep.model.effects.sweep_table import SweepTable, sweep_table
 from sweep.model.looks import coherent_gain
 from sweep.model.preparation import CHIRP, PhaseError, Shots
 from sweep.model.window import Window, samples
@@ -365,6 +369,38 @@ ACCELERATION = Effect(
 _SHAPES = ("quadratic", "cubic", "sinusoidal")
 _PEAKS = tuple(f"{CHIRP}{shape}_error" for shape in _SHAPES)
 _PERIODS = CHIRP + "error_periods"
+ERROR_TABLE, NO_TABLE = CHIRP + "error_table", "none"
+
+
+def table_phase(
+    x: np.ndarray,
+    *,
+    table: SweepTable,
+    sign: int,
+    chirp_duration: np.ndarray,
+    range: np.ndarray,
+    radial_velocity: np.ndarray,
+    start: np.ndarray,
+    duration: np.ndarray,
+) -> np.ndarray:
+    """Phase [cycles] that a measured error of the sweep adds to the beat, (n, m).
+
+    Before its first row and after its last the table's error stays what it is there.
+
+    Parameters
+    ----------
+    table : SweepTable
+        The error; the down-chirp runs through it backwards.
+    x, sign, chirp_duration, range, radial_velocity, start, duration
+        As of :func:`sweep_phase`.
+    """
+    if sign == 0:
+        return np.zeros((np.size(range), np.size(x)))
+    t = record_times(x, start=start, duration=duration)
+    beta = _column(2 * np.asarray(radial_velocity) / SPEED_OF_LIGHT)
+    delay = _column(2 * np.asarray(range) / SPEED_OF_LIGHT) - beta * t
+    at = t if sign > 0 else _column(chirp_duration) - t  # in the up-chirp
+    return -sign * table.integral(at - sign * delay, at)
 
 
 def sweep_phase(
@@ -413,10 +449,12 @@ def sweep_phase(
 def sweep_smear(points: Points) -> Smear | None:
     """Return the phase that the sweep's error adds over the record; None where there is none.
 
-    Square and cube are polynomials in the place in the record; the sine is taken at its largest.
+    Square and cube are polynomials in the place in the record; the sine and what a table departs
+    from the middle of its span are taken at their largest.
     """
+    text = points.word(ERROR_TABLE)
     if not points.has(*_PEAKS):
-        return None
+        return None if text == NO_TABLE else _table_smear(points, sweep_table(text))
     quadratic, cubic, sinusoidal = (points[path] for path in _PEAKS)
     half, signs = 0.5 * points.record_duration, points.signs
     middle, per_length = points.start + half, 2 / points[CHIRP + "duration"]
@@ -437,7 +475,23 @@ def sweep_smear(points: Points) -> Smear | None:
     constant, *powers = (chirped * np.abs(part) for part in _product(delay, mean))
     rest = chirped * (np.abs(delay[0]) + np.abs(delay[1])) * np.abs(sinusoidal)
     turns = 2 * np.pi * points[_PERIODS] * per_length * half
-    return Smear(tuple(powers), rest, constant, rest * turns)
+    smear = Smear(tuple(powers), rest, constant, rest * turns)
+    return smear if text == NO_TABLE else smear.plus(_table_smear(points, sweep_table(text)))
+
+
+def _table_smear(points: Points, table: SweepTable) -> Smear:
+    """Phase of a table's error e, about -tau e, by the middle of its span, the rest and e'."""
+    place = np.cos(np.linspace(0, np.pi, 16 * table.series.size + 1))
+    error, slope = table.error(place), np.polynomial.chebyshev.chebder(table.series)
+    middle, swing = (error.max() + error.min()) / 2, np.ptp(error) / 2
+    steep = np.abs(np.polynomial.chebyshev.chebval(place, slope)).max()
+    steep = steep * 2 / (table.last - table.first)
+    length, walk, chirped = points.record_duration, np.abs(points.beta), np.abs(points.signs)
+    delay = points.delay + walk * (points.start + length)
+    linear = 0.5 * walk * length * abs(middle)
+    reach = (delay * steep + walk * swing) * length
+    powers = (chirped * linear, 0.0, 0.0, 0.0)
+    return Smear(powers, chirped * delay * swing, chirped * delay * abs(middle), chirped * reach)
 
 
 def _product(one: Sequence[Sized], other: Sequence[Sized]) -> list[Sized]:
@@ -451,12 +505,13 @@ def _product(one: Sequence[Sized], other: Sequence[Sized]) -> list[Sized]:
 
 def bend_sweep(shots: Shots, scene: Scene) -> Shots:
     """Add the sweep's error to the record of the two chirps."""
-    p = scene.parameters
+    p, own = scene.parameters, {"chirp_duration": shots.duration, **shots.motion}
+    if (text := str(p[ERROR_TABLE])) != NO_TABLE:
+        shots = _with_phase(shots, partial(table_phase, table=sweep_table(text)), **own)
     return _with_phase(
         shots,
         sweep_phase,
-        chirp_duration=shots.duration,
-        **shots.motion,
+        **own,
         **{shape: p[path] for shape, path in zip(_SHAPES, _PEAKS, strict=True)},
         periods=p[_PERIODS],
     )
@@ -485,6 +540,17 @@ CHIRP_NONLINEARITY = Effect(
             default=1.0,
             example="5",
             limits=("1e-6", "1000"),
+        ),
+        Parameter(
+            path=ERROR_TABLE,
+            about="Measured frequency error of the sweep over the up-chirp, which the down-chirp "
+            "runs through backwards: a list of times and errors, [[0 us, 0 Hz], [10 us, 2 kHz], "
+            "...], or a CSV file with the columns 'time [us], error [kHz]'; none for no table. It "
+            "must cover the chirp from 0 to duration, and be smooth: a Chebyshev series of degree "
+            "64 at the most stands for it, to 1e-3 of its span. Echoes that arrive after the "
+            "record begins (acquisition_delay) see its ends held, and take longer to compute",
+            default=NO_TABLE,
+            table=True,
         ),
     ),
 )

@@ -39,7 +39,9 @@ Look = Callable[[Shots], np.ndarray]
 
 SEGMENTS = ("up", "doppler", "down")
 
-NOT_IN_TRUTH = frozenset({"acceleration", "chirp_nonlinearity", "line_width", "leakage"})
+NOT_IN_TRUTH = frozenset({
+    "acceleration", "chirp_nonlinearity", "circulator_leak", "line_width", "leakage"
+})  # fmt: skip
 """Effects that the time-domain records know nothing of."""
 
 AFTER_THE_LINES = frozenset({"record", "detection", "draws"})

@@ -1,9 +1,12 @@
-"""Chirp nonlinearity: its phase against the sweep integrated."""
+"""Chirp nonlinearity: its phase against the sweep integrated, and tables against whole records."""
 
 import numpy as np
 import pytest
+from effect_points import points_of, shots_of
 
 from sweep.model.effects import phase_errors
+from sweep.model.effects.sweep_table import sweep_table
+from sweep.model.segments import spectrum
 
 LIGHT = 299792458.0
 CHIRP, START, RECORD = 500e-6, 3e-5, 300e-6
@@ -54,3 +57,92 @@ def test_no_delay_no_sweep_no_error():
     none = phase_errors.sweep_phase(x, **error_of(1, **some, range=np.array([0.0])))
     assert not none.any()
     assert not phase_errors.sweep_phase(x, **error_of(0, **some)).any()
+
+
+def table_of(error, *, first=0.0, last=CHIRP, rows=401):
+    """Text of a table of an error [Hz] by the time in the up-chirp."""
+    times = np.linspace(first, last, rows)
+    return ", ".join(f"{t!r} {e!r}" for t, e in zip(times.tolist(), error(times), strict=True))
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+@pytest.mark.parametrize(("range_", "velocity"), [(1.0, 0.0), (4000.0, 3000.0), (50.0, -200.0)])
+def test_a_quadratic_error_in_a_table_is_the_quadratic_law(sign, range_, velocity):
+    text = table_of(lambda t: frequency_error(2 * t / CHIRP - 1, quadratic=2e5, cubic=0,
+                                              sinusoidal=0, periods=1).tolist())  # fmt: skip
+    place = {"range": np.array([range_]), "radial_velocity": np.array([velocity])}
+    scene = error_of(sign, quadratic=2e5, **place)
+    x, names = np.linspace(-1, 1, 9), ("sign", "chirp_duration", "start", "duration")
+    table = sweep_table(text)
+    assert table.series.size == 3
+    found = phase_errors.table_phase(x, table=table, **place, **{n: scene[n] for n in names})
+    expected = phase_errors.sweep_phase(x, **scene)
+    np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-13)
+
+
+def test_a_table_is_held_beyond_its_ends():
+    table = sweep_table("0.0 -1.0, 1.0 0.0, 2.0 1.0")
+    # From -1 to 3: -1 a second long, 0 over the table, 1 a second long; from 1.5 to 3.5 by hand.
+    np.testing.assert_allclose(table.integral(np.array([-1.0]), np.array([3.0])), 0, atol=1e-15)
+    np.testing.assert_allclose(table.integral(np.array([1.5]), np.array([3.5])), 0.375 + 1.5)
+    np.testing.assert_allclose(table.integral(np.array([-3.0]), np.array([-1.0])), -2.0)
+
+
+RIPPLE, CYCLES = 2e4, 6.3
+"""Peak [Hz] of an error, and its periods over the chirp."""
+
+
+@pytest.mark.parametrize("delayed", [20e-6, 0.0])
+def test_a_ripple_in_a_table_is_that_of_the_whole_record(table_4_1, delayed):
+    turn, range_ = 2 * np.pi * CYCLES / CHIRP, 2500.0
+    text = table_of(lambda t: (RIPPLE * np.sin(turn * t + 0.3)).tolist())
+    p = table_4_1(range=range_, acquisition_delay=delayed, fft_size=2**17, window="hann")
+    p = p | {phase_errors.ERROR_TABLE: text}
+    shots = shots_of(p, ("chirp_nonlinearity",))
+    delay, rate, length = 2 * range_ / LIGHT, 6e8, shots.window.length
+    t = delayed + np.arange(length) / rate
+
+    def emitted(at):  # integral of the error, held before the chirp begins
+        inside = -RIPPLE / turn * (np.cos(turn * np.maximum(at, 0) + 0.3) - np.cos(0.3))
+        return inside + np.minimum(at, 0) * RIPPLE * np.sin(0.3)
+
+    for segment, sign in ((0, 1), (2, -1)):
+        if sign > 0:
+            psi = emitted(t - delay) - emitted(t)
+        else:  # which runs through the sweep backwards, held beyond its other end
+            end = RIPPLE * np.sin(turn * CHIRP + 0.3)
+            later = CHIRP - t + delay
+            over = np.maximum(later - CHIRP, 0)
+            psi = emitted(CHIRP - t) - emitted(later - over) - over * end
+        beat = -sign * 1e9 / CHIRP * delay
+        record = np.hanning(length + 1)[:-1] * np.exp(2j * np.pi * (beat * t + psi))
+        expected = abs(np.fft.fft(record, 2**17))
+        plain = np.hanning(length + 1)[:-1] * np.exp(2j * np.pi * beat * t)
+        peak = int(np.argmax(abs(np.fft.fft(plain, 2**17))))
+        near = (peak + np.arange(-60, 61)) % 2**17
+        bins, magnitude = spectrum(shots, 0, segment)
+        mine = magnitude[np.searchsorted(bins, np.where(near > 2**16, 2**17 - near, near))]
+        scale = mine.max() / expected[near].max()
+        # The series leaves 1e-3 of the span 2 RIPPLE at the most, over the delay.
+        phase = 2 * np.pi * delay * 1e-3 * 2 * RIPPLE
+        assert expected[near].max() < 0.8 * abs(np.fft.fft(plain, 2**17)).max()  # it matters
+        bound = phase * abs(np.fft.fft(plain, 2**17)).max()
+        np.testing.assert_allclose(mine / scale, expected[near], atol=bound)
+
+
+def test_a_tables_size_covers_what_it_does_to_the_record(table_4_1):
+    text = table_of(lambda t: (2e3 + RIPPLE * np.sin(4e4 * t)).tolist())
+    p = table_4_1(range=np.array([100.0, 3000.0]), radial_velocity=30.0)
+    smear = phase_errors.sweep_smear(points_of(p | {phase_errors.ERROR_TABLE: text}))
+    x, t = np.linspace(-1, 1, 4001), 2**17 / 6e8
+    psi = phase_errors.table_phase(
+        x, table=sweep_table(text), sign=1, chirp_duration=CHIRP,
+        range=np.array([100.0, 3000.0]), radial_velocity=np.array([30.0, 30.0]), start=0.0,
+        duration=t,
+    )  # fmt: skip
+    most = (smear.constant + smear.rest + smear.powers[0])[0]
+    slope = 2 * np.abs(np.gradient(psi, x, axis=1)).max(axis=1)  # bins of fs/L
+    assert (np.abs(psi).max(axis=1) <= most).all()
+    assert (np.abs(psi).max(axis=1) > 0.8 * most).all()
+    assert (slope <= np.asarray(smear.bins)[0]).all()
+    assert (slope > 0.5 * np.asarray(smear.bins)[0]).all()

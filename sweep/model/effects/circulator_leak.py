@@ -1,0 +1,320 @@
+"""Light that leaks from the transmitter to the detector, by circulator, splice or window.
+
+A share 1 / I of the sent light P_tx (I the isolation) reaches the detector after a path d beyond
+the local oscillator's, at the delay tau = d / c. It is there in every record:
+
+- **A line.** It beats with the local oscillator as an echo does, with the photocurrent
+  i = 2 M Re sqrt(eta P_lo P_tx / I), at S tau in the chirps and at 0 in the Doppler segment. With
+  the window's transform W, and the receiver's transfer H
+
+      L_k = i H / 2 (e^{j phi} W(k - nu) + e^{-j phi} W(k + nu)),   nu = S tau N / fs
+
+  of a real record; a complex one has the first term alone, at -nu or nu by the chirp's sign. The
+  phase phi drifts with the path's temperature and is taken to be uniform.
+- **Shot noise** 2 q M^2 F Re P_tx / I B_e.
+- **Intensity noise**. A balanced receiver rejects that of the light, and sees that of the beat in
+  full: of variance RIN B_e ((M Re)^2 (2 P_lo P_l + P_l^2) / CMRR + i^2 / 2), P_l = P_tx / I.
+- **Phase noise** of a Lorentzian laser of width v. The beat carries theta(t) - theta(t - tau), of
+  density 4 v sin^2(pi f tau) / (pi f^2), 4 pi v tau^2 at all f << 1 / tau [Richter et al., IEEE J.
+  Quantum Electron. 22, 2070, 1986], which a line makes a noise of i^2 / 2 times that. It is taken
+  to be white within B_e, and no more than 2 pi v tau altogether.
+
+The processing knows the line, as it is always there: bins in which it comes to
+:data:`MASKED_FROM` of the threshold, at whatever phase, are **masked**. They raise no alarm, and an
+echo whose largest bin is among them is not detected. In other bins the line's skirts, as powers
+add, help an echo over the threshold. They help noise as well, which counts as leakage
+(`p_leakage_up`, `p_leakage_down`): the mean over the phase, in which all bins share. An echo that
+fades in developed speckle crosses with Q_1(L / s, Th / s), s^2 = sigma^2 + |X|^2 / 2.
+
+Left out: saturation of the ADC by the line; the line's own image of I and Q; and the echo's and the
+line's skirts raising one bin together. The spectrum of :func:`sweep.model.segments.spectrum` is
+that of the echo alone.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sweep.model import link
+from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.detection import found_pair
+from sweep.model.effects.effect import Effect, Parameter, Scene, Size, noisier
+from sweep.model.effects.points import Points
+from sweep.model.looks import Looks
+from sweep.model.marcum import marcum_q1
+from sweep.model.preparation import LASER, RECEIVER, TELESCOPE, Shots
+from sweep.model.window import Window, samples
+
+MASKED_FROM = 0.5
+"""Share of the threshold from which on a bin's line has it masked: less raises few alarms."""
+_PHASES = 16
+"""Phases of the line over which alarms are averaged."""
+
+PATH, ISOLATION = TELESCOPE + "leak_path", TELESCOPE + "isolation"
+
+
+def excess_density(
+    *,
+    leaked: ArrayLike,
+    beat: ArrayLike,
+    delay: ArrayLike,
+    electrical_bandwidth: ArrayLike,
+    relative_intensity_noise: ArrayLike,
+    common_mode_rejection: ArrayLike,
+    local_oscillator_power: ArrayLike,
+    line_width: ArrayLike,
+) -> np.ndarray:
+    """Relative variance of the leaked beat's noise within a bandwidth, of a gain M Re of 1.
+
+    Parameters
+    ----------
+    leaked, local_oscillator_power : array_like
+        Powers P_l and P_lo [W].
+    beat : array_like
+        Amplitude i of the beat over M Re [W].
+    delay, line_width : array_like
+        Delay tau [s]; width v of the Lorentzian line [Hz], 0 for none.
+    electrical_bandwidth : array_like
+        B_e [Hz].
+    relative_intensity_noise, common_mode_rejection : array_like
+        One-sided density [1/Hz]; ratio of powers.
+
+    Returns
+    -------
+    ndarray
+        Variance [W^2], to be multiplied by (M Re)^2.
+
+    Examples
+    --------
+    10 uW that leak over 1 m, of a laser of 100 kHz: as much as the shot noise of 0.9 W.
+
+    >>> laser = {"line_width": 1e5, "relative_intensity_noise": 0.0, "common_mode_rejection": 1.0}
+    >>> light = {"leaked": 1e-5, "local_oscillator_power": 1e-3, "beat": 2e-4}
+    >>> f"{excess_density(**light, **laser, delay=3.34e-9, electrical_bandwidth=1e8):.3g}"
+    '2.8e-11'
+    """
+    half, width = np.square(beat) / 2, np.asarray(line_width, float)
+    band, time = np.asarray(electrical_bandwidth, float), np.asarray(delay, float)
+    light, oscillator = np.asarray(leaked, float), np.asarray(local_oscillator_power, float)
+    common = (2 * oscillator + light) * light / np.asarray(common_mode_rejection, float)
+    intensity = np.asarray(relative_intensity_noise, float) * band * (common + half)
+    phase = 2 * np.pi * width * time * np.minimum(2 * time * band, 1.0)
+    return np.asarray(intensity + half * phase)
+
+
+def _leaked(p: Mapping[str, np.ndarray], architecture: str) -> tuple[np.ndarray, np.ndarray]:
+    """Leaked light [W], and amplitude of its beat's photocurrent [A]."""
+    power = np.asarray(p[LASER + "power"] / p[ISOLATION])
+    names = (
+        "local_oscillator_power", "mixing_efficiency", "apd_gain", "responsivity",
+        "modulation_index",
+    )  # fmt: skip
+    own = {name: p[RECEIVER + name] for name in names}
+    return power, np.asarray(link.beat_scale(architecture, echo_power_scale=power, **own))
+
+
+def _variance(p: Mapping[str, np.ndarray], architecture: str, shape: str) -> np.ndarray:
+    """Compute the current variance [A^2] of the beat's noise; direct detection has no beat."""
+    if architecture == "direct":
+        return np.zeros(())
+    power, current = _leaked(p, architecture)
+    scale = p[RECEIVER + "apd_gain"] * p[RECEIVER + "responsivity"]
+    width = p[LASER + "line_width"] if shape == "lorentzian" else 0.0
+    return scale**2 * excess_density(
+        leaked=power,
+        beat=current / scale,
+        delay=p[PATH] / SPEED_OF_LIGHT,
+        electrical_bandwidth=link.electrical_bandwidth(p, RECEIVER),
+        relative_intensity_noise=p[LASER + "relative_intensity_noise"],
+        common_mode_rejection=p[RECEIVER + "common_mode_rejection"],
+        local_oscillator_power=p[RECEIVER + "local_oscillator_power"],
+        line_width=width,
+    )
+
+
+def leak_size(points: Points) -> Size | None:
+    """Return the leak's noise, exactly; its line may hide any echo, and always counts."""
+    if not points.has(PATH):
+        return None
+    p, own = points.parameters, points.receiver
+    noise = _leaked(p, points.architecture)[0] * own.per_watt
+    shape = points.word(LASER + "line_shape")
+    noise = noise + _variance(p, points.architecture, shape) * own.per_ampere
+    return Size(noise=noise / points.noise_variance, chance=1.0)
+
+
+def add_leak(shots: Shots, scene: Scene) -> Shots:
+    """Add the leaked light's noise and its line."""
+    p = scene.parameters
+    power, current = _leaked(p, shots.architecture)
+    excess = _variance(p, shots.architecture, str(p[LASER + "line_shape"])) * shots.noise_scale
+    shots = noisier(shots, leak_shot=shots.shot_noise_scale * power, leak_excess=excess)
+    return replace(
+        shots,
+        leak_amplitude=current * p[RECEIVER + "transimpedance"],
+        leak_delay=p[PATH] / SPEED_OF_LIGHT,
+    )
+
+
+class Line(NamedTuple):
+    """A line of amplitude 2 in bins 0..N/2 of a real record, 0..N - 1 of a complex one."""
+
+    terms: np.ndarray
+    """(2, bins) complex: at its frequency, and at the negative one."""
+    most: np.ndarray
+    """Its largest magnitude at any phase."""
+    rms: np.ndarray
+    """Root mean square of its magnitude over the phase."""
+
+
+@lru_cache(maxsize=16)
+def _line(window: Window, fft_size: int, place: float, signed: bool) -> Line:
+    turns = place * np.arange(window.length) / fft_size
+    record = samples(window.name, window.length) * np.exp(2j * np.pi * (turns - np.rint(turns)))
+    spectrum = np.fft.fft(record, fft_size)
+    half = np.arange(fft_size // 2 + 1)
+    both = [spectrum, 0 * spectrum] if signed else [spectrum[half], spectrum[-half].conj()]
+    terms = np.array(both)
+    return Line(terms, np.abs(terms).sum(axis=0), np.hypot(*np.abs(terms)))
+
+
+def line_of(shots: Shots, i: int, segment: int) -> tuple[float, Line]:
+    """Return half of the amplitude [V] of point i's line in a segment, and that line."""
+    columns = (
+        shots.leak_amplitude, shots.leak_delay, shots.chirp_rate, shots.sample_rate,
+        shots.detector_bandwidth, shots.amplifier_bandwidth,
+    )  # fmt: skip
+    assert shots.leak_amplitude is not None
+    amplitude, delay, rate, sampled, detector, amplifier = (
+        float(np.broadcast_to(np.asarray(column), shots.size)[i]) for column in columns
+    )
+    beat = -shots.waveform[segment].sign * rate * delay
+    gain = link.transfer(
+        np.array(beat), detector_bandwidth=np.array(detector),
+        amplifier_bandwidth=np.array(amplifier), transimpedance=np.array(1.0),
+    )  # fmt: skip
+    scale = 0.5 * amplitude * abs(complex(gain)) * float(shots.whitening[segment][i])
+    place = beat * shots.fft_size / sampled
+    return scale, _line(shots.window, shots.fft_size, place, shots.complex_record)
+
+
+def alarm(looks: Looks, line: Line, bins: np.ndarray, *, scale: float, level: float) -> float:
+    """Probability that a line raises an alarm in some bins where noise alone does not.
+
+    Parameters
+    ----------
+    looks : Looks
+        How records are combined.
+    bins : (m,) int ndarray
+        Bins of the line that are looked at.
+    scale, level : float
+        Half of the line's amplitude, and the threshold, over the noise per quadrature.
+    """
+    one, other = scale * line.terms[:, bins]
+    phases = np.pi * (np.arange(_PHASES) + 0.5) / _PHASES  # its magnitude has this period
+    quiet = [
+        np.log1p(-np.minimum(looks.excess(np.abs(one * t + other * t.conjugate()), level), 1.0))
+        for t in np.exp(1j * phases)
+    ]
+    return float(-np.expm1(np.sum(quiet, axis=1)).mean())
+
+
+def raised(
+    own: np.ndarray, line: np.ndarray, *, deviation: float, level: float, fades: bool
+) -> np.ndarray:
+    """|X| of an echo's bins that cross as often as those with the line in them do, (m,).
+
+    Parameters
+    ----------
+    own, line : (m,) ndarray
+        |X| of the echo and root mean square |L| of the line [V].
+    deviation, level : float
+        Noise per quadrature and threshold [V].
+    fades : bool
+        Whether ``own`` is the root mean square of an echo that fades; the line never does.
+
+    Examples
+    --------
+    Without noise to speak of a steady echo and a line of 3 and 4 V come to 5 V.
+
+    >>> float(raised(np.array([3.0]), np.array([4.0]), deviation=1.0, level=9.0, fades=False)[0])
+    5.0
+    """
+    if not fades:
+        return np.hypot(own, line)
+    deep = np.sqrt(deviation**2 + own**2 / 2)
+    crosses, stays = marcum_q1(line / deep, level / deep)
+    with np.errstate(divide="ignore"):
+        power = level**2 / -np.where(stays < 0.5, np.log1p(-stays), np.log(crosses))
+    return np.where(line > 1e-6 * deviation, np.sqrt(np.maximum(power - 2 * deviation**2, 0)), own)
+
+
+def beside_leak(shots: Shots, runs: Any) -> Any:
+    """Put the line to :class:`sweep.model.segments.Runs`: it masks bins, and raises others."""
+    magnitudes = runs.magnitudes.copy()
+    pd, miss, exempted, leakage = (
+        v.copy() for v in (runs.pd, runs.miss, runs.exempted, runs.leakage)
+    )
+    deviation, under, level, floor = (
+        np.broadcast_to(v, shots.size)[runs.part]
+        for v in (shots.bin_deviation, shots.line_deviation, shots.threshold, shots.floor)
+    )
+    first, size, rule = shots.searched_from, shots.fft_size, shots.echo_rule
+    for s, i in np.argwhere(runs.bins > 0):
+        stretch = slice(runs.start[s, i], runs.start[s, i] + runs.bins[s, i])
+        at = runs.low[s, i] + np.arange(runs.bins[s, i])
+        at = at % size if shots.complex_record else at
+        (scale, line), peak = line_of(shots, int(runs.part[i]), s), runs.peak[s, i]
+        masked, echo = scale * line.most >= MASKED_FROM * level[i], runs.exempt[stretch]
+        skirts = np.where(masked[at], 0.0, scale * line.rms[at])
+        seen = raised(
+            runs.magnitudes[stretch], skirts, deviation=under[i], level=level[i],
+            fades=shots.fading is not None,
+        )  # fmt: skip
+        seen[masked[at]] = 0.0
+        magnitudes[stretch] = seen
+        if masked[at[peak]]:
+            pd[s, i], miss[s, i] = 0.0, 1.0
+        else:
+            pd[s, i], miss[s, i] = found_pair(
+                seen, echo, peak, runs.low[s, i], rule, (under[i], level[i])
+            )
+        searched = np.ones(masked.size, bool)
+        if not shots.complex_record:
+            searched[:first] = searched[masked.size - first :] = False
+        searched[at[echo]] = False
+        exempted[s, i] += np.count_nonzero(masked & searched)
+        if shots.waveform[s].leaks:
+            alarms = searched & ~masked & (scale * line.most >= floor[i] * deviation[i])
+            chance = alarm(
+                shots.looks, line, np.flatnonzero(alarms), scale=scale / deviation[i],
+                level=level[i] / deviation[i],
+            )  # fmt: skip
+            leakage[s, i] += (1 - leakage[s, i]) * chance
+    return runs._replace(
+        magnitudes=magnitudes, pd=pd, miss=miss, exempted=exempted, leakage=leakage
+    )
+
+
+CIRCULATOR_LEAK = Effect(
+    name="circulator_leak",
+    about="light that leaks to the detector: a line near DC, and its noise",
+    stage="noise",
+    size=leak_size,
+    act=add_leak,
+    parameters=(
+        Parameter(
+            path=PATH,
+            about="Optical path of the light that leaks past circulator and window (isolation) "
+            "beyond the local oscillator's, in all; 0 for no such light. Its line stands at the "
+            "range of half this path; bins in which it alone reaches the threshold are masked, and "
+            "hide echoes",
+            example="2 m",
+            limits=("0 m", "1 km"),
+        ),
+    ),
+)

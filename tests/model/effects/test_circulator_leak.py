@@ -1,0 +1,166 @@
+"""Light that leaks to the detector: its line and noise against simulated records."""
+
+import numpy as np
+import pytest
+from effect_points import shots_of
+
+from sweep.model import shot
+from sweep.model.effects import circulator_leak as leak
+from sweep.model.effects.catalogue import CORE, DEFAULTS
+from sweep.model.marcum import marcum_q1
+from sweep.model.segments import runs_of
+
+LIGHT, CHARGE = 299792458.0, 1.602176634e-19
+PATH, ISOLATION = 3.0, 1e5
+WITH = (*CORE, "circulator_leak")
+
+
+@pytest.fixture
+def leaking(table_4_1):
+    """Parameters of Table 4.1 with leaked light."""
+
+    def parameters(path=PATH, isolation=ISOLATION, further=None, **changes):
+        own = {leak.PATH: path, leak.ISOLATION: isolation}
+        return DEFAULTS | table_4_1(**changes) | own | (further or {})
+
+    return parameters
+
+
+@pytest.mark.parametrize("record", ["real", "complex"])
+@pytest.mark.parametrize(("segment", "sign"), [(0, 1), (1, 0), (2, -1)])
+def test_the_line_is_that_of_simulated_records(leaking, segment, sign, record):
+    further = {"instrument.receiver.record": record}
+    shots = shots_of(leaking(path=40.0, further=further, range=1500.0, fft_size=2**14), WITH)
+    scale, line = leak.line_of(shots, 0, segment)
+    # By hand: 2 Re sqrt(P_lo P_tx / I) [A] by 7 kohm, two poles of 400 MHz, at S d / c.
+    beat = -sign * 1e9 / 500e-6 * 40.0 / LIGHT
+    amplitude = 2 * 1.1 * np.sqrt(1e-3 * 1.0 / ISOLATION) * 7e3 / (1 + (beat / 4e8) ** 2)
+    n, window = np.arange(2**14), 0.54 - 0.46 * np.cos(2 * np.pi * np.arange(2**14) / 2**14)
+    powers, most = 0.0, 0.0
+    for phase in 2 * np.pi * np.arange(64) / 64:
+        tone = amplitude * np.exp(1j * (2 * np.pi * beat * n / 6e8 + phase))
+        if record == "real":
+            seen = np.abs(np.fft.rfft(window * tone.real))
+        else:
+            seen = np.abs(np.fft.fft(window * tone / 2))
+        powers, most = powers + seen**2 / 64, np.maximum(most, seen)
+    floor = 1e-9 * amplitude * 2**14
+    np.testing.assert_allclose(scale * line.rms, np.sqrt(powers), rtol=1e-9, atol=floor)
+    assert (scale * line.most >= most - floor).all()
+    np.testing.assert_allclose(scale * line.most, most, rtol=2e-3, atol=floor)
+
+
+def test_the_beats_noise_is_that_of_simulated_records():
+    """The density near DC of i (1 + dP/P) cos(phi + theta(t) - theta(t - tau))."""
+    rng, rate, length, records = np.random.default_rng(5), 1e9, 2**14, 60
+    width, rin, steps, beat = 3e4, 1e-12, 2, 0.7
+    density = 0.0
+    first, last = 40, 300  # where sin(pi f tau) is pi f tau to 0.3 %, off the line at 0
+    for k, phase in enumerate(np.repeat(2 * np.pi * rng.random(records // 2), 2)):
+        phase += np.pi / 2 * (k % 2)  # in pairs, whose sin^2 and cos^2 have the mean 1/2
+        walk = np.cumsum(rng.normal(size=length + steps)) * np.sqrt(2 * np.pi * width / rate)
+        theta = walk[steps:] - walk[:-steps]
+        power = 1 + rng.normal(size=length) * np.sqrt(rin * rate / 2)
+        # dP/P of both beams is a half each of the beat's amplitude: their root is the power.
+        record = beat * power * np.cos(phase + theta)
+        density += np.abs(np.fft.rfft(record)[first:last]) ** 2 * 2 / (length * rate) / records
+    law = leak.excess_density(
+        leaked=0.0, beat=beat, delay=steps / rate, electrical_bandwidth=1.0,
+        relative_intensity_noise=rin, common_mode_rejection=1.0, local_oscillator_power=1.0,
+        line_width=width,
+    )  # fmt: skip
+    # A bin's power has a relative variance of 1.
+    spread = 1 / np.sqrt(records * (last - first) / 2)  # of records with all of either noise
+    assert density.mean() == pytest.approx(law, rel=5 * spread)
+    parts = [
+        leak.excess_density(
+            leaked=0.0, beat=beat, delay=steps / rate, electrical_bandwidth=1.0,
+            relative_intensity_noise=a, common_mode_rejection=1.0, local_oscillator_power=1.0,
+            line_width=b,
+        )
+        for a, b in ((rin, 0.0), (0.0, width))
+    ]  # fmt: skip
+    assert min(parts) > 0.2 * law  # both are seen
+
+
+def test_leaked_light_makes_shot_noise_and_the_beats_noise(leaking):
+    laser = {
+        "instrument.laser.line_width": 1e5, "instrument.laser.line_shape": "lorentzian",
+        "instrument.laser.relative_intensity_noise": 1e-15,
+        "instrument.receiver.common_mode_rejection": 300.0,
+    }  # fmt: skip
+    sources = shots_of(leaking(further=laser), WITH).noise_sources
+    light, volts = 1 / ISOLATION, 7e3**2
+    assert sources["leak_shot"] == pytest.approx(2 * CHARGE * 1.1 * light * 4e8 * volts)
+    power = (2 * 1.1) ** 2 * 1e-3 * light / 2  # of the beat [A^2]
+    phase = 4 * np.pi * 1e5 * (PATH / LIGHT) ** 2
+    phase = power * min(phase * 4e8, 2 * np.pi * 1e5 * PATH / LIGHT)
+    beat = 1e-15 * 4e8 * (power + 1.1**2 * (2e-3 + light) * light / 300)
+    assert sources["leak_excess"] == pytest.approx((phase + beat) * volts)
+
+
+@pytest.mark.parametrize(("own", "line"), [(3.0, 2.0), (8.0, 3.0), (0.5, 3.2), (20.0, 0.1)])
+def test_an_echo_that_fades_beside_a_line_crosses_as_drawn(own, line):
+    rng, number, level = np.random.default_rng(int(10 * own)), 400_000, 6.5
+    normal = rng.normal(size=(4, number))
+    echo = own * np.sqrt(0.5) * (normal[0] + 1j * normal[1])
+    phase = np.exp(2j * np.pi * rng.random(number))
+    crosses = np.mean(np.abs(echo + line * phase + normal[2] + 1j * normal[3]) >= level)
+    m = leak.raised(np.array([own]), np.array([line]), deviation=1.0, level=level, fades=True)[0]
+    law = np.exp(-(level**2) / (2 + m**2))
+    assert crosses == pytest.approx(law, abs=5 * np.sqrt(law / number))
+
+
+def test_skirts_raise_alarms_as_often_as_in_simulated_records(leaking, monkeypatch):
+    monkeypatch.setattr(leak, "MASKED_FROM", 0.8)  # for many more alarms than noise makes
+    p = leaking(
+        path=7.3, isolation=10**9.3, window="rectangular", fft_size=2**12, tnr=8.0,
+        reflectance=1e-12, range=2000.0,
+    )  # fmt: skip
+    shots = shots_of(p, WITH)
+    scale, line = leak.line_of(shots, 0, 0)
+    level, sigma = float(shots.threshold[0]), float(shots.bin_deviation[0])
+    rng, number, size = np.random.default_rng(8), 20_000, 2**12
+    (runs,) = runs_of(shots)
+    masked = scale * line.most >= 0.8 * level
+    looked = ~masked
+    looked[[0, -1]] = False
+    looked[runs.low[0, 0] + np.flatnonzero(runs.exempt[: runs.bins[0, 0]])] = False
+    beat = 1e9 / 500e-6 * 7.3 / LIGHT
+    n, alarms = np.arange(size), 0
+    for phase in 2 * np.pi * rng.random(number):
+        noise = rng.normal(size=size) * np.sqrt(shots.noise_variance[0])
+        tone = 2 * scale * np.cos(2 * np.pi * beat * n / 6e8 + phase)
+        alarms += (np.abs(np.fft.rfft(noise + tone))[looked] >= level).any()
+    found = shot.statistics(shots)
+    none = 1 - np.exp(-(level**2) / 2 / sigma**2)
+    expected = 1 - (1 - found["p_leakage_up"][0]) * none ** looked.sum()
+    assert 0.02 < expected < 0.9
+    assert expected > 10 * (1 - none ** looked.sum())
+    assert 10 < masked.sum() < 1000
+    assert alarms / number == pytest.approx(expected, abs=5 * np.sqrt(expected / number))
+
+
+def test_a_steady_echo_beside_a_line_crosses_nearly_as_drawn():
+    rng, number, level, own, line = np.random.default_rng(4), 200_000, 6.5, 6.0, 2.0
+    phase = np.exp(2j * np.pi * rng.random(number))
+    noise = rng.normal(size=number) + 1j * rng.normal(size=number)
+    crosses = np.mean(np.abs(own + line * phase + noise) >= level)
+    m = leak.raised(np.array([own]), np.array([line]), deviation=1.0, level=level, fades=False)
+    # Powers add, in place of the mean of the crossings over the phase: within 0.03.
+    assert crosses == pytest.approx(float(marcum_q1(m, level).q[0]), abs=0.03)
+    assert crosses > float(marcum_q1(own, level).q) + 0.05
+
+
+def test_near_echoes_are_hidden_and_far_ones_are_not(leaking):
+    far, near = (
+        {"range": r, "radial_velocity": 0.0, "tnr": 8.0, "window": "hann"} for r in (2000.0, 8.0)
+    )
+    hidden = shot.evaluate(leaking(**near), WITH)
+    assert hidden["pd_up"] == 0 and hidden["miss_up"] == 1
+    assert shot.evaluate(leaking(**near), CORE)["pd_up"] > 0.999
+    seen, alone = (shot.evaluate(leaking(**far), e) for e in (WITH, CORE))
+    assert seen["pd_up"] == pytest.approx(alone["pd_up"], abs=1e-3)
+    assert seen["pd_up"] > 0.9
+    # Masked bins are not searched.
+    assert seen["pfa_segment"] < alone["pfa_segment"]
