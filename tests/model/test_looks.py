@@ -56,8 +56,9 @@ def drawn(looks, speckle, signals, level, alike=1.0):
 @pytest.mark.parametrize("speckle", ["steady", "independent", "common"])
 @pytest.mark.parametrize(
     ("number", "combine", "votes"),
-    [(1, "power", 1), (2, "power", 1), (8, "power", 1), (32, "power", 1),
-     (2, "binary", 1), (8, "binary", 3), (32, "binary", 12)],
+    [(1, "power", 1), (2, "power", 1), (8, "power", 1), (2, "binary", 1), (8, "binary", 3),
+     pytest.param(32, "power", 1, marks=pytest.mark.slow),
+     pytest.param(32, "binary", 12, marks=pytest.mark.slow)],
 )  # fmt: skip
 def test_closed_forms_are_the_mean_over_a_million_draws(number, combine, votes, speckle):
     looks = Looks(number, combine, votes, speckle == "independent")
