@@ -52,7 +52,7 @@ class Segment:
     """
 
     name: str
-    sign: int
+    slope: float
     frequency: np.ndarray
     signal: np.ndarray
     magnitude: np.ndarray
@@ -102,8 +102,10 @@ class Shot:
 
     @property
     def detected(self) -> bool:
-        """Tell whether both chirp segments have a group."""
-        return all(segment.groups for segment in self.segments if segment.sign)
+        """Tell whether the segments that detect a shot have a group."""
+        if self.prepared.any_two:
+            return sum(bool(segment.groups) for segment in self.segments) >= 2
+        return all(segment.groups for segment in self.segments if segment.name != NAMES[1])
 
 
 def simulated(
@@ -156,7 +158,7 @@ def _segment(prepared: model.Shots, found: np.ndarray, k: int, seed: int | None)
     segment = prepared.waveform[k]
     carrier = np.asarray(segment.carrier).item()
     beat = waveform.beat_frequency(
-        segment.sign,
+        segment.slope,
         carrier=carrier,
         chirp_rate=np.asarray(prepared.chirp_rate),
         range=prepared.range[0] - np.ravel(segment.nearer)[0],
@@ -164,7 +166,7 @@ def _segment(prepared: model.Shots, found: np.ndarray, k: int, seed: int | None)
     )
     return Segment(
         name=NAMES[k],
-        sign=waveform.SIGNS[k],
+        slope=segment.slope,
         frequency=bins * float(prepared.sample_rate[0]) / prepared.fft_size,
         signal=signal,
         magnitude=magnitude,
@@ -209,10 +211,10 @@ def quantity_at(shot: Shot, segment: Segment, frequency: np.ndarray) -> np.ndarr
     fold = np.rint(segment.beat / rate) * rate
     turned = segment.beat < fold and not p.complex_record
     signed = fold + (-1.0 if turned else 1.0) * np.asarray(frequency)
-    if segment.sign == 0:
+    if segment.slope == 0:
         return signed * SPEED_OF_LIGHT / (2 * segment.carrier)
     beta = float(np.asarray(p.beta).flat[0])
-    delay_beat = segment.sign * (segment.carrier * beta - signed)
+    delay_beat = (segment.carrier * beta - signed) / segment.slope
     return delay_beat * SPEED_OF_LIGHT / (2 * np.asarray(p.chirp_rate).item() * (1 + beta))
 
 
@@ -311,7 +313,7 @@ def _explain(axes: Axes, shot: Shot, segment: Segment) -> None:
         return (value - first) / (second - first)
 
     top = axes.secondary_xaxis("top", functions=(meaning, frequency))
-    top.set_xlabel("range (m)" if segment.sign else "radial velocity (m/s)", size=8, labelpad=4)
+    top.set_xlabel("range (m)" if segment.slope else "radial velocity (m/s)", size=8, labelpad=4)
     top.tick_params(labelsize=8)
     top.ticklabel_format(axis="x", useOffset=False)
     axes.ticklabel_format(axis="x", useOffset=False)

@@ -109,6 +109,23 @@ def fading_together(
     return np.where(there, both, np.nan)
 
 
+def any_two(chances: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Chance that at least two of three independent events happen.
+
+    Parameters
+    ----------
+    chances, others : (3, ...) ndarray
+        Chances of each, and of its contrary.
+
+    Examples
+    --------
+    >>> round(float(any_two(np.array([0.9, 0.8, 0.5]), np.array([0.1, 0.2, 0.5]))), 6)
+    0.85
+    """
+    (a, b, c), (no_a, no_b, no_c) = chances, others
+    return np.asarray(a * b * c + a * b * no_c + a * no_b * c + no_a * b * c)
+
+
 @njit(cache=True, error_model="numpy")
 def mark(magnitude, count, level, exempt, beside):
     """Find the detection in a run of bins, and mark the bins that can't raise a false alarm.

@@ -30,6 +30,9 @@ from sweep.model.philox import (
 from sweep.model.preparation import Shots
 from sweep.model.segments import runs_of
 
+BOTH = "pd_both_chirps"
+"""Chance of a detection in both chirps, beside the outputs where any two segments detect."""
+
 _AT_ONCE = 256
 """Draws of a row whose random numbers are made together."""
 
@@ -56,7 +59,8 @@ def count_by_chance(
     points, batches) in the order of :data:`sweep.model.outputs.DRAW_OUTPUTS`.
     """
     size, chances = rows.point.size, _chances(outputs)
-    none = False, np.empty((0, TAPS)), np.empty(0, np.int64), 0
+    rule = np.empty((0, TAPS)), np.empty(0, np.int64), 0
+    none = False, *rule, np.isfinite(outputs.get(BOTH, np.full(size, np.nan)))
     nothing = Seen.nothing(size), np.empty((0, size))
     _count(rows, ends, np.zeros((2, size)), chances, none, *nothing, counts)
 
@@ -71,7 +75,13 @@ def count_in_noise(rows: Rows, ends: np.ndarray, shots: Shots, counts: np.ndarra
         chances = np.array([others, *np.zeros((2, *others.shape))])  # in C order
         some = Rows(*(column[part] for column in rows))
         rule = echo_filter(shots, seen)
-        own = levels[:, part].copy(), chances, (True, *rule), seen, mixing[:, part].copy()
+        own = (
+            levels[:, part].copy(),
+            chances,
+            (True, *rule, np.full(part.size, shots.any_two)),
+            seen,
+            mixing[:, part].copy(),
+        )
         _count(some, ends, *own, counts)
 
 
@@ -92,11 +102,19 @@ def echo_filter(shots: Shots, seen: "Seen") -> tuple[np.ndarray, np.ndarray, int
 def _chances(outputs: Mapping[str, np.ndarray]) -> np.ndarray:
     """Probabilities of a false alarm, and of a detection without and with one in the up segment.
 
-    By segment (up, Doppler, down), (3, 3, n).
+    By segment (up, Doppler, down), (3, 3, n); of a detection in the Doppler segment where not one
+    alone of the other two has a detection, and where one has, which decides if any two detect.
     """
-    up, down, both = (np.nan_to_num(outputs[f"pd_{name}"]) for name in ("up", "down", "shot"))
+    up, down, shot = (np.nan_to_num(outputs[f"pd_{name}"]) for name in ("up", "down", "shot"))
+    known = outputs.get(BOTH, np.full(up.shape, np.nan))
+    both = np.where(np.isfinite(known), known, shot)
     alone, beside = down_given_up(up, down, both)
     doppler = np.nan_to_num(outputs["pd_doppler"])
+    odd, added, third = up + down - 2 * both, shot - both, np.isfinite(known)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        one_more = np.where(third & (odd > 0), np.clip(added / odd, 0.0, 1.0), doppler)
+        even = np.clip((doppler - added) / (1 - odd), 0.0, 1.0)
+    none_more = np.where(third & (odd < 1), even, doppler)
     noise_up = outputs["pfa_segment"]
     both, one = outputs["log10_pfa_both_chirps"], outputs["log10_pfa_segment"]
     some = np.isfinite(one)  # else the detection occupies every bin
@@ -104,7 +122,7 @@ def _chances(outputs: Mapping[str, np.ndarray]) -> np.ndarray:
     alarm_up = 1 - (1 - noise_up) * (1 - outputs["p_leakage_up"])
     alarm_down = 1 - (1 - noise_down) * (1 - outputs["p_leakage_down"])
     alarms = alarm_up, np.zeros_like(alarm_up), alarm_down
-    return np.array([alarms, (up, doppler, alone), (up, doppler, beside)])
+    return np.array([alarms, (up, none_more, alone), (up, one_more, beside)])
 
 
 def down_given_up(up: np.ndarray, down: np.ndarray, both: np.ndarray) -> np.ndarray:
@@ -204,12 +222,13 @@ def seen_spectra(shots: Shots) -> Iterator[tuple[np.ndarray, Seen]]:
 def _count(rows, ends, levels, chances, how, seen, mixing, counts):
     """Add the draws of each row to the counts.
 
-    ``how``: whether in noise; filter of an echo's noise, as of :func:`echo_filter`. ``levels`` (2,
+    ``how``: whether in noise; filter of an echo's noise, as of :func:`echo_filter`; whether any
+    two segments detect a shot. ``levels`` (2,
     m): :func:`noise_levels`. ``chances`` (3, 3, m): those of a false alarm in bins that are not
     looked at one by one, and, of no meaning in noise, of a detection without and with one in the up
     segment. ``mixing`` (6, m): :meth:`sweep.model.detection.Fading.mixing`, or nothing.
     """
-    noisy, weights, start, real_ends = how
+    noisy, weights, start, real_ends, any_two = how
     noise_of_bins = np.empty((4, weights.shape[0] + weights.shape[1]))
     words = np.empty((4, _AT_ONCE), np.uint64)
     factors = np.ones((3, _AT_ONCE))
@@ -223,7 +242,7 @@ def _count(rows, ends, levels, chances, how, seen, mixing, counts):
             hits[:], alarms[:] = False, False
             for d in range(number if mixing.shape[0] > 0 else 0):
                 factors[:, d] = fading_factors(address[:2], first + d, 0, mixing[:, j])
-            for s in range(3):
+            for s in (0, 2, 1):
                 stream, ratio, peak = STREAM_NOISE[s], seen.ratio[j, s], seen.peak[j, s]
                 if noisy and weights.size > 0:
                     _cross_any(
@@ -238,7 +257,8 @@ def _count(rows, ends, levels, chances, how, seen, mixing, counts):
                     _cross(address, stream, peak, line, words, hits[s])
                 else:
                     either = chances[1, s, j], chances[2, s, j]
-                    _happen(address, STREAM_DETECTION[s], either, hits[0], words, hits[s])
+                    one = hits[0] if s == 2 else hits[0] ^ hits[2]
+                    _happen(address, STREAM_DETECTION[s], either, one, words, hits[s])
                 if chances[0, s, j] > 0.0:
                     largest = STREAM_NOISE_MAXIMUM[s] if noisy else STREAM_FALSE_ALARM[s]
                     chance = chances[0, s, j], chances[0, s, j]
@@ -252,7 +272,8 @@ def _count(rows, ends, levels, chances, how, seen, mixing, counts):
                 counts[0, i, batch] += hits[0, d]
                 counts[1, i, batch] += hits[2, d]
                 counts[2, i, batch] += hits[1, d]
-                counts[3, i, batch] += hits[0, d] & hits[2, d]
+                third = any_two[j] & hits[1, d] & (hits[0, d] | hits[2, d])
+                counts[3, i, batch] += (hits[0, d] & hits[2, d]) | third
                 counts[4, i, batch] += alarms[0, d]
                 counts[5, i, batch] += alarms[2, d]
                 counts[6, i, batch] += alarms[0, d] & alarms[2, d]

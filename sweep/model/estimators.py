@@ -48,7 +48,7 @@ spectrum is taken for the tone (the threshold effect).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -355,6 +355,7 @@ def resolved_deviation(
     chirp_rate: ArrayLike,
     range: ArrayLike,
     radial_velocity: ArrayLike,
+    slopes: Sequence[ArrayLike] = SIGNS,
 ) -> Deviation:
     """Least standard deviations of range and radial velocity, of the beats' own.
 
@@ -368,14 +369,16 @@ def resolved_deviation(
         Carrier of each segment [Hz].
     chirp_rate, range, radial_velocity : array_like
         S [Hz/s]; where the target is [m], and how fast it closes [m/s].
+    slopes : sequence of array_like
+        Chirp rate of each segment over S, signed.
     """
     per_metre = 2 / SPEED_OF_LIGHT
     delay, beta = per_metre * np.asarray(range, float), per_metre * np.asarray(radial_velocity)
     rate = np.asarray(chirp_rate, float)
-    along_range = [-sign * rate * per_metre * (1 + beta) for sign in SIGNS]
+    along_range = [-np.asarray(s) * rate * per_metre * (1 + beta) for s in slopes]
     along_velocity = [
-        per_metre * (np.asarray(carrier) - sign * rate * delay)
-        for sign, carrier in zip(SIGNS, carriers, strict=True)
+        per_metre * (np.asarray(carrier) - np.asarray(slope) * rate * delay)
+        for slope, carrier in zip(slopes, carriers, strict=True)
     ]
     with np.errstate(divide="ignore"):
         weight = [1 / np.asarray(deviation, float) ** 2 for deviation in (up, doppler, down)]

@@ -424,6 +424,88 @@ def level_of(log_pfa: np.ndarray, law: Callable[[np.ndarray], np.ndarray]) -> np
     return 0.5 * (low + high)
 
 
+def fading_any_two(
+    pd: np.ndarray, miss: np.ndarray, level: np.ndarray, alike: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Chances that at least two of three segments in developed speckle are detected, and not.
+
+    The amplitude of each segment, signal and noise, is normal, of the part l_i z of one common
+    amplitude z and a rest of its own. With A_i = Th^2 over the mean power, u = |z|^2 exponential,
+
+        P_i(u) = Q_1(l_i sqrt(2 u / (1 - l_i^2)), sqrt(2 A_i / (1 - l_i^2)))
+
+    and given u the segments are independent. The correlations, those of
+    :func:`sweep.model.detection.fading_together`, give l_i = sqrt(rho_ij rho_ik / rho_jk): exact
+    for segments that share their speckle, or each have their own. Where speckle moves on between
+    them one l_k may come out above 1. It is then 1, z is that segment's own amplitude, and of the
+    others a covariance
+    kappa = rho_ij - rho_ik rho_jk is left, which adds to the chance of both
+
+        kappa P_i' P_j' / 2 + kappa^2 (A_i A_j + B_i B_j) / 16,    A, B = P'' +- P' / r
+
+    with derivatives by r, the mean given z: Mehler's series to its second term, within 0.002 of
+    drawn amplitudes.
+
+    Parameters
+    ----------
+    pd, miss : (3, n) ndarray
+        Chances of up, Doppler and down segment.
+    level : (n,) ndarray
+        Threshold over the noise per quadrature.
+    alike : (3, n) ndarray
+        Sizes of the correlations of :class:`sweep.model.detection.Fading`.
+    """
+    from sweep.model.detection import any_two
+    from sweep.model.marcum import marcum_q1
+
+    there = np.isfinite(pd).all(axis=0)
+    with np.errstate(divide="ignore"):
+        a = np.where(pd < 0.5, -np.log(np.where(there, pd, 1.0)), -np.log1p(-np.minimum(miss, 0.5)))
+    a = np.clip(a, 1e-300, 700.0)
+    share = np.maximum(1 - a / (0.5 * np.square(level)), 1e-9)
+    rho = np.minimum(alike, 1.0) * np.sqrt(share[[0, 0, 1]] * share[[1, 2, 2]])
+    near, over, last = rho
+    with np.errstate(divide="ignore", invalid="ignore"):
+        square = np.array([near * over / last, near * last / over, over * last / near])
+    square = np.nan_to_num(square, posinf=2.0)
+    pairs = ((1, 2, near, over), (0, 2, near, last), (0, 1, over, last))
+    above = square > 1  # one of them at most
+    for k, (i, j, one, other) in enumerate(pairs):
+        square[i], square[j] = np.where(above[k], (one**2, other**2), square[[i, j]])
+    square = np.minimum(square, 1 - 1e-9)
+    rest = 1 - square
+    place = np.sqrt(a / np.maximum(square, 1e-12))
+    wide = 6 * np.sqrt(rest / np.maximum(2 * square, 1e-12))
+    most = np.sqrt(a.max(axis=0)) + 7.0
+    ends = [0 * most, most, *np.clip([place - wide, place, place + wide], 0.0, most).reshape(9, -1)]
+    node, weight = _gauss(np.sort(np.stack(ends, axis=-1), axis=-1))
+    weight = weight * 2 * node * np.exp(-np.square(node))
+    signal = np.sqrt(2 * square / rest)[..., None] * node
+    threshold = np.sqrt(2 * a / rest)[..., None] + 0 * node
+    found, missed = marcum_q1(signal, threshold)
+    more = np.zeros(node.shape)
+    for k, (i, j, one, other) in enumerate(pairs):
+        some = np.flatnonzero(above[k])
+        two = np.ix_(np.array([i, j]), some)
+        kappa = (rho[[2, 1, 0]][k] - one * other)[some] * 2 / np.sqrt(rest[i] * rest[j])[some]
+        slope, plus, minus = _bends(signal[two], threshold[two])
+        square_term = (plus[0] * plus[1] + minus[0] * minus[1]) * np.square(kappa[:, None]) / 16
+        both = kappa[:, None] * slope[0] * slope[1] / 2 + square_term
+        more[some] = both * (missed[k, some] - found[k, some])
+    chances = any_two(found, missed) + more, any_two(missed, found) - more
+    found, missed = (np.clip((each * weight).sum(axis=-1), 0.0, 1.0) for each in chances)
+    return np.where(there, found, np.nan), np.where(there, missed, np.nan)
+
+
+def _bends(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Q_1' and Q_1'' +- Q_1' / a by the signal a, at the threshold b."""
+    x = np.maximum(a * b, 1e-12)
+    zero, one = (b * np.exp(-0.5 * np.square(a - b)) * special.ive(n, x) for n in (0, 1))
+    second = b * (zero - one / x) - a * one
+    over = b * one / x
+    return one, second + over, second - over
+
+
 def _gauss(ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Gauss points and weights of the stretches between ends (..., k), all behind one another."""
     node, weight = np.polynomial.legendre.leggauss(_NODES)

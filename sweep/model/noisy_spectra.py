@@ -55,6 +55,7 @@ from sweep.model.looks import BINARY
 from sweep.model.philox import STREAM_LASER_PHASE, STREAM_RECORD, normals, uniforms
 from sweep.model.preparation import Parameters, Shots
 from sweep.model.segments import spectrum as segment_spectrum
+from sweep.model.shot import fit
 
 VALUES = ("pfa_bin", "false_alarms", "range", "radial_velocity", "range_2", "radial_velocity_2")
 """What is averaged over draws; the last two are squares of bounds."""
@@ -373,41 +374,64 @@ def counted(view: View, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             inside = view.setting.fft_size // 2 + 1 - 2 * view.shots.searched_from
             searched += inside - max(signal.last - signal.first + 1, 0)
     up, doppler, down = found
-    both, alarm = up.detected & down.detected, (up.alarms > 0, down.alarms > 0)
+    detected, alarm = np.array([f.detected for f in found]), (up.alarms > 0, down.alarms > 0)
+    shot = up.detected & down.detected
+    whole = shot & (doppler.detected | (view.signals[1] is None))
+    if view.shots.any_two:
+        shot = whole = detected.sum(axis=0) >= 2
     counts = np.array([
-        up.detected, down.detected, doppler.detected, both, *alarm, alarm[0] & alarm[1]
+        up.detected, down.detected, doppler.detected, shot, *alarm, alarm[0] & alarm[1]
     ], np.int64)  # fmt: skip
-    false, alarms = sum(f.flagged for f in found), sum(f.alarms for f in found)
-    least = resolved_bound(view)
-    squares = [np.full(draws.size, bound**2) for bound in least]
-    whole = both & (doppler.detected | (view.signals[1] is None))
-    errors = [np.where(whole, error, np.nan) for error in _errors(view, found)]
-    return counts, np.array([false / max(searched, 1), alarms, *errors, *squares])
+    flagged, alarms = sum(f.flagged for f in found), sum(f.alarms for f in found)
+    squares = np.square(_bounds(view, detected))
+    if view.shots.any_two:  # they differ by what is detected
+        squares = np.where(whole, squares, np.nan)
+    errors = [np.where(whole, error, np.nan) for error in _errors(view, found, detected)]
+    return counts, np.array([flagged / max(searched, 1), alarms, *errors, *squares])
 
 
-def resolved_bound(view: View) -> Deviation:
-    """Bound of range and velocity that are resolved from up and down beat.
+def _bounds(view: View, detected: np.ndarray) -> np.ndarray:
+    """Bounds of range and velocity in draws (2, m) by the segments (3, m) that tell of them."""
+    bounds = np.empty((2, detected.shape[1]))
+    bounds[...] = np.reshape(resolved_bound(view), (2, 1))
+    if view.shots.any_two:
+        for missed in np.eye(3, dtype=bool):
+            here = (detected == ~missed[:, None]).all(axis=0)
+            bounds[:, here] = np.reshape(resolved_bound(view, ~missed), (2, 1))
+    return bounds
 
-    Of Cramer and Rao in white noise, and what the laser's phase adds; looks tell independently.
+
+def resolved_bound(view: View, used: Sequence[bool] | np.ndarray | None = None) -> Deviation:
+    """Bound of range and velocity that are resolved from the beats that are ``used``.
+
+    By default of up and down beat; where segments have slopes of their own, of all. Of
+    Cramer and Rao in white noise, and what the laser's phase adds; looks tell independently.
     """
     shots, i = view.shots, view.i
     length, rate = shots.window.length, float(shots.sample_rate[i])
     walk, looks = phase_deviation(**_laser(shots, i)), math.sqrt(shots.looks.number)
-    up, _, down = (
+    if used is None:
+        used = (True, shots.slopes != waveform.SIGNS, True)
+    up, doppler, down = (
         np.inf
-        if s is None
+        if s is None or not there
         else np.hypot(beat_deviation(cnr=s.cnr, samples=length, sample_rate=rate), walk) / looks
-        for s in view.signals
+        for s, there in zip(view.signals, used, strict=True)
     )
     return resolved_deviation(
-        up=up, doppler=np.inf, down=down, carriers=_carriers(shots, i),
+        up=up, doppler=doppler, down=down, carriers=_carriers(shots, i),
         chirp_rate=_at(shots.chirp_rate, i), range=shots.range[i],
-        radial_velocity=shots.radial_velocity[i],
+        radial_velocity=shots.radial_velocity[i], slopes=shots.slopes,
     )  # fmt: skip
 
 
-def _errors(view: View, found: Sequence[Found]) -> tuple[np.ndarray, np.ndarray]:
-    """Compute reported less true range [m] and radial velocity [m/s], (m,) each."""
+def _errors(
+    view: View, found: Sequence[Found], detected: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Compute reported less true range [m] and radial velocity [m/s], (m,) each.
+
+    By the segments (3, m) that are detected; up, Doppler and down beat are resolved as ever.
+    """
     shots, i = view.shots, view.i
     width = view.setting.sample_rate / view.setting.fft_size
     up, doppler, down = (segment.frequency * width for segment in found)
@@ -415,11 +439,18 @@ def _errors(view: View, found: Sequence[Found]) -> tuple[np.ndarray, np.ndarray]
         up=up, doppler=doppler if shots.segments[1] else None, down=down,
         carrier=_carriers(shots, i)[0],
         bandwidth=_at(shots.bandwidth, i), duration=_at(shots.duration, i),
-        sample_rate=shots.sample_rate[i], bin_width=np.asarray(width),
+        sample_rate=shots.sample_rate[i], bin_width=np.asarray(width), assumed=shots.two_beats,
     )  # fmt: skip
     velocity = reported.radial_velocity * (1 + _at(shots.slowing, i))
     walked = _at(shots.walk, i) * velocity  # within the shot
-    return reported.range + walked - shots.range[i], velocity - shots.radial_velocity[i]
+    metres = reported.range + walked
+    fitted = shots.slopes != waveform.SIGNS or (shots.any_two & ~detected.all(axis=0))
+    if np.any(fitted):
+        cnr = np.array([[0.0 if s is None else s.cnr] for s in view.signals])
+        own = fit(shots, np.array([up, doppler, down]), detected * cnr, i)
+        metres = np.where(fitted, own.range, metres)
+        velocity = np.where(fitted, own.radial_velocity, velocity)
+    return metres - shots.range[i], velocity - shots.radial_velocity[i]
 
 
 def _carriers(shots: Shots, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

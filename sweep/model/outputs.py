@@ -49,7 +49,9 @@ def _by_segment(
 
 
 OUTPUTS: dict[str, Output] = {
-    **_by_segment("pd_{}", "probability of detection", shot="up- and down-chirp both detected"),
+    **_by_segment(
+        "pd_{}", "probability of detection", shot="both chirps detected, or as shot_detection says"
+    ),
     **_by_segment("miss_{}", "probability of a miss", "1 - pd with its digits."),
     "pfa_bin": Output("1", "probability of false alarm in one bin, from noise alone"),
     "pfa_segment": Output(
@@ -184,7 +186,7 @@ def _resolved(quantity: str, name: str, units: str) -> dict[str, Output]:
 SPECTRA_OUTPUTS: dict[str, Output] = {
     **{name: OUTPUTS[name] for name in KEPT},
     **_by_segment(
-        "pd_{}", "probability of detection", shot="Up- and down-chirp both detected",
+        "pd_{}", "probability of detection", shot="Both chirps detected, or as shot_detection says",
         comment="share of draws with a detection in a bin of the echo.",
     ),
     "pfa_bin": Output("1", "share of bins with a false alarm", f"those in groups of {_AT_FAULT}"),

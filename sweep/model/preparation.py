@@ -42,7 +42,8 @@ BEAMLETS_ERROR = "footprint.beamlets_error"
 APPROACH = "target.approach"
 """Speed [m/s] at which the range along the beam falls, where rays have told."""
 
-CATEGORIES = (PROCESSING + "fft_size", "footprint.beamlets", "record", NUMBER, VOTES)
+SLOPES = waveform.DOPPLER_SLOPE, waveform.DOWN_SLOPE
+CATEGORIES = (PROCESSING + "fft_size", "footprint.beamlets", "record", NUMBER, VOTES, *SLOPES)
 """Numbers that points must share to be prepared together; words they must share all."""
 
 ADC_NOISE = "quantisation"
@@ -92,6 +93,10 @@ class Shots:
     """``correlated``: noise of bins as the record makes it; ``independent``: as [T] has it."""
     detection: str
     """``any_bin``: of the echo; ``peak_bin``: the largest alone, as in [T]."""
+    shot_detection: str
+    """``both_chirps``: a shot is detected in up and down segment; ``any_two``: in any two."""
+    two_beats: str
+    """What is taken for granted where two beats of real records tell: ``far`` or ``fast``."""
     noise_shape: str
     """``receiver``: noise passes the receiver as signals do; ``white``: none of it, as in [T]."""
     order: tuple[str, ...]
@@ -109,6 +114,8 @@ class Shots:
     """Speed [m/s] at which the range along the beam falls (:func:`approach`)."""
     bandwidth: np.ndarray
     duration: np.ndarray
+    slopes: tuple[float, ...]
+    """Chirp rates of up, Doppler and down segment over :attr:`chirp_rate`, signed."""
     carriers: tuple[np.ndarray, np.ndarray, np.ndarray]
     sample_rate: np.ndarray
     acquisition_delay: np.ndarray
@@ -284,10 +291,7 @@ class Shots:
     def both(
         self, up: np.ndarray, down: np.ndarray, magnitudes: tuple[np.ndarray, np.ndarray]
     ) -> np.ndarray:
-        """Chance that up and down segment are detected, both; (..., n).
-
-        By their own chances, and |X| of their bins [V].
-        """
+        """Chance that up and down segment are detected, by their own and |X| [V]; (..., n)."""
         from sweep.model import detection
 
         if self.fading is None:
@@ -297,6 +301,11 @@ class Shots:
             one, other = (magnitude / self.line_deviation for magnitude in magnitudes)
             return self.looks.faded_together(one, other, level, alike)
         return detection.fading_together(up, down, level, alike)
+
+    @property
+    def any_two(self) -> bool:
+        """True where any two of three segments detect a shot."""
+        return self.shot_detection == waveform.ANY_TWO and len(self.order) == 3
 
     def detected(
         self, magnitude: np.ndarray, bins: np.ndarray, points: np.ndarray | slice = slice(None)
@@ -332,12 +341,12 @@ class Shots:
         """Segments of the waveform, one after the other; no output tells of Doppler's leakage."""
         return tuple(
             waveform.Segment(
-                name, sign, sign * self.chirp_rate, carrier, sign != 0,
+                name, slope, slope * self.chirp_rate, carrier, name != waveform.SEGMENTS[1],
                 self.approach * start + 0.5 * self.acceleration * start * start,
                 self.beta + doppler_ratio(self.acceleration * start), start,
             )
-            for name, sign, carrier, start in zip(
-                waveform.SEGMENTS, waveform.SIGNS, self.carriers, self.starts, strict=True
+            for name, slope, carrier, start in zip(
+                waveform.SEGMENTS, self.slopes, self.carriers, self.starts, strict=True
             )
         )  # fmt: skip
 
@@ -524,6 +533,8 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
         bins_counted=str(p[PROCESSING + "bins_counted"]),
         noise_bins=str(p[PROCESSING + "noise_bins"]),
         detection=str(p[PROCESSING + "detection"]),
+        shot_detection=str(p[waveform.SHOT_DETECTION]),
+        two_beats=str(p[waveform.TWO_BEATS]),
         noise_shape=str(p[RECEIVER + "noise_shape"]),
         order=waveform.order_of(architecture, str(p[waveform.ORDER])),
         gap=p[waveform.GAP],
@@ -534,11 +545,13 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
         approach=approach(p),
         bandwidth=p[CHIRP + "bandwidth"],
         duration=p[CHIRP + "duration"],
+        slopes=waveform.slopes_of(p),
         carriers=waveform.carrier_frequencies(
             architecture,
             wavelength=p[LASER + "wavelength"],
             start_frequency=p[CHIRP + "start_frequency"],
             bandwidth=p[CHIRP + "bandwidth"],
+            slopes=waveform.slopes_of(p),
         ),
         sample_rate=p[PROCESSING + "sample_rate"] + everywhere,
         acquisition_delay=p[PROCESSING + "acquisition_delay"],

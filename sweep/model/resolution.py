@@ -234,9 +234,10 @@ def _spread(p: Mapping[str, np.ndarray], size: int, most: int) -> Spread:
     per_speed = velocity_to_bins(
         range=p["target.range"], carrier=carrier, chirp_rate=rate, bin_width=bins
     )
-    signs, nothing = np.array([[1.0], [0.0], [-1.0]]), np.zeros(size)  # of ranges in the beats
+    # Of ranges in the beats.
+    signs, nothing = np.array(waveform.slopes_of(p))[:, None], np.zeros(size)
     spread = Spread(
-        deviation=per_range * rms + per_speed * velocities.rms + nothing,
+        deviation=abs(signs).max() * per_range * rms + per_speed * velocities.rms + nothing,
         slope=abs(per_speed * across * turn + signs * per_range * slope) + nothing,
         curve=abs(per_speed * along * (turn / sigma) ** 2 + signs * per_range) * (sigma**2 / 2)
         + nothing,

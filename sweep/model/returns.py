@@ -274,7 +274,7 @@ def beamlet_lines(shots: Shots) -> np.ndarray:
         beta = _columns(shots, each.beta) + own
         drifted = SPEED_OF_LIGHT / 2 * own * _columns(shots, each.start)
         far = distance[0] * distance[1] - per_metre * (_columns(shots, each.nearer) + drifted)
-        beat = _columns(shots, each.carrier) * beta - each.sign * far * (1 + beta)
+        beat = _columns(shots, each.carrier) * beta - each.slope * far * (1 + beta)
         turns = beat / _columns(shots, shots.sample_rate)
         lines[:, s] = (turns - np.floor(turns + 0.5)) * shots.fft_size
     return lines if shots.complex_record else abs(lines)

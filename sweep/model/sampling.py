@@ -435,7 +435,8 @@ class SpectraSample(Drawn):
                     f"{name}_bias": mean[name] + some,
                     f"{name}_bias_error": error[name] + some,
                     f"{name}_rmse": np.sqrt(mean[name] ** 2 + square[name] / n[name]),
-                    f"{name}_bound": np.sqrt(mean[f"{name}_2"]),
+                    f"{name}_bound": np.sqrt(mean[f"{name}_2"])
+                    + np.where(n[f"{name}_2"] > 0, 0.0, np.nan),
                 }
         sums = self._fixed.sums()
         running = np.concatenate([self._count, self._mean, self._square, sums]).T

@@ -360,7 +360,7 @@ def _phases(shots: Shots, points: np.ndarray, x: np.ndarray) -> np.ndarray:
     for segment in np.flatnonzero(shots.segments):
         for error in shots.phase_errors:
             values = error.chosen(int(segment), points)
-            found[segment] += error.phase(x, sign=shots.waveform[segment].sign, **values)
+            found[segment] += error.phase(x, sign=shots.waveform[segment].slope, **values)
     return found
 
 

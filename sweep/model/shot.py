@@ -9,9 +9,11 @@ from dataclasses import replace
 import numpy as np
 
 from sweep.model import waveform
+from sweep.model.detection import any_two
 from sweep.model.effects.catalogue import CORE, DEFAULTS, EFFECTS, NAMES, SHARED
 from sweep.model.effects.effect import Effect, Scene
 from sweep.model.ground import Cast, Ground, Plane
+from sweep.model.looks import fading_any_two
 from sweep.model.marcum import log_any, log_at_least_one
 from sweep.model.outputs import WITHOUT_ECHO
 from sweep.model.preparation import Parameters, Shots, as_arrays, bare
@@ -108,7 +110,7 @@ def evaluate(
     results: dict[str, np.ndarray] = {}
     for index, shots in groups:
         for name, values in statistics(shots, look(shots)).items():
-            results.setdefault(name, np.empty(size))[index] = values
+            results.setdefault(name, np.full(size, np.nan))[index] = values
     return results
 
 
@@ -122,10 +124,7 @@ def statistics(shots: Shots, found: np.ndarray | None = None) -> dict[str, np.nd
     snr = (magnitude / shots.bin_deviation) ** 2 / 2
     alarms = _false_alarms(shots, exempted)
     reported = report(shots, found)
-    pd_shot = shots.both(pd[0], pd[2], (magnitude[0], magnitude[2]))
-    miss_shot = np.minimum(miss[0] + pd[0] * miss[2], 1.0)  # of roundings
-    if shots.fading is not None:
-        miss_shot = np.minimum(miss[0] + np.maximum(pd[0] - pd_shot, 0.0), 1.0)
+    pd_shot, miss_shot = chances(shots, pd, miss, magnitude)
     results = {
         f"{name}_{segment}": values[s]
         for name, values in {"pd": pd, "miss": miss, "snr": snr}.items()
@@ -142,13 +141,36 @@ def statistics(shots: Shots, found: np.ndarray | None = None) -> dict[str, np.nd
         "range_error": reported.range - shots.range,
         "radial_velocity_error": reported.radial_velocity - shots.radial_velocity,
     }
+    if shots.any_two:
+        results["pd_both_chirps"] = shots.both(pd[0], pd[2], (magnitude[0], magnitude[2]))
     dark = shots.echo_power == 0
     return results | {name: np.where(dark, np.nan, results[name]) for name in WITHOUT_ECHO}
 
 
+def chances(
+    shots: Shots, pd: np.ndarray, miss: np.ndarray, magnitudes: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Chances that a shot is detected, and that it is missed, (n,).
+
+    By the segments' own chances and |X| of their bins [V], (3, n) each.
+    """
+    if shots.any_two:
+        if shots.fading is None:
+            return any_two(pd, miss), any_two(miss, pd)
+        level = shots.threshold / shots.line_deviation
+        return fading_any_two(pd, miss, level, np.abs(np.array(shots.fading)))
+    both = shots.both(pd[0], pd[2], (magnitudes[0], magnitudes[2]))
+    missed = miss[0] + pd[0] * miss[2]
+    if shots.fading is not None:
+        missed = miss[0] + np.maximum(pd[0] - both, 0.0)
+    return both, np.minimum(missed, 1.0)  # of roundings
+
+
 def report(shots: Shots, found: np.ndarray) -> waveform.Resolution:
     """Range and radial velocity that the peaks of the segments report."""
-    frequency = found[:, 3]
+    frequency, weight = found[:, 3], found[:, 2] ** 2
+    if shots.slopes != waveform.SIGNS:
+        return fit(shots, frequency, np.where(shots.segments[:, None], weight, 0.0))
     return waveform.resolve(
         up=frequency[0],
         doppler=frequency[1] if shots.segments[1] else None,
@@ -159,7 +181,40 @@ def report(shots: Shots, found: np.ndarray) -> waveform.Resolution:
         sample_rate=shots.sample_rate,
         bin_width=shots.sample_rate / shots.fft_size,
         signed=shots.complex_record,
+        assumed=shots.two_beats,
     )
+
+
+def fit(
+    shots: Shots, peaks: np.ndarray, weights: np.ndarray, point: int | None = None
+) -> waveform.Resolution:
+    """Range and radial velocity at the shot's start, by :func:`sweep.model.waveform.fit`.
+
+    Parameters
+    ----------
+    shots : Shots
+        Prepared points.
+    peaks, weights : (3, n) ndarray
+        Frequencies [Hz] by segment, and their weights, 0 where a segment is not detected.
+    point : int, optional
+        The only point that all peaks are of.
+    """
+    size = (shots.size,)
+    walk, rate = np.broadcast_to(shots.walk, size), np.broadcast_to(shots.sample_rate, size)
+    starts, slopes, carriers = (
+        np.array([np.broadcast_to(v, size) for v in values])
+        for values in (shots.starts, shots.slopes, shots.carriers)
+    )
+    # A record tells the delay at its middle, and at twice that by the phase's own curve.
+    times = starts + walk - (starts[0] + starts[2]) / 2
+    rates = slopes * shots.chirp_rate
+    one = slice(None) if point is None else slice(point, point + 1)
+    rate = rate[one]
+    return waveform.fit(
+        peaks, weights=weights, carriers=(carriers + rates * times)[:, one], rates=rates[:, one],
+        sample_rate=rate, bin_width=rate / shots.fft_size, signed=shots.complex_record,
+        assumed=shots.two_beats,
+    )  # fmt: skip
 
 
 def _false_alarms(shots: Shots, exempted: np.ndarray) -> dict[str, np.ndarray]:

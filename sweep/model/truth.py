@@ -15,7 +15,6 @@ from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection import detect_rows
 from sweep.model.effects.segment_motion import looks_of
 from sweep.model.preparation import Shots
-from sweep.model.waveform import SIGNS
 
 
 def spectrum(
@@ -108,7 +107,7 @@ def analytic_record(
     velocity; both from the shot's start on. Where the two differ the beam slides over the ground:
     scatterers take each other's place, and the beat has the delay of those that are there.
     """
-    sign, carrier = SIGNS[segment], float(_at(shots.carriers[segment], i))
+    sign, carrier = shots.slopes[segment], float(_at(shots.carriers[segment], i))
     own, begun = float(shots.doppler[shots.row[i], beamlet]), float(_at(shots.starts[segment], i))
     closing, grows = float(_at(shots.approach, i)), float(_at(shots.acceleration, i))
     alpha = grows / SPEED_OF_LIGHT
@@ -142,12 +141,12 @@ def analytic_record(
 
 
 def _start_phase(
-    sign: int, carrier: float, rate: float, range_0: float, further: float, nearer: float
+    sign: float, carrier: float, rate: float, range_0: float, further: float, nearer: float
 ) -> float:
     """-f tau_0 + s S tau_0^2 / 2, the phase at t = 0 [cycles], in exact fractions."""
     delay = Fraction(range_0) + Fraction(further) - Fraction(nearer)
     delay = 2 * delay / Fraction(SPEED_OF_LIGHT)
-    phase = -Fraction(carrier) * delay + sign * Fraction(rate) * delay**2 / 2
+    phase = -Fraction(carrier) * delay + Fraction(sign) * Fraction(rate) * delay**2 / 2
     return float(phase - round(phase))
 
 

@@ -24,9 +24,12 @@ half sum and half difference could be exchanged: the target is taken to be furth
 the sign of each beat, and two tell both unknowns.
 """
 
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from itertools import product
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from sweep.model.constants import SPEED_OF_LIGHT
 
@@ -37,17 +40,25 @@ ORDERS = (
     "doppler down up", "up down doppler", "down up doppler",
 )  # fmt: skip
 """Segments of a shot in the order of time."""
-DEFAULTS: dict[str, float | int | str | np.ndarray] = {ORDER: ORDERS[0], GAP: 0.0}
+DOPPLER_SLOPE, DOWN_SLOPE = "instrument.chirp.doppler_slope", "instrument.chirp.down_slope"
+SHOT_DETECTION = "instrument.processing.shot_detection"
+BOTH_CHIRPS, ANY_TWO = SHOT_DETECTIONS = ("both_chirps", "any_two")
+TWO_BEATS = "instrument.processing.two_beats"
+FAR_TARGET, FAST_TARGET = ASSUMPTIONS = ("far", "fast")
 SIGNS = (1, 0, -1)
-"""Sign s of the chirp rate in each segment."""
+"""Chirp rate of up, Doppler and down segment over the up-chirp's, by default."""
+DEFAULTS: dict[str, float | int | str | np.ndarray] = {
+    ORDER: ORDERS[0], GAP: 0.0, DOPPLER_SLOPE: 0.0, DOWN_SLOPE: -1.0,
+    SHOT_DETECTION: BOTH_CHIRPS, TWO_BEATS: FAR_TARGET,
+}  # fmt: skip
 
 
 class Segment(NamedTuple):
     """One stretch of a waveform, in which the frequency rises or falls evenly or stands still."""
 
     name: str
-    sign: int
-    """Of the chirp rate: 1, 0 or -1."""
+    slope: float
+    """Chirp rate over the up-chirp's, signed: 1, 0 and -1 by default."""
     chirp_rate: np.ndarray
     """[Hz/s], signed, (n,) or scalar."""
     carrier: np.ndarray
@@ -63,22 +74,40 @@ class Segment(NamedTuple):
 
 
 class Resolution(NamedTuple):
-    """Range and radial velocity that three peaks report, (n,) each."""
+    """Range and radial velocity that the peaks of a shot report, (n,) each."""
 
     range: np.ndarray
     radial_velocity: np.ndarray
 
 
 def carrier_frequencies(
-    architecture: str, *, wavelength: np.ndarray, start_frequency: np.ndarray, bandwidth: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    architecture: str, *, wavelength: np.ndarray, start_frequency: np.ndarray,
+    bandwidth: np.ndarray, slopes: Sequence[ArrayLike] = SIGNS,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Frequency f_seg [Hz] that the delay turns into phase, for up, Doppler and down segment.
 
-    The wavelength is that at the start of the chirp. Direct detection chirps the light's power,
-    so that there the radio frequency takes the optical one's place.
+    The wavelength is that at the start of the up-chirp, the lowest of a segment's: one that falls
+    starts above it by its own bandwidth. Direct detection chirps the light's power, so that there
+    the radio frequency takes the optical one's place.
     """
     start = start_frequency if architecture == "direct" else SPEED_OF_LIGHT / np.asarray(wavelength)
-    return start, start, start + bandwidth
+    up, doppler, down = (
+        start + bandwidth * np.maximum(np.negative(s), 0.0) if np.any(np.less(s, 0)) else start
+        for s in slopes
+    )
+    return up, doppler, down
+
+
+def slopes_of(p: Mapping[str, Any]) -> tuple[float, ...]:
+    """Chirp rate of each segment over the up-chirp's, of points that share them.
+
+    Examples
+    --------
+    >>> slopes_of({DOWN_SLOPE: 0.5})
+    (1.0, 0.0, 0.5)
+    """
+    doppler, down = (float(np.ravel(p.get(x, DEFAULTS[x]))[0]) for x in (DOPPLER_SLOPE, DOWN_SLOPE))
+    return 1.0, doppler, down
 
 
 def order_of(architecture: str, segments: str) -> tuple[str, ...]:
@@ -112,16 +141,16 @@ def segment_starts(
 
 
 def beat_frequency(
-    sign: int,
+    slope: float | np.ndarray,
     *,
     carrier: np.ndarray,
     chirp_rate: np.ndarray,
     range: np.ndarray,
     radial_velocity: np.ndarray,
 ) -> np.ndarray:
-    """Signed beat [Hz] of a segment whose chirp has the given sign; chirp rate B/T [Hz/s]."""
+    """Signed beat [Hz] of a segment whose chirp rate is the slope times B/T [Hz/s]."""
     beta = 2 * radial_velocity / SPEED_OF_LIGHT
-    return carrier * beta - sign * chirp_rate * (2 * range / SPEED_OF_LIGHT) * (1 + beta)
+    return carrier * beta - slope * chirp_rate * (2 * range / SPEED_OF_LIGHT) * (1 + beta)
 
 
 def record_length(
@@ -148,6 +177,9 @@ READINGS = 16
 
 FAR = 1
 """Reading without folds in which the half difference is the Doppler frequency: |f_d| < f_r."""
+
+FAST = 0
+"""Reading without folds in which the half sum is the Doppler frequency: |f_d| > f_r."""
 
 
 SIGNED = 16
@@ -197,11 +229,13 @@ def resolve(
     sample_rate: np.ndarray,
     bin_width: np.ndarray,
     signed: bool = False,
+    assumed: str = FAR_TARGET,
 ) -> Resolution:
     """Range and velocity from unsigned, folded peak frequencies [Hz], (n,) each.
 
     Frequencies with signs (``signed``), of complex records, are read by :data:`SIGNED`. Without a
-    Doppler segment, ``doppler=None``, others are read by :data:`FAR`. With it there are two
+    Doppler segment, ``doppler=None``, others are read by :data:`FAR`, or by :data:`FAST` where a
+    fast target is ``assumed``. With it there are two
     unknowns and three peaks: every reading (each peak as it stands or folded at Nyquist,
     half sum or half difference being the Doppler frequency) predicts the third peak. The reading
     that predicts it best is taken, a fold counting as :data:`FOLD_PENALTY` bins of mismatch. The
@@ -211,7 +245,8 @@ def resolve(
     the carrier and to the range at mid-chirp is put right here.
     """
     if signed or doppler is None:
-        f_d, f_r = reading(SIGNED if signed else FAR, up, down, sample_rate)
+        code = SIGNED if signed else FAST if assumed == FAST_TARGET else FAR
+        f_d, f_r = reading(code, up, down, sample_rate)
         return Resolution(*measured(f_d, f_r, carrier, bandwidth, duration))
     at_start = carrier / (carrier + bandwidth / 2)  # the Doppler segment's carrier is lower
     least, f_d, f_r = np.array(np.inf), np.zeros(()), np.zeros(())
@@ -225,3 +260,142 @@ def resolve(
             np.where(better, new, old) for new, old in ((cost, least), (shift, f_d), (beat, f_r))
         )
     return Resolution(*measured(f_d, f_r, carrier, bandwidth, duration))
+
+
+def fit(
+    peaks: np.ndarray,
+    *,
+    weights: np.ndarray,
+    carriers: np.ndarray,
+    rates: np.ndarray,
+    sample_rate: np.ndarray,
+    bin_width: np.ndarray,
+    signed: bool = False,
+    assumed: str = FAR_TARGET,
+) -> Resolution:
+    """Range and velocity by weighted least squares over the peaks of two or more segments.
+
+    A segment's beat is linear in the Doppler ratio beta and in x = tau (1 + beta),
+
+        f_i = carrier_i beta - rate_i x,
+
+    and every assignment of signs (and folds at Nyquist) to the peaks gives a fit. Of three peaks or
+    more that of the least misfit is taken, of those whose range is not negative, a fold counting
+    as :data:`FOLD_PENALTY` bins. Two peaks fit whatever their signs, and an assumption decides:
+
+    - ``far``: the range beat exceeds the Doppler shift in every chirp, so that a beat has the
+      sign opposite to its chirp rate; that of a segment without a chirp is positive (closing);
+    - ``fast``: the Doppler shift exceeds every range beat, so that all beats have one sign, that
+      which makes the range positive.
+
+    Peaks with signs (``signed``), of complex records, are known but for whole sample rates: the
+    two segments of rates furthest apart give the least range that is not negative, and a Doppler
+    shift within half the sample rate.
+
+    Parameters
+    ----------
+    peaks : (k, n) ndarray
+        Frequencies of the peaks [Hz]: 0..fs/2, or with signs.
+    weights : (k, n) ndarray
+        Inverse variances of the peaks, in any unit; 0 for a segment that is not detected.
+    carriers, rates : (k, n) ndarray
+        Carrier [Hz], and signed chirp rate [Hz/s] of each segment. To refer results to the start
+        of the shot, add to the carrier of a segment rate times the time of its record.
+    sample_rate, bin_width : (n,) ndarray or float
+        [Hz]
+    signed : bool
+        True for peaks of complex records.
+    assumed : str
+        ``far`` or ``fast``.
+
+    Returns
+    -------
+    Resolution
+        nan where segments of less than two different chirp rates are detected.
+
+    Examples
+    --------
+    Two up-chirps, the second of half the slope, 300 m away and closing at 10 m/s:
+
+    >>> carriers, rates = np.full((2, 1), 1.93e14), np.array([[1e14], [5e13]])
+    >>> beats = [beat_frequency(1.0, carrier=1.93e14, chirp_rate=rate, range=np.array([300.0]),
+    ...                         radial_velocity=np.array([10.0])) for rate in rates]
+    >>> found = fit(np.abs(beats), weights=np.ones((2, 1)), carriers=carriers, rates=rates,
+    ...             sample_rate=1e9, bin_width=1e5)
+    >>> round(float(found.range[0]), 6), round(float(found.radial_velocity[0]), 6)
+    (300.0, 10.0)
+    """
+    shape = np.shape(peaks)
+    carriers, rates, weights = (np.broadcast_to(v, shape) for v in (carriers, rates, weights))
+    sample_rate, bin_width = (np.broadcast_to(v, shape[1:]) for v in (sample_rate, bin_width))
+    found = np.full((2, *shape[1:]), np.nan)
+    used = (weights > 0) & np.isfinite(peaks)
+    kinds, which = np.unique(used, axis=1, return_inverse=True)
+    for number, kind in enumerate(kinds.T):
+        here = np.ravel(which) == number
+        p, w, c, s = (v[np.ix_(kind, here)] for v in (peaks, weights, carriers, rates))
+        if kind.sum() < 2 or not np.all(np.ptp(s, axis=0) > 0):
+            continue
+        signs = _by_turns if signed else _by_signs
+        found[:, here] = signs(p, w, c, s, sample_rate[here], bin_width[here], assumed)
+    beta, x = found
+    return Resolution(SPEED_OF_LIGHT * x / (2 * (1 + beta)), SPEED_OF_LIGHT * beta / 2)
+
+
+def _least_squares(
+    beats: np.ndarray, weights: np.ndarray, carriers: np.ndarray, rates: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Doppler ratio beta and x [s] of signed beats (k, n)."""
+    # The determinant of the normal equations as a sum over pairs: nothing cancels.
+    pairs = [(i, j) for i in range(len(beats)) for j in range(i)]
+    both = [weights[i] * weights[j] for i, j in pairs]
+    minors = [carriers[j] * rates[i] - carriers[i] * rates[j] for i, j in pairs]
+    of_beta = [beats[j] * rates[i] - beats[i] * rates[j] for i, j in pairs]
+    of_x = [carriers[i] * beats[j] - carriers[j] * beats[i] for i, j in pairs]
+    whole = sum(w * m * m for w, m in zip(both, minors, strict=True))
+    beta, x = (
+        sum(w * m * v for w, m, v in zip(both, minors, own, strict=True)) / whole
+        for own in (of_beta, of_x)
+    )
+    return beta, x
+
+
+def _by_signs(  # type: ignore[no-untyped-def]  # seven arrays and a word
+    peaks, weights, carriers, rates, sample_rate, bin_width, assumed
+):
+    """(beta, x) of unsigned, folded peaks, by the assignment of signs that fits best."""
+    number = len(peaks)
+    least, found = np.full(peaks.shape[1:], np.inf), np.full((2, *peaks.shape[1:]), np.nan)
+    nearest = -bin_width / np.abs(rates).max(axis=0)  # a range of less than 0 by rounding
+    for signs in product((1, -1), repeat=number):
+        for folds in product((0, 1), repeat=number) if number > 2 else ((0,) * number,):
+            sign, fold = np.reshape(signs, (-1, 1)), np.reshape(folds, (-1, 1))
+            beats = sign * np.where(fold == 1, sample_rate - peaks, peaks)
+            beta, x = _least_squares(beats, weights, carriers, rates)
+            misfit = carriers * beta - rates * x - beats
+            cost = np.sqrt((weights * misfit**2).sum(axis=0) / weights.sum(axis=0)) / bin_width
+            cost = np.where(x < nearest, np.inf, cost + FOLD_PENALTY * sum(folds))
+            if number == 2:
+                # Where none keeps to what is assumed the first that does but for its range.
+                far = (sign == np.where(rates == 0, 1, -np.sign(rates))).all(axis=0)
+                kept = far if assumed == FAR_TARGET else np.full(far.shape, len({*signs}) == 1)
+                cost = np.where(kept, np.where(x < nearest, 1e300, 0.0), np.inf)
+            better = cost < least
+            least = np.where(better, cost, least)
+            found = np.where(better, (beta, x), found)
+    return found
+
+
+def _by_turns(  # type: ignore[no-untyped-def]  # seven arrays and a word
+    peaks, weights, carriers, rates, sample_rate, bin_width, assumed
+):
+    """(beta, x) of peaks with signs, known but for whole sample rates."""
+    column = np.arange(peaks.shape[1])
+    low, high = rates.argmin(axis=0), rates.argmax(axis=0)
+    apart = (peaks[low, column] - peaks[high, column]) / sample_rate
+    apart = (apart - np.floor(apart + _BELOW)) * sample_rate
+    x = apart / (rates[high, column] - rates[low, column])
+    turns = (peaks[high, column] + rates[high, column] * x) / sample_rate
+    shift = (turns - np.floor(turns + 0.5)) * sample_rate
+    whole = np.rint((shift - rates * x - peaks) / sample_rate)
+    return _least_squares(peaks + whole * sample_rate, weights, carriers, rates)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sweep.model import beam, looks
+from sweep.model import beam, looks, waveform
 from sweep.model.constants import ELEMENTARY_CHARGE, PLANCK, SPEED_OF_LIGHT
 from sweep.model.detectors import FIXED
 from sweep.model.effects import circulator_leak, iq_imbalance
@@ -163,7 +163,7 @@ def _met(axis: Axis, conditions: Mapping[str, Condition]) -> np.ndarray:
     return met
 
 
-def _is(word: str) -> Condition:
+def _is(word: str | float) -> Condition:
     return lambda values: values == word
 
 
@@ -378,6 +378,9 @@ def _looks_findings(grid: Grid) -> Iterator[Finding]:
         rule = "detects by the largest bin of an echo where several records are not added in "
         rule += "amplitude: the chance that any of its bins does is known for one record alone"
         yield grid.finding(DETECTION, rule, "write 'detection: peak_bin', or combine: coherent")
+    if grid.has_point(by_bin | {waveform.SHOT_DETECTION: _is(waveform.ANY_TWO)}):
+        rule = "asks for any two of three segments, of which several looks have no law"
+        yield grid.finding(waveform.SHOT_DETECTION, rule, "take both_chirps, or combine: coherent")
     if grid.has_point(voted | {looks.NUMBER: lambda number: number > MOST_VOTES}):
         rule = f"counts the votes of at most {MOST_VOTES} records"
         yield grid.finding(looks.NUMBER, rule, "take fewer, or combine: power")
@@ -543,6 +546,12 @@ def not_in_flights(grid: Grid, draws: SceneDraws) -> Iterator[Finding]:
             instead = ": beams wander by platform.jitter" if effect.turn is not None else ""
             yield _of_mode(effect.name, rule, f"leave it out{instead}")
     yield from spectra_findings(draws, grid)
+    for path in (
+        waveform.DOPPLER_SLOPE, waveform.DOWN_SLOPE, waveform.SHOT_DETECTION, waveform.TWO_BEATS,
+    ):  # fmt: skip
+        if grid.has_point({path: partial(operator.ne, waveform.DEFAULTS[path])}):
+            remedy = f"leave it at {waveform.DEFAULTS[path]}, or study a flat target"
+            yield grid.finding(path, "is not known to flights, which pair peaks", remedy)
     voted = {looks.NUMBER: _several, looks.COMBINE: _is(looks.BINARY)}
     if grid.has_point(voted | {"footprint.speckle": _is("developed")}):
         rule = "counts records, and flights draw no powers of echoes that fade in several"

@@ -65,6 +65,18 @@ class Chirp(Part):
         waveform.ORDERS,
         waveform.ORDERS[0],
     )
+    doppler_slope: float = of.number(
+        "Chirp rate of the segment 'doppler' over that of the segment 'up', with its sign: 0 for "
+        "light without a chirp",
+        "0.5", "-1000", "1000", default=0.0,
+    )  # fmt: skip
+    down_slope: float = of.number(
+        "Chirp rate of the segment 'down' over that of the segment 'up', with its sign: -1 for a "
+        "down-chirp as steep, 0.5 for a second up-chirp half as steep. With slopes other than 0 "
+        "and -1 range and velocity are a weighted least-squares fit to the beats of all segments "
+        "that are detected",
+        "-0.5", "-1000", "1000", default=-1.0,
+    )  # fmt: skip
     gap: float = of.duration(
         "Time from the end of a segment to the start of the next", "5 us", "0 s", "1e6 s",
         default=0.0,
@@ -230,6 +242,19 @@ class Processing(Part):
         "Bins by which an echo is detected: any that it occupies, or the largest alone",
         ("any_bin", "peak_bin"),
         "any_bin",
+    )
+    shot_detection: str = of.choice(
+        "Segments in which a shot is detected: both chirps; or any two of three, which still tell "
+        "range and velocity where the third is missed",
+        waveform.SHOT_DETECTIONS,
+        waveform.BOTH_CHIRPS,
+    )
+    two_beats: str = of.choice(
+        "What is taken for granted where two beats of a real record tell range and velocity: far, "
+        "the range beat of a chirp exceeds the Doppler shift (and where one of them is of the "
+        "light without a chirp, the target is closing); fast, the Doppler shift exceeds them",
+        waveform.ASSUMPTIONS,
+        waveform.FAR_TARGET,
     )
     noise_bins: str = of.choice(
         "Noise of bins: correlated as window and padding make it, and real at DC and "

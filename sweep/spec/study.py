@@ -14,13 +14,20 @@ import numpy as np
 from pydantic import ConfigDict, Field, PrivateAttr, ValidationError
 
 import sweep.spec.declaring as of
-from sweep.model import VERSION
+from sweep.model import VERSION, waveform
 from sweep.model.threshold import WAYS
 from sweep.spec.axes import Axis, Member, paths_on_axes, read_axes
 from sweep.spec.fields import SECTIONS, parameter_rules, parameter_suggestion, short_name
 from sweep.spec.figures import Figure, figure_findings
 from sweep.spec.generators import values_in
-from sweep.spec.grid_rules import Grid, grid_findings, is_method, spectra_findings, without_draws
+from sweep.spec.grid_rules import (
+    Condition,
+    Grid,
+    grid_findings,
+    is_method,
+    spectra_findings,
+    without_draws,
+)
 from sweep.spec.identity import axis_identity, digest
 from sweep.spec.instrument import Instrument
 from sweep.spec.mistakes import Finding, Location, Mistake, SpecError, dotted, shown
@@ -124,7 +131,7 @@ class Study(Part):
             findings += findings_of(error, cls)
         grid = Grid.of(written, axes)
         findings += grid_findings(grid)
-        findings += _size_findings(axes)
+        findings += [*_size_findings(axes), *_segment_findings(grid)]
         findings += cls.further_findings(written, grid, base, axes_are_whole)
         # What is wrong with an axis or an instrument's file is told there, and there alone.
         findings = [
@@ -300,6 +307,18 @@ def _parameter(name: str, known: Mapping[str, object]) -> tuple[str, Rule | None
     rules = parameter_rules()
     paths = [path for path in known if name in (path, short_name(path))]
     return (paths[0], rules[paths[0]]) if len(paths) == 1 else (name, None)
+
+
+def _segment_findings(grid: Grid) -> Iterator[Finding]:
+    """Report segments whose beats do not tell range and velocity apart, and rules without laws."""
+    if grid.has_point({waveform.DOWN_SLOPE: lambda slope: slope == 1.0}):
+        rule = "is the slope of the segment 'up': range and velocity need two slopes"
+        yield grid.finding(waveform.DOWN_SLOPE, rule, "write another, or -1 for a triangle")
+    any_two: dict[str, Condition] = {waveform.SHOT_DETECTION: lambda rule: rule == waveform.ANY_TWO}
+    slopes = {1.0, *grid.span(waveform.DOWN_SLOPE)}
+    if grid.has_point(any_two | {waveform.DOPPLER_SLOPE: lambda v: np.isin(v, [*slopes])}):
+        rule = "is another segment's too, and these two tell neither range nor velocity: any_two"
+        yield grid.finding(waveform.DOPPLER_SLOPE, rule, "write another, or take both_chirps")
 
 
 def _size_findings(axes: tuple[Axis, ...]) -> list[Finding]:

@@ -125,7 +125,7 @@ def test_the_upper_axis_reads_true_range_and_velocity_at_the_beats_folded_or_not
         at_peak = segment.frequency[segment.peak]
         found = float(shot_figure.quantity_at(shot, segment, np.array(at_peak)))
         # a bin is 0.343 m of range and 3.55 mm/s of velocity; the peak is within one
-        if segment.sign:
+        if segment.slope:
             assert found == pytest.approx(distance, abs=0.35)
         else:
             assert found == pytest.approx(velocity, abs=0.0036)

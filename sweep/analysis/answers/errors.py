@@ -22,6 +22,7 @@ _PARAMETERS = {
     "architecture": "receiver.architecture", "wavelength": "laser.wavelength",
     "bandwidth": "chirp.bandwidth", "start_frequency": "chirp.start_frequency",
     "duration": "chirp.duration", "segments": "chirp.segments", "gap": "chirp.gap",
+    "doppler_slope": "chirp.doppler_slope", "down_slope": "chirp.down_slope",
     "sample_rate": "processing.sample_rate",
     "fft_size": "processing.fft_size", "window": "processing.window",
     "delay": "processing.acquisition_delay", "line_width": "laser.line_width",
@@ -126,24 +127,25 @@ def _alike(snr: list[np.ndarray], p: dict[str, np.ndarray]) -> estimators.Deviat
         sample_rate=p["sample_rate"][:1],
     )[0])  # fmt: skip
     shape = window(str(p["window"][0]), length)
+    slopes = np.ones_like(p["down_slope"]), p["doppler_slope"], p["down_slope"]
     carriers = waveform.carrier_frequencies(
         str(p["architecture"][0]), wavelength=p["wavelength"],
-        start_frequency=p["start_frequency"], bandwidth=p["bandwidth"],
+        start_frequency=p["start_frequency"], bandwidth=p["bandwidth"], slopes=slopes,
     )  # fmt: skip
     chirp_rate = p["bandwidth"] / p["duration"]
     deviations = []
     order = waveform.order_of(str(p["architecture"][0]), str(p["segments"][0]))
     starts = waveform.segment_starts(order, duration=p["duration"], gap=p["gap"])
     late = 0.5 * (p["looks"] - 1) * len(order) * (p["duration"] + p["gap"])
-    for segment, sign in enumerate(waveform.SIGNS):
+    for segment, slope in enumerate(slopes):
         carrier, seen = carriers[segment], snr[segment]
         moved = np.where(p["moves"], (starts[segment] + late) * p["radial_velocity"], 0.0)
         beat = waveform.beat_frequency(
-            sign, carrier=carrier, chirp_rate=chirp_rate, range=p["range"] - moved,
+            slope, carrier=carrier, chirp_rate=chirp_rate, range=p["range"] - moved,
             radial_velocity=p["radial_velocity"],
         )  # fmt: skip
         # the frequency drifts by 2 s S beta a second: by half of that by the record's middle
-        walk = sign * chirp_rate * (2 * p["radial_velocity"] / SPEED_OF_LIGHT) * length / rate
+        walk = slope * chirp_rate * (2 * p["radial_velocity"] / SPEED_OF_LIGHT) * length / rate
         beat = np.where(p["walks"], beat + walk, beat)
         place = waveform.fold(beat, p["sample_rate"]) / rate * size
         # in bins of fs/L: a padded FFT's bins are finer than the window's
@@ -163,7 +165,7 @@ def _alike(snr: list[np.ndarray], p: dict[str, np.ndarray]) -> estimators.Deviat
     up, doppler, down = deviations
     found = estimators.resolved_deviation(
         up=up, doppler=doppler, down=down, carriers=carriers, chirp_rate=chirp_rate,
-        range=p["range"], radial_velocity=p["radial_velocity"],
+        range=p["range"], radial_velocity=p["radial_velocity"], slopes=slopes,
     )  # fmt: skip
     dark = np.isnan(snr[0]) | np.isnan(snr[2])
     return estimators.Deviation(*(np.where(dark, np.nan, b) for b in found))

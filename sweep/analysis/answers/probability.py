@@ -291,11 +291,14 @@ def roc(
             f"{number:,} points make too many curves (at most {MOST_POINTS:,}): select some"
         )
     looks = _looks_of(spec_of(dataset))
+    rule = parameter(dataset, waveform.SHOT_DETECTION, spec_of(dataset))
     needed = [f"{kind}_{s}" for s in _SEGMENTS[segment] for kind in ("snr", "pd")]
     needed += [named("pd", segment), "log10_pfa_bin", "effects"]
     dataset = dataset[list(dict.fromkeys(needed))].compute()
     level = xr.DataArray(looks.level(np.log(chances)), dims=["pfa_bin"])
     pd, exact = _closed(dataset, segment, level, looks)
+    if segment == "shot":  # else of two segments out of three
+        exact = exact & (rule == waveform.BOTH_CHIRPS)
     tnr = level * _own_tnr(dataset) / _own_level(dataset, looks)
     result = xr.Dataset(
         {"pd": pd, CURVE_TNR: tnr, "simulated": ~exact, "half_width": xr.zeros_like(pd)},

@@ -124,7 +124,15 @@ class Points:
         self.acceleration = self["target.acceleration"]
         """[m/s^2]."""
         self.looks = Looks.of(parameters)
-        self.signs = self.columns(*self._there(waveform.SIGNS))
+        self.slopes: tuple[np.ndarray | float, ...] = (
+            1.0,
+            *(
+                np.asarray(parameters.get(path, waveform.DEFAULTS[path]), float)
+                for path in (waveform.DOPPLER_SLOPE, waveform.DOWN_SLOPE)
+            ),
+        )
+        """Chirp rates of up, Doppler and down segment over :attr:`chirp_rate`, signed."""
+        self.signs = self.columns(*self._there(self.slopes))
         coherent = self.word("footprint.phases") == "coherent"
         self.adds_amplitudes = coherent or direct
         self.by_roots = coherent and not direct
@@ -192,6 +200,7 @@ class Points:
             wavelength=self[LASER + "wavelength"],
             start_frequency=self[CHIRP + "start_frequency"],
             bandwidth=self[CHIRP + "bandwidth"],
+            slopes=self.slopes,
         )
         return self.columns(*self._there(found))
 

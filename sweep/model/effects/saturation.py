@@ -142,7 +142,7 @@ def beat_amplitude(shots: Shots) -> np.ndarray:
         "chirp_rate": shots.chirp_rate, "range": shots.range,
         "radial_velocity": np.asarray(shots.beta * SPEED_OF_LIGHT / 2),
     }  # fmt: skip
-    chirps = zip(waveform.SIGNS, shots.carriers, strict=True)
+    chirps = zip(shots.slopes, shots.carriers, strict=True)
     beats = [waveform.beat_frequency(sign, carrier=carrier, **shape) for sign, carrier in chirps]
     gain = link.transfer(
         np.min(np.abs(beats), axis=0), transimpedance=np.ones(1),
