@@ -34,11 +34,11 @@ NOT_IN_THE_MODEL = {
 """Pure physics: arrays in, arrays out."""
 
 LARGEST_HOUSE = {
-    "lines": 50_040, "modules": 183, "lines of the model": 18_982, "modules of the model": 71,
-    "compiled functions": 129, "arguments of a compiled function": 10,
+    "lines": 50_040, "modules": 183, "lines of the model": 19_320, "modules of the model": 75,
+    "compiled functions": 134, "arguments of a compiled function": 10,
 }  # fmt: skip
 """Upper limits on the size of sweep/."""
-LARGEST_MODULE = 620
+LARGEST_MODULE = 660
 LARGEST_FUNCTION = 50
 
 

@@ -43,10 +43,12 @@ def bin_probability(tnr: float, looks: Looks = ONE) -> float:
     return math.exp(-bin_exponent(tnr))
 
 
-def bins_counted(parameters: Mapping[str, Any], bin_probability: ArrayLike) -> np.ndarray:
+def bins_counted(
+    parameters: Mapping[str, Any], bin_probability: ArrayLike, segment: str = "up"
+) -> np.ndarray:
     """Independent bins with the false alarms of a segment, by the probability of one in a bin."""
     level = Looks.of(parameters).level(np.log(np.maximum(bin_probability, 1e-300)))
-    return segment_bins(parameters, level)
+    return segment_bins(parameters, level, segment)
 
 
 def segment_probability(bin_probability: np.ndarray, bins: ArrayLike) -> np.ndarray:
@@ -79,9 +81,11 @@ def alarms_of_study(study: Spec | SceneSpec) -> list[tuple[float, float]]:
             in_a_bin = float(parameters["instrument.processing.detector.pfa"])
         else:
             continue
-        bins = float(bins_counted(parameters, in_a_bin))
-        once, twice = (float(segment_probability(np.asarray(in_a_bin), n * bins)) for n in (1, 2))
-        found.append((twice, once**2))
+        up, down = (float(bins_counted(parameters, in_a_bin, s)) for s in ("up", "down"))
+        one, other, any_ = (
+            float(segment_probability(np.asarray(in_a_bin), bins)) for bins in (up, down, up + down)
+        )
+        found.append((any_, one * other))
     return found
 
 

@@ -358,12 +358,13 @@ def reference(spec: Spec, setting: dict[str, Any]) -> Reference:
     parameters = first | setting | {"target.reflectance": 0.0}
     tnr = float(tnr_of(parameters))
     in_a_bin = noise_only.bin_probability(tnr, Looks.of(parameters))
-    bins = float(noise_only.bins_counted(parameters, in_a_bin))
+    both = [noise_only.bins_counted(parameters, in_a_bin, s) for s in ("up", "down")]
+    bins = float(both[0])
     found = evaluate(parameters)
     return Reference(
         tnr=tnr,
         bins=bins,
-        closed_form=float(noise_only.segment_probability(np.asarray(in_a_bin), bins)) ** 2,
+        closed_form=float(noise_only.segment_probability(np.asarray(in_a_bin), both).prod()),
         model=float(found["pfa_both_chirps"].item()),
         model_bin=float(found["pfa_bin"].item()),
     )

@@ -152,7 +152,7 @@ def _statistics(shots: Shots, found: Groups) -> dict[str, np.ndarray]:
     up, doppler, down = found.pd[:, :, 0].T
     both = shots.both(up, down, (found.magnitude[:, 0, 0], found.magnitude[:, 2, 0]))
     one = np.exp(shots.looks.log_alarm(shots.threshold / shots.bin_deviation))[:, None]
-    noise = at_least_one(one, shots.counted_bins(found.exempted.T[[0, 2]]).T)
+    noise = at_least_one(one, shots.counted_bins(found.exempted.T).T[:, [0, 2]])
     leakage = found.leakage[:, [0, 2]]
     alarm = leakage + noise * (1 - leakage)
     above = found.magnitude[:, 0] >= shots.threshold[:, None]

@@ -194,7 +194,9 @@ def seen_spectra(shots: Shots) -> Iterator[tuple[np.ndarray, Seen]]:
         number = np.arange(run.size) - (np.cumsum(count) - count)[run]
         at, point = start[run] + number, runs.part[run // 3]
         ratio = runs.magnitudes[at] / sigma[point]
-        leaks = (ratio >= floor[point]) & (number != peak[run]) & ~runs.exempt[at]
+        inside = runs.inside.T.ravel()
+        leaks = (ratio >= floor[point]) & ((number != peak[run]) | ~inside[run])
+        leaks &= ~runs.exempt[at]
         leaking = np.bincount(run[leaks], minlength=count.size).reshape(-1, 3)
         after = np.cumsum(leaking).reshape(-1, 3)
         there = runs.bins.T > 0
@@ -204,7 +206,9 @@ def seen_spectra(shots: Shots) -> Iterator[tuple[np.ndarray, Seen]]:
             low=np.where(there, runs.low.T, 0),
             peak=np.where(there, runs.peak.T, 0),
             real=np.isin((runs.low + runs.peak).T, (0, shots.real_ends / 2)) & there & is_real,
-            ratio=np.where(there, runs.magnitude.T / sigma[runs.part, None], np.nan),
+            ratio=np.where(
+                there & runs.inside.T, runs.magnitude.T / sigma[runs.part, None], np.nan
+            ),
             start=(np.cumsum(count) - count).reshape(-1, 3),
             bins=runs.bins.T,
             ratios=ratio,

@@ -10,7 +10,7 @@ from numba import njit
 
 from sweep.model.detection import echo_of, found_pair
 from sweep.model.preparation import Shots
-from sweep.model.segments import runs_of
+from sweep.model.segments import Runs, runs_of
 
 BIN, FIRST, LAST = range(3)
 """Bins of a group: the strongest, the first and the last."""
@@ -56,17 +56,34 @@ def groups(shots: Shots, *, most: int = 4, every_bin: bool = False) -> Groups:
     levels = np.stack([shots.threshold, shots.line_deviation])
     mirror = 0 if shots.complex_record else shots.fft_size // 2
     for runs in runs_of(shots, every_bin=every_bin):
+        count, magnitudes = (runs.bins, runs.magnitudes) if shots.band is None else _echoes(runs)
         _find_groups(
-            runs.part, (runs.low, runs.bins, runs.peak, runs.start), runs.magnitudes, levels,
+            runs.part, (runs.low, count, runs.peak, runs.start), magnitudes, levels,
             (mirror, shots.echo_rule), bins, neighbours, pd,
         )  # fmt: skip
         if shots.looks.several:
             seen, middle = bins[BIN][runs.part], neighbours[runs.part][..., 1]
             chances = shots.detected(middle.T, seen.T, runs.part)[0]
             pd[runs.part] = chances.T
-        some = np.where(runs.bins > 0, runs.exempted, np.nan)
+        pd[runs.part, :, 0] = np.where(runs.inside.T | (count.T > 0), pd[runs.part, :, 0], 0.0)
+        some = np.where((runs.bins > 0) | ~runs.inside, runs.exempted, np.nan)
         exempted[runs.part], leakage[runs.part] = some.T, runs.leakage.T
     return Groups(bins[BIN], bins[FIRST], bins[LAST], neighbours, pd, exempted, leakage)
+
+
+def _echoes(runs: Runs) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers of bins of runs, and |X|, with nothing but echoes where the largest is not searched.
+
+    Sidelobes of what is not searched are no groups, and leak.
+    """
+    count, magnitudes = runs.bins.copy(), runs.magnitudes
+    for s, j in np.argwhere(~runs.inside):
+        start, end = runs.start[s, j] + np.array([0, runs.bins[s, j]])
+        exempt = runs.exempt[start:end]
+        magnitudes[start:end][~exempt] = 0.0
+        if not exempt.any():
+            count[s, j] = 0
+    return count, magnitudes
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -54,6 +54,7 @@ from sweep.model.interpolation import interpolator, phasors, sub_bin
 from sweep.model.looks import BINARY
 from sweep.model.philox import STREAM_LASER_PHASE, STREAM_RECORD, normals, uniforms
 from sweep.model.preparation import Parameters, Shots
+from sweep.model.search import is_searched
 from sweep.model.segments import spectrum as segment_spectrum
 from sweep.model.shot import fit
 
@@ -80,11 +81,13 @@ class Signal(NamedTuple):
     largest magnitude, and a main lobe's half-width to either side. What is detected elsewhere is
     a false alarm, leaked signal or not."""
     last: int
-    """Last of them; below ``first`` where there is no echo."""
+    """Last of them; below ``first`` where there is no echo, or its largest bin is not searched."""
     frequency: float
     """Where a lone tone of these magnitudes about the largest bin stands [bins]."""
     cnr: float
     """Power of the signal over that of the noise in the record, before the FFT."""
+    segment: int
+    """0 up, 1 Doppler, 2 down."""
     echo: np.ndarray | None = None
     """(N/2 + 1,) int64: number of the echo that each bin is nearest to; None where all are one."""
 
@@ -104,7 +107,7 @@ def signal_of(
     least = 0 if shots.real_ends else 1  # at DC and Nyquist, else taken for circular
     k = int(np.clip(np.argmax(magnitude), least, half - least))
     if not magnitude[k] > 0:
-        return Signal(magnitude.astype(complex), k, 1, 0, float(k), 0.0)
+        return Signal(magnitude.astype(complex), k, 1, 0, float(k), 0.0, segment)
     tables = interpolator(window, shots.fft_size)
     below, above = magnitude[abs(k - 1)], magnitude[min(k + 1, 2 * half - k - 1)]
     place = k + sub_bin(below, magnitude[k], above, tables)
@@ -119,6 +122,8 @@ def signal_of(
         phases[first : last + 1] = phases[k] * np.exp(
             -1j * np.pi * apart * (window.length / shots.fft_size)
         )
+    if not is_searched(shots, segment, i, k):
+        first, last = 1, 0
     echo = None
     if len(echoes) > 1:
         echo = np.abs(np.arange(half + 1)[:, None] - np.asarray(echoes)).argmin(axis=1)
@@ -134,6 +139,7 @@ def signal_of(
         last=last,
         frequency=place,
         cnr=float(power / shots.noise_variance[i]),
+        segment=segment,
         echo=echo,
     )
 
@@ -309,7 +315,9 @@ def view_of(
     return view._replace(signals=signals)
 
 
-def flagged(spectra: Sequence[np.ndarray], view: View) -> tuple[np.ndarray, np.ndarray]:
+def flagged(
+    spectra: Sequence[np.ndarray], view: View, segment: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Mean power of a segment's looks, and the bins that are flagged, (m, N/2 + 1) each."""
     powers = [each.real**2 + each.imag**2 for each in spectra]
     power = powers[0] if len(powers) == 1 else np.mean(powers, axis=0)
@@ -318,7 +326,7 @@ def flagged(spectra: Sequence[np.ndarray], view: View) -> tuple[np.ndarray, np.n
         flags = np.asarray(votes >= view.shots.looks.votes)
     else:
         flags = np.array(view.detect(power, view.setting), bool)
-    return power, flags
+    return power, flags & is_searched(view.shots, segment, view.i, np.arange(flags.shape[1]))
 
 
 def placed(spectra: Sequence[np.ndarray], peak: np.ndarray, view: View) -> np.ndarray:
@@ -329,14 +337,15 @@ def placed(spectra: Sequence[np.ndarray], peak: np.ndarray, view: View) -> np.nd
 
 def look(spectra: Sequence[np.ndarray], signal: Signal, view: View) -> Found:
     """Detect and estimate in spectra (m, N/2 + 1) of a segment, of one or several looks."""
-    power, flags = flagged(spectra, view)
+    power, flags = flagged(spectra, view, signal.segment)
     shots, bins, half = view.shots, np.arange(power.shape[1]), power.shape[1] - 1
     low, high = max(signal.strongest - 1, 0), min(signal.strongest + 2, half + 1)
     if shots.detection == "any_bin" and signal.last >= signal.first:
         low, high = signal.first, signal.last + 1
     if not shots.real_ends:
         low, high = max(low, 1), min(high, half)
-    near = np.where(flags[:, low:high], power[:, low:high], -1.0)
+    own = flags[:, low:high] & is_searched(shots, signal.segment, view.i, signal.strongest)
+    near = np.where(own, power[:, low:high], -1.0)
     hit, detected = low + near.argmax(axis=1), near.max(axis=1) >= 0
     flags[:, [0, -1]] = False  # DC and Nyquist
     edges = np.diff(flags.astype(np.int8), axis=1)
@@ -371,8 +380,10 @@ def counted(view: View, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     for s, signal in enumerate(view.signals):
         if signal is not None:
             found[s] = look(list(spectra_of(view, s, draws)), signal, view)
-            inside = view.setting.fft_size // 2 + 1 - 2 * view.shots.searched_from
-            searched += inside - max(signal.last - signal.first + 1, 0)
+            first, last = view.shots.searched_from, view.setting.fft_size // 2 + 1
+            inside = is_searched(view.shots, s, view.i, np.arange(last))
+            occupied = inside[signal.first : signal.last + 1].sum()
+            searched += int(inside[first : last - first].sum() - occupied)
     up, doppler, down = found
     detected, alarm = np.array([f.detected for f in found]), (up.alarms > 0, down.alarms > 0)
     shot = up.detected & down.detected

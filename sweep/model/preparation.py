@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sweep.model import alarms, beam, link, waveform
+from sweep.model import alarms, beam, link, search, waveform
 from sweep.model.accuracy import AUTOMATIC, Accuracy
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detectors import main_lobe
@@ -89,6 +89,8 @@ class Shots:
     window: Window
     fft_size: int
     bins_counted: str
+    band: np.ndarray | None
+    """(3, 2, n) int64: first bin and number of bins searched (:mod:`sweep.model.search`)."""
     noise_bins: str
     """``correlated``: noise of bins as the record makes it; ``independent``: as [T] has it."""
     detection: str
@@ -299,8 +301,10 @@ class Shots:
         level, alike = self.threshold / self.line_deviation, np.abs(self.fading.over)
         if self.looks.several:
             one, other = (magnitude / self.line_deviation for magnitude in magnitudes)
-            return self.looks.faded_together(one, other, level, alike)
-        return detection.fading_together(up, down, level, alike)
+            both = self.looks.faded_together(one, other, level, alike)
+        else:
+            both = detection.fading_together(up, down, level, alike)
+        return both if self.band is None else np.where((up == 0) | (down == 0), 0.0, both)
 
     @property
     def any_two(self) -> bool:
@@ -440,16 +444,20 @@ class Shots:
 
         Parameters
         ----------
-        exempted : (..., m) ndarray
-            Bins that the detection of some points occupies.
+        exempted : (3, m) ndarray
+            Bins searched that the detection of some points occupies, by segment.
         points
             Which points these are.
         """
-        searched = self.fft_size if self.complex_record else self.fft_size // 2
+        searched: Any = self.fft_size if self.complex_record else self.fft_size // 2
         if self.real_ends:
             searched += 1 - 2 * self.searched_from
+        if self.band is not None:
+            size, first = self.fft_size, self.searched_from
+            of_band = search.number_of(self.band, size, first, is_signed=self.complex_record)
+            searched = of_band[:, points]
         bins = np.maximum(searched - exempted, 0.0)
-        if self.bins_counted == "all":
+        if self.bins_counted == "all" and self.band is None:
             bins = np.full(np.shape(exempted), float(self.fft_size))
         if self.noise_bins == "independent":
             return bins
@@ -513,12 +521,8 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
 
     Parameters
     ----------
-    p : mapping
-        Of :func:`categories`.
-    size : int
-        Points n.
-    ground : Ground
-        What the beams meet.
+    p, size, ground : mapping, int, Ground
+        Of :func:`categories`; points n; what their beams meet.
     """
     architecture = str(p[RECEIVER + "architecture"])
     echo_scale, current_scale = link_scales(architecture, p)
@@ -531,6 +535,7 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
         window=window(canonical_name(str(p[PROCESSING + "window"])), int(p["record"])),
         fft_size=int(p[PROCESSING + "fft_size"]),
         bins_counted=str(p[PROCESSING + "bins_counted"]),
+        band=search.band_of(p, size),
         noise_bins=str(p[PROCESSING + "noise_bins"]),
         detection=str(p[PROCESSING + "detection"]),
         shot_detection=str(p[waveform.SHOT_DETECTION]),
@@ -546,13 +551,7 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
         bandwidth=p[CHIRP + "bandwidth"],
         duration=p[CHIRP + "duration"],
         slopes=waveform.slopes_of(p),
-        carriers=waveform.carrier_frequencies(
-            architecture,
-            wavelength=p[LASER + "wavelength"],
-            start_frequency=p[CHIRP + "start_frequency"],
-            bandwidth=p[CHIRP + "bandwidth"],
-            slopes=waveform.slopes_of(p),
-        ),
+        carriers=waveform.carriers_of(p),
         sample_rate=p[PROCESSING + "sample_rate"] + everywhere,
         acquisition_delay=p[PROCESSING + "acquisition_delay"],
         detector_bandwidth=p[RECEIVER + "detector_bandwidth"],

@@ -60,6 +60,7 @@ from sweep.model.pairing import (
     pair_peaks,
 )
 from sweep.model.preparation import Shots
+from sweep.model.search import beamlet_lines, columns
 
 WHOLE, FINE, ERROR, RATIO = range(4)
 """Fields of a peak: bin; position between bins and its standard error [bins]; |X| / sigma."""
@@ -201,6 +202,8 @@ class Known(NamedTuple):
     beside: np.ndarray
     """(n, 2, most): chance of a group in the down segment, where the up segment's of the same
     number is missed, or detected."""
+    searched: np.ndarray
+    """(n, 3, 2) int64: first and last of the bins that false peaks may lie in."""
     mixing: np.ndarray
     """(n, 6), as of :meth:`sweep.model.detection.Fading.mixing`; or (n, 0)."""
 
@@ -250,8 +253,21 @@ def known_of(shots: Shots, found: Groups) -> Known:
         bins, found.pd, found.neighbours, np.sqrt(np.maximum(square - mean**2, 0.0)), lines,
         amplitude, np.stack([shots.bin_deviation, *noise_levels(shots)], axis=1), found.leakage,
         np.broadcast_to(carrier / (carrier + shots.bandwidth / 2), n).copy(), _beside(shots, found),
+        _searched(shots),
         np.empty((n, 0)) if shots.fading is None else shots.fading.mixing().T.copy(),
     )  # fmt: skip
+
+
+def _searched(shots: Shots) -> np.ndarray:
+    """First and last bin searched, as of :class:`Known`: 1..N/2; of a complex record 0..N - 1."""
+    whole = (0, shots.fft_size - 1) if shots.complex_record else (1, shots.fft_size // 2)
+    found = np.empty((shots.size, 3, 2), np.int64)
+    found[:] = whole
+    if shots.band is not None:
+        first, number = shots.band[:, 0].T, shots.band[:, 1].T
+        found[..., 0] = first if shots.complex_record else np.maximum(first, 1)
+        found[..., 1] = first + number - 1
+    return found
 
 
 def _beside(shots: Shots, found: Groups) -> np.ndarray:
@@ -261,34 +277,10 @@ def _beside(shots: Shots, found: Groups) -> np.ndarray:
     return np.ascontiguousarray(np.moveaxis(down_given_up(up, down, both), 0, 1))
 
 
-def beamlet_lines(shots: Shots) -> np.ndarray:
-    """Places of each beamlet's line in the three spectra [bins, 0..N/2], (n, 3, beamlets).
-
-    In spectra of complex records -N/2 .. N/2.
-    """
-    per_metre = _columns(shots, shots.chirp_rate) * (2 / SPEED_OF_LIGHT)  # as a beat [Hz]
-    distance = per_metre * _columns(shots, shots.range), 1 + shots.offset[shots.row]
-    own = shots.doppler[shots.row]
-    lines = np.empty((shots.size, 3, own.shape[1]))
-    for s, each in enumerate(shots.waveform):
-        beta = _columns(shots, each.beta) + own
-        drifted = SPEED_OF_LIGHT / 2 * own * _columns(shots, each.start)
-        far = distance[0] * distance[1] - per_metre * (_columns(shots, each.nearer) + drifted)
-        beat = _columns(shots, each.carrier) * beta - each.slope * far * (1 + beta)
-        turns = beat / _columns(shots, shots.sample_rate)
-        lines[:, s] = (turns - np.floor(turns + 0.5)) * shots.fft_size
-    return lines if shots.complex_record else abs(lines)
-
-
-def _columns(shots: Shots, values: np.ndarray | float, dims: int = 1) -> np.ndarray:
-    """One value a point, with so many dimensions behind it."""
-    return np.broadcast_to(values, shots.size).reshape(-1, *[1] * dims)
-
-
 def measured(shots: Shots, found: Groups, drawn: Drawn) -> Returns:
     """Compute returns from pairs of peaks; flag those that misread their common beamlet."""
     carrier, bandwidth, duration, rate, deepest, walk = (
-        _columns(shots, column, 3)
+        columns(shots, column, 3)
         for column in (
             shots.carriers[0], shots.bandwidth, shots.duration, shots.sample_rate, shots.range,
             shots.walk,
@@ -312,13 +304,13 @@ def measured(shots: Shots, found: Groups, drawn: Drawn) -> Returns:
     sizes = (found.last - found.first)[point[..., None], np.arange(3), group]
     reach = 2 * (4 + np.where(drawn.group >= 0, sizes, 0).sum(axis=-1))  # of half bins
     offset, doppler = shots.offset[shots.row], SPEED_OF_LIGHT / 2 * shots.doppler[shots.row]
-    truth = _columns(shots, shots.radial_velocity) + doppler
+    truth = columns(shots, shots.radial_velocity) + doppler
     seen = np.maximum(drawn.beamlet, 0)
     # Up and down beat tell the range at the middle of their starts; acceleration adds to it.
-    first, last = (_columns(shots, shots.starts[s], 2) for s in (0, 2))
-    pulled = carrier / (bandwidth / duration) * _columns(shots, shots.acceleration, 3)
+    first, last = (columns(shots, shots.starts[s], 2) for s in (0, 2))
+    pulled = carrier / (bandwidth / duration) * columns(shots, shots.acceleration, 3)
     pulled = 0.5 * (last - first) * pulled[..., 0]
-    pulled -= 0.5 * (last + first) * _columns(shots, shots.approach, 2)
+    pulled -= 0.5 * (last + first) * columns(shots, shots.approach, 2)
     off = distance[..., FINE] - pulled - deepest[..., 0] * (1 + offset[point, seen])
     right = abs(off) <= reach * metre
     right &= abs(velocity[..., FINE] - truth[point, seen]) <= reach * speed
@@ -326,7 +318,7 @@ def measured(shots: Shots, found: Groups, drawn: Drawn) -> Returns:
     pd = found.pd[point, 0, group[..., 0]] * _beside(shots, found)[point, 1, group[..., 2]]
     misread = (drawn.flags & TRUE > 0) & ~right
     # What the ground came nearer by within the shot, which the measured velocity tells.
-    velocity[..., FINE] *= 1 + _columns(shots, shots.slowing, 2)
+    velocity[..., FINE] *= 1 + columns(shots, shots.slowing, 2)
     distance[..., FINE] += velocity[..., FINE] * walk[..., 0]
     return Returns(
         distance[..., WHOLE], distance[..., FINE], velocity[..., WHOLE], velocity[..., FINE],
@@ -442,7 +434,8 @@ def draw_peaks(address, at, how, known, seen, tables, peaks, which, up):
     if chance < known.alarm[i, s]:
         ratio = max(largest_of(seen.others[i, s], chance, how.looks), beta)
         if place < 0 or ratio > largest:
-            place = free_bin(philox.to_uniform(words[1]), bins, how.half, how.signed)
+            ends = known.searched[i, s, 0], known.searched[i, s, 1]
+            place = free_bin(philox.to_uniform(words[1]), bins, ends, 2 * how.half, how.signed)
             largest = ratio
     if place >= 0:
         error = sub_bin_error(0.0, largest, tables) / math.sqrt(how.looks)
@@ -542,18 +535,19 @@ def put(peak, whole, fine, error, ratio, spread, how, tables):
 
 
 @njit(cache=True, error_model="numpy")
-def free_bin(chance, bins, half, signed):
+def free_bin(chance, bins, ends, size, signed):
     """Bin outside the groups and the bins beside them, uniformly by a chance.
 
-    One of 1..N/2, of a complex record 0..N - 1.
+    One of those from the first to the last of ``ends``; of a complex record, of N = ``size`` bins,
+    as far round as they go on.
     """
-    first, last = (0, 2 * half - 1) if signed else (1, half)
+    first, last = ends
     number = 0
     while number < bins.shape[1] and bins[BIN, number] >= 0:
         number += 1
     spans, free, end = np.empty((number, 2), np.int64), last - first + 1, first
     for g in range(number):  # disjoint; in rising order
-        turned = (bins[BIN, g] // (last + 1)) * (last + 1) if signed else 0
+        turned = (bins[BIN, g] - first) // size * size if signed else 0
         k = g
         while k > 0 and spans[k - 1, 0] > bins[FIRST, g] - turned:
             spans[k, 0], spans[k, 1] = spans[k - 1, 0], spans[k - 1, 1]

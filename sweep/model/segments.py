@@ -38,6 +38,7 @@ from sweep.model.lines import (
 )
 from sweep.model.looks import MOST_PLACES
 from sweep.model.preparation import LINE_STEPS, Shots
+from sweep.model.search import cut
 from sweep.model.spectrum import (
     A_IM,
     A_RE,
@@ -97,6 +98,8 @@ class Runs(NamedTuple):
     """|X| of all runs, one after the other."""
     exempt: np.ndarray
     """Bins of them that can't raise a false alarm, bool."""
+    inside: np.ndarray
+    """Whether the largest bin of all is searched, bool; else it is in no run."""
 
     def run(self, segment: int, i: int) -> np.ndarray:
         """|X| of one run, (count,)."""
@@ -129,10 +132,10 @@ def find(shots: Shots, *, every_bin: bool = False) -> np.ndarray:
     width = (shots.sample_rate / shots.fft_size) + np.zeros(shots.size)
     for runs in runs_of(shots, every_bin=every_bin, keep=False):
         for s in np.flatnonzero(shots.segments):
+            frequency = _bin(shots, runs.low[s] + runs.peak[s]) * width[runs.part]
             found[s][:, runs.part] = (
                 runs.pd[s], runs.miss[s], runs.magnitude[s],
-                _bin(shots, runs.low[s] + runs.peak[s]) * width[runs.part], runs.exempted[s],
-                runs.leakage[s],
+                np.where(runs.inside[s], frequency, np.nan), runs.exempted[s], runs.leakage[s],
             )  # fmt: skip
     return found
 
@@ -145,6 +148,7 @@ def runs_of(
     leakage: bool = True,
     every_bin: bool = False,
     keep: bool = True,
+    whole: bool = False,
 ) -> Iterator[Runs]:
     """Yield runs of all points, some points at a time, in any order.
 
@@ -163,6 +167,8 @@ def runs_of(
         Look at each bin by itself where leakage could be summed as an integral.
     keep : bool
         Hand the bins' magnitudes on.
+    whole : bool
+        Look at bins that are not searched as well.
     """
     table = shots.point_table()
     levels = table[11] if least is None else np.broadcast_to(least, shots.size)
@@ -172,8 +178,10 @@ def runs_of(
         floor = table[12] * table[10] if leaks == BIN_BY_BIN else np.inf
         lowest, done = np.minimum(levels, floor), 0
         while done < together.part.size:
-            held = keep or (shots.looks.several and bool(leaks)) or shots.leak_amplitude is not None
+            held = keep or (shots.looks.several and bool(leaks))
+            held |= shots.leak_amplitude is not None or shots.band is not None
             runs, number = _some(shots, table, lowest, together, leaks, done, held)
+            runs = runs if whole else cut(shots, runs)
             runs = _of_looks(shots, runs, bool(leaks)) if shots.looks.several else runs
             yield runs if shots.leak_amplitude is None else beside_leak(shots, runs)
             done += number
@@ -194,6 +202,7 @@ def _of_looks(shots: Shots, runs: Runs, leakage: bool) -> Runs:
             with np.errstate(divide="ignore"):  # sure to leak
                 leaked[s, i] = 0.0 - np.expm1(np.log1p(-np.minimum(more, 1.0)).sum())
     pd, miss = shots.detected(runs.magnitude, runs.low + runs.peak, runs.part)
+    pd, miss = np.where(runs.inside, pd, 0.0), np.where(runs.inside, miss, 1.0)
     return runs._replace(pd=pd, miss=miss, leakage=leaked)
 
 
@@ -215,7 +224,9 @@ def spectrum(shots: Shots, i: int, segment: int, *, level: float = 0.0) -> tuple
     magnitude : (m,) ndarray
     """
     shots = replace(shots, leak_amplitude=None)
-    (runs,) = runs_of(shots, points=np.array([i]), least=np.array([level]), leakage=False)
+    (runs,) = runs_of(
+        shots, points=np.array([i]), least=np.array([level]), leakage=False, whole=True
+    )
     low = int(runs.low[segment, 0])
     magnitude = runs.run(segment, 0).copy()
     return np.arange(low, low + magnitude.size), magnitude
@@ -265,7 +276,7 @@ def _way_to_leakage(shots: Shots, shapes: Shapes, every_bin: bool) -> int:
     if not shots.leakage:
         return NO_LEAKAGE
     averaged = shots.gaussian_width is not None and not shots.incoherent
-    averaged |= shots.looks.several or every_bin
+    averaged |= shots.looks.several or every_bin or shots.band is not None
     smooth = shapes.sizes[0] == shapes.sizes[1] and not shapes.sizes[5]
     if smooth and not averaged and view(shots) != COMPLEX:
         return INTEGRAL
@@ -401,7 +412,7 @@ def _some(
     pd, miss, magnitude, leakage = values[:, :, :done]
     return Runs(
         part[:done], low, count, peak, exempted, pd, miss, magnitude, leakage, start, magnitudes,
-        exempt,
+        exempt, np.ones(low.shape, np.bool_),
     ), done  # fmt: skip
 
 

@@ -143,7 +143,7 @@ def statistics(shots: Shots, found: np.ndarray | None = None) -> dict[str, np.nd
     }
     if shots.any_two:
         results["pd_both_chirps"] = shots.both(pd[0], pd[2], (magnitude[0], magnitude[2]))
-    dark = shots.echo_power == 0
+    dark = (shots.echo_power == 0) | np.isnan(found[shots.segments, 3]).any(axis=0)
     return results | {name: np.where(dark, np.nan, results[name]) for name in WITHOUT_ECHO}
 
 

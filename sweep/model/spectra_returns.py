@@ -132,7 +132,7 @@ def peaks_of(
 
     ``spectra``: (1, N/2 + 1) each, of one or several looks; ``echoes``: first and last bins.
     """
-    (power,), (flags,) = flagged(spectra, view)
+    (power,), (flags,) = flagged(spectra, view, signal.segment)
     half = power.size - 1
     if view.shots.real_ends and signal.last >= signal.first:  # an echo on DC or Nyquist
         flags[1] |= flags[0] and signal.first == 0

@@ -6,7 +6,7 @@ sigma sqrt(2 - pi/2). A threshold of b sigma is written in one of five ways:
     tnr                  b / sqrt(2 - pi/2), as the thesis has it
     threshold_to_mean    b / sqrt(pi/2)
     design_pfa_bin       exp(-b^2 / 2)
-    design_pfa_segment   chance that any bin counted in a segment crosses
+    design_pfa_segment   chance that any bin counted in a segment, the up-chirp's, crosses
     design_pfa_shot      the same of a shot: of any of its segments, one after the other
 
 Design probabilities are those of noise alone, before a detection takes bins away. In several looks
@@ -15,14 +15,16 @@ of one record, and the chances are those of all of them together.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from functools import reduce
 from typing import Any
 
 import numpy as np
 
 from sweep.model import alarms
 from sweep.model.looks import Looks, level_of
-from sweep.model.waveform import DEFAULTS, ORDER, order_of, record_length
+from sweep.model.search import band_of, number_of
+from sweep.model.waveform import DEFAULTS, ORDER, SEGMENTS, order_of, record_length
 from sweep.model.window import canonical_name, window
 
 PROCESSING = "instrument.processing."
@@ -72,26 +74,34 @@ def tnr_of(p: Mapping[str, Any]) -> np.ndarray:
     log_pfa, looks = np.log(value), Looks.of(p)
     if given[0] == PFA_BIN:
         return looks.level(log_pfa) / RAYLEIGH_DEVIATION
+    band, segments = band_of(p), ["up"]
     if given[0] == PFA_SHOT:  # segments are independent
         order = order_of(
             str(p["instrument.receiver.architecture"]), str(p.get(ORDER, DEFAULTS[ORDER]))
         )
-        log_pfa = log_at_least_one(log_pfa, 1 / len(order))
-    return level_of(log_pfa, _law(p)) / RAYLEIGH_DEVIATION
+        if band is None:
+            log_pfa = log_at_least_one(log_pfa, 1 / len(order))
+        else:
+            segments = list(order)
+    if band is not None:
+        log_pfa = log_pfa + np.zeros(band.shape[2:])
+    return level_of(log_pfa, _law(p, segments)) / RAYLEIGH_DEVIATION
 
 
-def _law(p: Mapping[str, Any]) -> Callable[[np.ndarray], np.ndarray]:
-    """Logarithm of the probability that noise alone raises an alarm in a segment, by the level."""
-    from sweep.model.marcum import log_at_least_one
+def _law(p: Mapping[str, Any], segments: Sequence[str]) -> Callable[[np.ndarray], np.ndarray]:
+    """Logarithm of the probability that noise alone raises an alarm in segments, by the level."""
+    from sweep.model.marcum import log_any, log_at_least_one
 
     alarm = Looks.of(p).log_alarm
-    return lambda level: log_at_least_one(alarm(level), segment_bins(p, level))
+    return lambda level: reduce(
+        log_any, (log_at_least_one(alarm(level), segment_bins(p, level, s)) for s in segments)
+    )
 
 
-def segment_bins(p: Mapping[str, Any], level: np.ndarray) -> np.ndarray:
+def segment_bins(p: Mapping[str, Any], level: np.ndarray, segment: str = "up") -> np.ndarray:
     """Independent bins that alarm as often as those of a segment that a detection takes none of.
 
-    As :meth:`sweep.model.preparation.Shots.counted_bins`.
+    As :meth:`sweep.model.preparation.Shots.counted_bins`. Segments differ where a band is searched.
 
     Parameters
     ----------
@@ -99,12 +109,18 @@ def segment_bins(p: Mapping[str, Any], level: np.ndarray) -> np.ndarray:
         As of :func:`tnr_of`.
     level : (n,) ndarray
         Threshold over sigma, >= 0.
+    segment : str
+        Of :data:`sweep.model.waveform.SEGMENTS`.
     """
     size = int(np.max(p[PROCESSING + "fft_size"]))
     is_all = str(p[PROCESSING + "bins_counted"]) == "all"
     in_quadrature = str(p.get("instrument.receiver.record", "real")) == "complex"
     is_all |= in_quadrature
+    band, row = band_of(p), SEGMENTS.index(segment)
     if str(p[PROCESSING + "noise_bins"]) == "independent":
+        if band is not None:
+            number = number_of(band, size, 1, is_signed=in_quadrature)[row]
+            return number + np.zeros(np.shape(level))
         return np.full(np.shape(level), float(size if is_all else size // 2))
     record = record_length(
         fft_size=np.asarray(size),
@@ -113,6 +129,9 @@ def segment_bins(p: Mapping[str, Any], level: np.ndarray) -> np.ndarray:
         sample_rate=p[PROCESSING + "sample_rate"],
     )
     taper = window(canonical_name(str(p[PROCESSING + "window"])), int(np.max(record)))
-    bins = size if is_all else max(size // 2 + 1 - 2 * alarms.first_circular(taper, size), 0)
+    first = 1 if in_quadrature else alarms.first_circular(taper, size)
+    bins = size if is_all else max(size // 2 + 1 - 2 * first, 0)
+    if band is not None:
+        bins = number_of(band, size, first, is_signed=in_quadrature)[row]
     correlation = alarms.neighbour_correlation(taper, size)
     return alarms.independent_bins(bins, level=level, correlation=correlation, looks=Looks.of(p))

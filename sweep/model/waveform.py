@@ -110,6 +110,17 @@ def slopes_of(p: Mapping[str, Any]) -> tuple[float, ...]:
     return 1.0, doppler, down
 
 
+def carriers_of(p: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Compute the frequencies of :func:`carrier_frequencies` from parameters by dotted path."""
+    return carrier_frequencies(
+        str(p["instrument.receiver.architecture"]),
+        wavelength=p["instrument.laser.wavelength"],
+        start_frequency=p["instrument.chirp.start_frequency"],
+        bandwidth=p["instrument.chirp.bandwidth"],
+        slopes=slopes_of(p),
+    )
+
+
 def order_of(architecture: str, segments: str) -> tuple[str, ...]:
     """Names of the segments of a shot, of :data:`ORDERS`, in the order of time.
 

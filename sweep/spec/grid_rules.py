@@ -27,6 +27,7 @@ from sweep.model.effects.phase_errors import ERROR_TABLE, NO_TABLE
 from sweep.model.effects.sweep_table import sweep_table
 from sweep.model.estimators import DEFAULTS, DETECTOR, ESTIMATOR
 from sweep.model.preparation import RECORD
+from sweep.model.search import ENDS, RANGES, VELOCITIES
 from sweep.spec.axes import Axis, place_on_grid
 from sweep.spec.fields import default_of, parameter_rules
 from sweep.spec.mistakes import ABSENT, Finding
@@ -47,6 +48,7 @@ RESPONSIVITY = "instrument.receiver.responsivity"
 EXTINCTION = "atmosphere.extinction"
 FULL_SCALE = "instrument.processing.full_scale"
 DETECTION = "instrument.processing.detection"
+BINS_COUNTED = "instrument.processing.bins_counted"
 LINE_WIDTH, LINE_SHAPE = "instrument.laser.line_width", "instrument.laser.line_shape"
 ROUGHNESS = "target.roughness"
 TRAINING, GUARD, RANK = (DETECTOR + name for name in ("training", "guard", "rank"))
@@ -190,6 +192,7 @@ def grid_findings(grid: Grid) -> list[Finding]:
         *_need_findings(grid),
         *_record_findings(grid),
         *_looks_findings(grid),
+        *_search_findings(grid),
     ]
 
 
@@ -419,6 +422,21 @@ def _drawn_noise(grid: Grid, method: str) -> Iterator[Finding]:
         yield Finding(("draws", "method"), rule, remedy, method)
 
 
+def _search_findings(grid: Grid) -> Iterator[Finding]:
+    """Search bands that lack an end, are upside down, or count bins that are not searched."""
+    lacking = [path for path in ENDS if not grid.span(path).size]
+    if 0 < len(lacking) < len(ENDS):
+        rule = "is left out, and a beat tells of range and velocity both"
+        yield Finding(tuple(lacking[0].split(".")), rule, "give all four ends, or none")
+    for low, high in (RANGES, VELOCITIES):
+        apart = _spare(grid, {high: 1.0, low: -1.0})
+        if apart is not None and apart <= 0:
+            yield grid.finding(high, f"must exceed {low}, and is {-apart:.6g} below", "raise it")
+    if not lacking and grid.has_point({BINS_COUNTED: _is("all")}):
+        rule = "counts bins that instrument.processing.search leaves out"
+        yield grid.finding(BINS_COUNTED, rule, "write 'bins_counted: half', or leave the band out")
+
+
 # Effects
 
 
@@ -469,6 +487,11 @@ NEEDS = (
         circulator_leak.PATH, _given, looks.NUMBER, _several,
         "is that of a line which is known in one record of each segment alone",
         "take instrument.looks.number: 1",
+    ),
+    Need(
+        circulator_leak.PATH, _given, RANGES[0], _given,
+        "is that of a line which masks bins, and no law joins that with a search band",
+        "leave instrument.processing.search out",
     ),
     _above_zero("atmosphere.profile", lambda p: np.isin(p, ("exponential", "layer")), EXTINCTION),
     Need(

@@ -203,6 +203,27 @@ class Estimator(Part):
     )
 
 
+def _looked_for(about: str, unit: str, example: str, *bounds: str) -> float | None:
+    """Field of an end of the search band."""
+    whole = f"{about}, as a segment starts; a search band has all four ends, and without them the "
+    whole += "whole record is searched. What lies outside is neither detected nor a false alarm"
+    end: float | None = of.quantity(whole, unit, example, *bounds, default=None)
+    return end
+
+
+class Search(Part):
+    """Band of ranges and radial velocities that is searched: those bins that they put a beat in."""
+
+    min_range: float | None = _looked_for("Least range looked for", "m", "10 m", "0 m")
+    max_range: float | None = _looked_for("Largest range looked for", "m", "2 km", "0 m")
+    min_radial_velocity: float | None = _looked_for(
+        "Least radial velocity looked for, positive when closing", "m/s", "-5 m/s"
+    )
+    max_radial_velocity: float | None = _looked_for(
+        "Largest radial velocity looked for, positive when closing", "m/s", "40 m/s"
+    )
+
+
 def _design_pfa(where: str) -> float | None:
     """Field of a probability of a false alarm that the threshold is set by."""
     about = f"Instead of tnr: probability that noise alone raises a false alarm in {where}"
@@ -225,7 +246,7 @@ class Processing(Part):
         "4", "1e-6", "1e6", default=None,
     )  # fmt: skip
     design_pfa_bin: float | None = _design_pfa("a bin")
-    design_pfa_segment: float | None = _design_pfa("any bin of a segment")
+    design_pfa_segment: float | None = _design_pfa("any bin of a segment, the up-chirp's")
     design_pfa_shot: float | None = _design_pfa("any segment of a shot")
     window: str = of.field(
         Window(about="Window function, by scipy.signal's name, with its parameters"), "hamming"
@@ -262,6 +283,7 @@ class Processing(Part):
         ("correlated", "independent"),
         "correlated",
     )
+    search: Search = Search()
     detector: Detector = Detector()
     estimator: Estimator = Estimator()
 

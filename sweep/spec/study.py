@@ -15,6 +15,7 @@ from pydantic import ConfigDict, Field, PrivateAttr, ValidationError
 
 import sweep.spec.declaring as of
 from sweep.model import VERSION, waveform
+from sweep.model.search import ENDS
 from sweep.model.threshold import WAYS
 from sweep.spec.axes import Axis, Member, paths_on_axes, read_axes
 from sweep.spec.fields import SECTIONS, parameter_rules, parameter_suggestion, short_name
@@ -191,7 +192,7 @@ class Study(Part):
         parameters = self.parameters()
         findings = []
         for name, written in at.items():
-            path, rule = _parameter(name, parameters | dict.fromkeys(WAYS))
+            path, rule = _parameter(name, parameters | dict.fromkeys((*WAYS, *ENDS)))
             if rule is None:
                 suggestion = parameter_suggestion(name, parameters)
                 findings.append(Finding((name,), "is no parameter", suggestion))

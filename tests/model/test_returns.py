@@ -238,7 +238,7 @@ def test_false_peaks_fall_on_every_free_bin_alike():
         free = sorted(set(range(1, half + 1)) - taken)
         chances = (np.arange(20 * len(free)) + 0.5) / (20 * len(free))
         places, counts = np.unique(
-            [free_bin(u, bins, half, False) for u in chances], return_counts=True
+            [free_bin(u, bins, (1, half), 2 * half, False) for u in chances], return_counts=True
         )
         assert places.tolist() == free
         assert (counts == 20).all()

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from written_specs import written
 
 import sweep.spec.study
+from sweep.model.search import ENDS
 from sweep.model.threshold import PFA_BIN, PFA_SEGMENT, PFA_SHOT, TNR, WAYS
 from sweep.spec import Spec, difference
 from sweep.spec.fields import SECTIONS, default_of, parameter_rules
@@ -20,8 +21,9 @@ AXES = {
     "instrument.laser.power": ["1 W", "3 W"],
 }
 
-OTHER_WAYS = set(WAYS) - {TNR}
-"""Of setting the threshold: a spec has one."""
+OTHER_WAYS = set(WAYS) - {TNR} | set(ENDS)
+"""Of setting the threshold, of which a spec has one; and a search band, which none need have."""
+BAND = dict(zip(ENDS, ("10 m", "2 km", "-5 m/s", "95 m/s"), strict=True))
 
 CUT = {"zip": [{"target.grazing_angle": ["1 deg", "2 deg"], "footprint.beamlets": 7}]}
 
@@ -170,6 +172,8 @@ def test_every_parameter_is_part_of_the_id(path):
         every |= {"target.roughness": "0 um"}  # a stated one asks for no developed speckle
     if "receiver.iq_" in path:
         every |= {"instrument.receiver.record": "complex"}
+    if path in ENDS:
+        every |= BAND
     instead = {TNR: ...} if path in WAYS and path != TNR else {}
     base, changed = spec(every), spec(every | instead | {path: other_value(path)})
     assert changed.id != base.id

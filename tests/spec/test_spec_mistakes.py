@@ -324,3 +324,24 @@ def test_an_axis_that_stands_in_for_a_field_is_blamed_alone():
     mapping = written({"target.range": ...}, axes={"target.range": [5, "6 m"]})
     (mistake,) = mistakes_of(mapping)
     assert mistake.path == "axes.target.range[0]"
+
+
+BAND = {
+    "min_range": "10 m", "max_range": "2 km", "min_radial_velocity": "-5 m/s",
+    "max_radial_velocity": "40 m/s",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("band", "message"),
+    [
+        ({"min_range": "1 m", "max_range": "9 m"}, "range and velocity both; give all four ends"),
+        (BAND | {"max_range": "4 m"}, "must exceed instrument.processing.search.min_range"),
+        (BAND, "counts bins that instrument.processing.search leaves out"),
+    ],
+)
+def test_search_bands_have_four_ends_and_count_what_they_search(band, message):
+    changes = {f"instrument.processing.search.{name}": value for name, value in band.items()}
+    counted = "all" if band == BAND else "half"
+    with pytest.raises(SpecError, match=message):
+        Spec.from_mapping(written(changes | {"instrument.processing.bins_counted": counted}))

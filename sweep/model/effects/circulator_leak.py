@@ -192,7 +192,7 @@ def line_of(shots: Shots, i: int, segment: int) -> tuple[float, Line]:
     amplitude, delay, rate, sampled, detector, amplifier = (
         float(np.broadcast_to(np.asarray(column), shots.size)[i]) for column in columns
     )
-    beat = -shots.waveform[segment].sign * rate * delay
+    beat = -shots.waveform[segment].slope * rate * delay
     gain = link.transfer(
         np.array(beat), detector_bandwidth=np.array(detector),
         amplifier_bandwidth=np.array(amplifier), transimpedance=np.array(1.0),
