@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from sweep.analysis import canvas, charts, labels, tables
+from sweep.analysis import accuracy, canvas, charts, labels, tables
 from sweep.analysis.opening import ACCURACY, SCENE, opened, read_attributes
 from sweep.analysis.opening import open as open_store
 from sweep.analysis.scenes import pictures
@@ -138,6 +138,7 @@ def held(figure: Surface | Slices) -> str:
     )
 
 
+@canvas.style()
 def draw(
     store_path: str | Location, directory: str | Path | None = None, form: str = "png"
 ) -> list[Path]:
@@ -148,8 +149,8 @@ def draw(
     store_path
         The store, complete or not.
     directory
-        Where to; by default ``NAME-figures`` for ``NAME.zarr``: beside the store, or in the folder
-        that one is in where the store is an object store's.
+        Where to; by default ``NAME-figures`` for ``NAME.zarr``, in the folder of the store, or
+        in this one for an object store.
     form
         ``png``, ``pdf`` or ``svg``. The same store gives the same bytes.
 
@@ -164,23 +165,16 @@ def draw(
         Where there is no store of a grid of points, of a scene or of what accuracy costs; or the
         eyepoints that a figure needs are gone.
     """
-    with canvas.style():
-        return _drawn(located(store_path), directory, form)
-
-
-def _drawn(store_path: Location, directory: str | Path | None, form: str) -> list[Path]:
-    """All of it, whichever kind of store."""
-    kind = read_attributes(store_path)["kind"]
+    store = located(store_path)
+    kind = read_attributes(store)["kind"]
     if kind == ACCURACY:
-        from sweep.analysis import accuracy
-
-        return accuracy.draw(store_path, None if directory is None else Path(directory), form)
-    stem = store_path.name.removesuffix(".zarr")
-    directory = beside(store_path) / f"{stem}-figures" if directory is None else Path(directory)
+        return accuracy.draw(store, None if directory is None else Path(directory), form)
+    stem = store.name.removesuffix(".zarr")
+    directory = beside(store) / f"{stem}-figures" if directory is None else Path(directory)
     if kind == SCENE:
-        study: Any = SceneStudy.of(store_path)
+        study: Any = SceneStudy.of(store)
     else:
-        study = Study.of(store_path)
+        study = Study.of(store)
         if not study.figures:
             return tables.outputs_page(study.dataset).save(directory, "outputs")
     files = []

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import gzip
+import json
 import textwrap
 from base64 import b64encode
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import itables.options
@@ -14,9 +17,7 @@ import numpy as np
 import pandas
 import plotly.graph_objects as go
 import plotly.io
-from itables import to_html_datatable
-from itables.javascript import generate_init_offline_itables_html
-from markupsafe import Markup
+from itables.javascript import get_itable_arguments
 from matplotlib import colormaps
 from matplotlib.colors import to_hex
 from plotly.io.json import to_json_plotly
@@ -347,44 +348,46 @@ def rendered(page: Page) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.globals |= {"table": _table, "chart_json": _chart_json, "download": _download}
+    environment.globals |= {"packed": _packed, "table_json": _table_json, "download": _download}
+    environment.globals |= {"chart_json": _chart_json}
     environment.tests |= {
         "chart": lambda item: isinstance(item, Plot),
         "sheet": lambda item: isinstance(item, Table),
         "text": lambda item: isinstance(item, Text),
     }
+    tables = Path(itables.options.dt_bundle)
     return environment.get_template("report.html").render(
         page=page,
-        plotly=Markup(get_plotlyjs().replace("</script", "<\\/script")),
-        tables=Markup(generate_init_offline_itables_html(itables.options.dt_bundle)),
-        themes=_in_script(to_json_plotly(themes())),
+        plotly=get_plotlyjs(),
+        tables=tables.read_text(encoding="utf-8"),
+        tables_style=tables.with_suffix(".css").read_text(encoding="utf-8"),
+        themes=to_json_plotly(themes()),
     )
 
 
-def _in_script(json_text: str) -> Markup:
-    """JSON that can stand in a page, whatever words it holds."""
-    return Markup(json_text.replace("<", "\\u003c").replace("&", "\\u0026"))
+def _packed(text: str) -> str:
+    """Text compressed, a third of what it is, in letters that can stand in a page."""
+    return b64encode(gzip.compress(text.encode(), mtime=0)).decode()
 
 
-def _chart_json(plot: Plot) -> Markup:
+def _chart_json(plot: Plot) -> str:
     """JSON of a plot for the page's script."""
     relayouts: dict[str, Any] = {c.name: dict(c.relayout) for c in plot.controls if c.relayout}
-    return _in_script(
-        to_json_plotly({"figure": plot.figure.to_dict(), "relayouts": relayouts, "cut": plot.cut})
-    )
+    made = {"figure": plot.figure.to_dict(), "relayouts": relayouts, "cut": plot.cut}
+    return str(to_json_plotly(made))
 
 
-def _table(table: Table, number: int) -> Markup:
-    """Return a table with its sorting, searching and downloading."""
+def _table_json(table: Table) -> str:
+    """JSON of a table for the page's script, with its sorting, searching and downloading."""
     csv = {"extend": "csvHtml5", "text": "Download CSV", "filename": table.file}
     with pandas.option_context("display.float_format", "{:.6g}".format):
-        made = to_html_datatable(
-            table.frame, connected=False, table_id=f"table-{number}", showIndex=False, maxBytes=0,
-            maxColumns=0, classes="display compact", style="width:100%",
+        made = get_itable_arguments(
+            table.frame, showIndex=False, maxBytes=0, maxColumns=0, pageLength=ROWS,
             columnDefs=[{"targets": _long(table.frame), "className": "long"}],
-            buttons=[csv, "copyHtml5"], pageLength=ROWS, display_logo_when_loading=False,
+            buttons=[csv, "copyHtml5"],
         )  # fmt: skip
-    return Markup(str(made))
+    # As words the library refuses them here; the template has the class.
+    return json.dumps({k: v for k, v in made.items() if k not in ("classes", "style")})
 
 
 def _long(frame: pandas.DataFrame) -> list[int]:

@@ -225,7 +225,7 @@ def fractal(
     exact method (J. Comput. Graph. Stat. 11, 587, 2002): a stationary field whose covariance
     differs from the fractal's by a paraboloid only, plus the random plane that makes up for it.
 
-    Hurst's exponent, 0 < . < 1, is 0.5 for a random walk, towards 1 for smooth ground; lunar
+    Hurst's exponent, 0 < . < 1, is 0.5 for a random walk, towards 1 for smooth ground. Lunar
     ground has a median near 0.95 in the highlands and 0.76 in the maria over 57 m to 2.7 km
     (Rosenburg et al., J. Geophys. Res. 116, E02001, 2011).
     """

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from sweep.model import VERSION
 from sweep.spec import SceneSpec, Spec, difference
 from sweep.storage import locations, opening
 from sweep.storage.atomic_replace import beside, discard, draft, settle
@@ -158,7 +159,7 @@ def new_attributes(study: Content) -> dict[str, Any]:
     return study.attributes() | {
         "Conventions": CONVENTIONS,
         "study_id": study.id,
-        "model_version": model_version(),
+        "model_version": VERSION,
         "software": software(),
         "processor": processor(),
         "layout": LAYOUT,
@@ -358,13 +359,6 @@ def software() -> dict[str, str]:
     return {name: version(name) for name in DISTRIBUTIONS}
 
 
-def model_version() -> str:
-    """Version of the physics."""
-    from sweep.model import VERSION
-
-    return VERSION
-
-
 @cache
 def processor() -> str:
     """Machine, processor and vector instructions, by which numpy and LLVM choose their code."""
@@ -434,7 +428,7 @@ def refuse_other_study(
 def refuse_other_versions(path: str | Location, attributes: dict[str, Any], *, where: str) -> None:
     """Refuse a store begun with another model or other software: the bits could differ."""
     lines = _differences(attributes["software"])
-    written, here = attributes["model_version"], model_version()
+    written, here = attributes["model_version"], VERSION
     if written != here:
         lines.insert(0, f"model: {written} in the store, {here} here")
     if lines:

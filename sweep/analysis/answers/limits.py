@@ -1,8 +1,8 @@
 """Limits along an axis at which pd falls below a level: maximum range, least grazing angle.
 
-Between two points of the grid the place is interpolated in the normal deviate z(pd), pd = Phi(z):
-Q_1(a, b) is near Phi(a - b), so that z follows the signal's amplitude and is nearly a straight line
-where pd itself bends from 1 to 0. Digits near 1 come from the probability of a miss.
+Between two points of the grid the place is interpolated in the normal deviate z(pd), pd = Phi(z).
+Q_1(a, b) is near Phi(a - b): z follows the signal's amplitude and is nearly a straight line where
+pd itself bends from 1 to 0. Digits near 1 come from the probability of a miss.
 """
 
 from __future__ import annotations
@@ -70,8 +70,8 @@ def limit(
           below the level at the very first value (or at all of them), or is not below it up to
           the last, or what decides is not computed.
 
-        Where pd is drawn, `unbroken_low`, `unbroken_high` and so on are the answers with the
-        lower and the upper ends of its intervals.
+        `unbroken_low`, `unbroken_high` and so on are the answers with the lower and the upper ends
+        of pd's intervals, if it is drawn.
 
     Raises
     ------

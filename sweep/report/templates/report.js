@@ -1,7 +1,13 @@
-"use strict";
 // Draws the charts as their controls say, in the colours of the reader's scheme.
 
-const THEMES = JSON.parse(document.getElementById("themes").textContent);
+async function opened(element) {
+  const bytes = Uint8Array.from(atob(element.textContent), (letter) => letter.charCodeAt(0));
+  return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"))).text();
+}
+
+const part = (id) => opened(document.getElementById(id));
+
+const THEMES = JSON.parse(await part("themes"));
 const DARK = matchMedia("(prefers-color-scheme: dark)");
 const HOVERS = matchMedia("(hover: hover)").matches;
 const CONFIG = { responsive: true, displaylogo: false, displayModeBar: HOVERS ? "hover" : false,
@@ -47,8 +53,8 @@ function put(layout, path, value) {
 }
 
 class Chart {
-  constructor(element) {
-    Object.assign(this, JSON.parse(element.querySelector("script").textContent));
+  constructor(element, held) {
+    Object.assign(this, JSON.parse(held));
     this.figure = unpacked(this.figure);
     this.plot = element.querySelector(".plot");
     this.selects = [...element.querySelectorAll("[data-control]")];
@@ -133,12 +139,25 @@ class Cut {
   }
 }
 
-const charts = [...document.querySelectorAll("figure.chart")].map((element) => new Chart(element));
+function added(kind, text) {
+  const element = document.createElement(kind);
+  element.textContent = text;
+  document.head.append(element);
+}
+
+added("script", await part("plotly"));
+const charts = await Promise.all([...document.querySelectorAll("figure.chart")].map(
+  async (element) => new Chart(element, await opened(element.querySelector("script")))));
 const drawn = Promise.all(charts.map((chart) => chart.draw()));
 // DataTables, too, looks at the class.
 const mark = () => document.documentElement.classList.toggle("dark", DARK.matches);
 DARK.addEventListener("change", () => { mark(); charts.forEach((chart) => chart.draw()); });
 mark();
+added("style", await part("tables-style"));
+const { ITable } = await import(
+  URL.createObjectURL(new Blob([await part("tables-library")], { type: "text/javascript" })));
+for (const place of document.querySelectorAll(".table"))
+  new ITable(place.querySelector("table"), JSON.parse(await opened(place.querySelector("script"))));
 // Says that a table is wider than its place, while it is.
 const wider = (element) => element.scrollWidth > element.clientWidth + 1;
 const widths = new ResizeObserver((changed) => {
