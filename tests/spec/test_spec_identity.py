@@ -111,6 +111,11 @@ def other_value(path):
     """A good value of a parameter that is not the one of the base study."""
     special = {
         "instrument.receiver.architecture": "heterodyne",
+        "instrument.chirp.error_table": [
+            ["0 us", "0 Hz"],
+            ["250 us", "1 kHz"],
+            ["500 us", "2 kHz"],
+        ],
         "instrument.processing.window": "hann",
         "instrument.processing.bins_counted": "all",
         "target.reflectance_law": "thesis",
@@ -172,6 +177,8 @@ def test_every_parameter_is_part_of_the_id(path):
         every |= {"target.roughness": "0 um"}  # a stated one asks for no developed speckle
     if "receiver.iq_" in path:
         every |= {"instrument.receiver.record": "complex"}
+    if path == "instrument.telescope.leak_path":
+        every |= {"instrument.telescope.isolation": "60 dB"}
     if path in ENDS:
         every |= BAND
     instead = {TNR: ...} if path in WAYS and path != TNR else {}
