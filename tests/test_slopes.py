@@ -127,7 +127,7 @@ def test_any_two_of_three_that_fade(snr, near):
     fading = Fading(*np.array([[near + 0j], [over + 0j], [near + 0j]]))
     factors = np.empty((3, number))
     mixing = fading.mixing()[:, 0].copy()
-    fading_of_draws(np.array([3, 5], np.uint64), np.arange(number), mixing, factors)
+    fading_of_draws(np.array([3, 5], np.uint64), np.arange(number), 0, mixing, factors)
     rng = np.random.default_rng(5)
     real, imaginary = rng.normal(size=(2, 3, number))
     hit = np.hypot(np.sqrt(2 * snr)[:, None] * factors + real, imaginary) >= level

@@ -35,6 +35,7 @@ import numpy as np
 from scipy import fft
 
 from sweep.model import waveform
+from sweep.model.band import is_searched
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detectors import DETECTORS, Detector, Setting, main_lobe, taper
 from sweep.model.draws import fading_of_draws
@@ -54,7 +55,6 @@ from sweep.model.interpolation import interpolator, phasors, sub_bin
 from sweep.model.looks import BINARY
 from sweep.model.philox import STREAM_LASER_PHASE, STREAM_RECORD, normals, uniforms
 from sweep.model.preparation import Parameters, Shots
-from sweep.model.search import is_searched
 from sweep.model.segments import spectrum as segment_spectrum
 from sweep.model.shot import fit
 

@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sweep.model import alarms, beam, link, search, waveform
+from sweep.model import alarms, beam, link, waveform
 from sweep.model.accuracy import AUTOMATIC, Accuracy
+from sweep.model.band import band_of, number_of
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detectors import main_lobe
 from sweep.model.ground import Ground
@@ -90,7 +91,7 @@ class Shots:
     fft_size: int
     bins_counted: str
     band: np.ndarray | None
-    """(3, 2, n) int64: first bin and number of bins searched (:mod:`sweep.model.search`)."""
+    """(3, 2, n) int64: first bin and number of bins searched (:mod:`sweep.model.band`)."""
     noise_bins: str
     """``correlated``: noise of bins as the record makes it; ``independent``: as [T] has it."""
     detection: str
@@ -454,7 +455,7 @@ class Shots:
             searched += 1 - 2 * self.searched_from
         if self.band is not None:
             size, first = self.fft_size, self.searched_from
-            of_band = search.number_of(self.band, size, first, is_signed=self.complex_record)
+            of_band = number_of(self.band, size, first, is_signed=self.complex_record)
             searched = of_band[:, points]
         bins = np.maximum(searched - exempted, 0.0)
         if self.bins_counted == "all" and self.band is None:
@@ -535,7 +536,7 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
         window=window(canonical_name(str(p[PROCESSING + "window"])), int(p["record"])),
         fft_size=int(p[PROCESSING + "fft_size"]),
         bins_counted=str(p[PROCESSING + "bins_counted"]),
-        band=search.band_of(p, size),
+        band=band_of(p, size),
         noise_bins=str(p[PROCESSING + "noise_bins"]),
         detection=str(p[PROCESSING + "detection"]),
         shot_detection=str(p[waveform.SHOT_DETECTION]),

@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 
 from sweep.model import alarms
+from sweep.model.band import band_of, number_of
 from sweep.model.looks import Looks, level_of
-from sweep.model.search import band_of, number_of
 from sweep.model.waveform import DEFAULTS, ORDER, SEGMENTS, order_of, record_length
 from sweep.model.window import canonical_name, window
 

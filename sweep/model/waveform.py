@@ -52,6 +52,12 @@ DEFAULTS: dict[str, float | int | str | np.ndarray] = {
     SHOT_DETECTION: BOTH_CHIRPS, TWO_BEATS: FAR_TARGET,
 }  # fmt: skip
 
+SEARCH = "instrument.processing.search."
+RANGES = SEARCH + "min_range", SEARCH + "max_range"
+VELOCITIES = SEARCH + "min_radial_velocity", SEARCH + "max_radial_velocity"
+ENDS = RANGES + VELOCITIES
+"""Parameters of which a search band (:mod:`sweep.model.search`) has all four."""
+
 
 class Segment(NamedTuple):
     """One stretch of a waveform, in which the frequency rises or falls evenly or stands still."""

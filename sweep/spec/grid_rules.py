@@ -27,7 +27,7 @@ from sweep.model.effects.phase_errors import ERROR_TABLE, NO_TABLE
 from sweep.model.effects.sweep_table import sweep_table
 from sweep.model.estimators import DEFAULTS, DETECTOR, ESTIMATOR
 from sweep.model.preparation import RECORD
-from sweep.model.search import ENDS, RANGES, VELOCITIES
+from sweep.model.waveform import ENDS, RANGES, VELOCITIES
 from sweep.spec.axes import Axis, place_on_grid
 from sweep.spec.fields import default_of, parameter_rules
 from sweep.spec.mistakes import ABSENT, Finding

@@ -15,8 +15,8 @@ from pydantic import ConfigDict, Field, PrivateAttr, ValidationError
 
 import sweep.spec.declaring as of
 from sweep.model import VERSION, waveform
-from sweep.model.search import ENDS
 from sweep.model.threshold import WAYS
+from sweep.model.waveform import ENDS
 from sweep.spec.axes import Axis, Member, paths_on_axes, read_axes
 from sweep.spec.fields import SECTIONS, parameter_rules, parameter_suggestion, short_name
 from sweep.spec.figures import Figure, figure_findings

@@ -36,8 +36,12 @@ CLIPPING = ("instrument.processing.full_scale", "instrument.processing.bits")
 MOVING = (
     "target.radial_velocity", "target.transverse_velocity", "target.acceleration",
     "instrument.chirp.quadratic_error", "instrument.chirp.cubic_error",
-    "instrument.chirp.sinusoidal_error",
+    "instrument.chirp.sinusoidal_error", "instrument.chirp.error_table",
+    "instrument.chirp.down_slope", "instrument.chirp.doppler_slope",
+    "instrument.processing.search",
 )  # fmt: skip
+MASKING = "instrument.telescope.leak_path"
+"""Its line masks bins by the threshold, and grows with the light: more of either may hide more."""
 
 
 def steady(written, *paths):
@@ -46,7 +50,7 @@ def steady(written, *paths):
         written.pop(section, None)
     written["accuracy"] = {"tolerance": 0}
     written["storage"] = {"block_points": 1000}
-    for path in (*RANDOM, *paths):
+    for path in (*RANDOM, MASKING, *paths):
         drop(written, path)
     return mended(written)
 
@@ -124,7 +128,8 @@ def test_without_movement_up_and_down_chirp_are_alike(written):
         up, down = results[f"{name}_up"], results[f"{name}_down"]
         # Bins just at the threshold may count in one and not in the other.
         assert np.allclose(up, down, rtol=1e-6, atol=1e-12), name
-    assert np.isnan(results["radial_velocity_error"]) or abs(results["radial_velocity_error"]) == 0
+    error = results["radial_velocity_error"]
+    assert np.isnan(error) or abs(error) < 1e-9  # rounding, where three beats are fitted
 
 
 @settings(SOME)

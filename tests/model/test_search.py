@@ -7,14 +7,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sweep.model import truth
+from sweep.model.band import band_of
 from sweep.model.effects.catalogue import CORE
 from sweep.model.groups import groups
 from sweep.model.pairing import UNCONFIRMED
 from sweep.model.returns import draw_returns, free_bin
 from sweep.model.sampling import simulate
-from sweep.model.search import ENDS, band_of
 from sweep.model.shot import evaluate
 from sweep.model.threshold import PFA_SEGMENT, PFA_SHOT, TNR
+from sweep.model.waveform import ENDS
 from sweep.model.window import samples
 
 RECORD = "instrument.receiver.record"

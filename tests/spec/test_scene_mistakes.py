@@ -174,7 +174,7 @@ def test_a_unit_of_a_mesh_is_one_of_length(tmp_path):
 
 
 TABLES = [
-    ("time [s], x [m], y [m], z [m]\n1, 0, 0, 0\n", "holds fewer than two waypoints"),
+    ("time [s], x [m], y [m], z [m]\n1, 0, 0, 0\n", "holds fewer than two lines"),
     ("time [s], x [m], y [m], z [m]\n1, 0, 0, 0\n0, 0, 0, 0\n", "line 3: the time does not rise"),
     ("time [s], x, y [m], z [m]\n1, 0, 0, 0\n2, 0, 0, 0\n", "the unit of column 'x'"),
 ]

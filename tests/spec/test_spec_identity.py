@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from written_specs import written
 
 import sweep.spec.study
-from sweep.model.search import ENDS
 from sweep.model.threshold import PFA_BIN, PFA_SEGMENT, PFA_SHOT, TNR, WAYS
+from sweep.model.waveform import ENDS
 from sweep.spec import Spec, difference
 from sweep.spec.fields import SECTIONS, default_of, parameter_rules
 from sweep.spec.grid_rules import is_method

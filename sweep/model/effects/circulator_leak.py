@@ -41,11 +41,9 @@ from numpy.typing import ArrayLike
 
 from sweep.model import link
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.detection import found_pair
 from sweep.model.effects.effect import Effect, Parameter, Scene, Size, noisier
 from sweep.model.effects.points import Points
 from sweep.model.looks import Looks
-from sweep.model.marcum import marcum_q1
 from sweep.model.preparation import LASER, RECEIVER, TELESCOPE, Shots
 from sweep.model.window import Window, samples
 
@@ -244,6 +242,8 @@ def raised(
     >>> float(raised(np.array([3.0]), np.array([4.0]), deviation=1.0, level=9.0, fades=False)[0])
     5.0
     """
+    from sweep.model.marcum import marcum_q1  # needs the compiler, too
+
     if not fades:
         return np.hypot(own, line)
     deep = np.sqrt(deviation**2 + own**2 / 2)
@@ -255,6 +255,8 @@ def raised(
 
 def beside_leak(shots: Shots, runs: Any) -> Any:
     """Put the line to :class:`sweep.model.segments.Runs`: it masks bins, and raises others."""
+    from sweep.model.detection import found_pair  # needs the compiler, which reading specs does not
+
     magnitudes = runs.magnitudes.copy()
     pd, miss, exempted, leakage = (
         v.copy() for v in (runs.pd, runs.miss, runs.exempted, runs.leakage)

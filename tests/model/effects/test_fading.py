@@ -164,7 +164,7 @@ def test_drawn_factors_have_the_correlations(near):
     fading = Fading(*np.array([[near + 0j], [far + 0j], [near + 0j]]))
     found = np.empty((3, number))
     fading_of_draws(
-        np.array([3, 4], np.uint64), np.arange(number), fading.mixing()[:, 0].copy(), found
+        np.array([3, 4], np.uint64), np.arange(number), 0, fading.mixing()[:, 0].copy(), found
     )
     power = found**2
     assert power.mean(axis=1) == pytest.approx(np.ones(3), abs=5 / np.sqrt(number))
