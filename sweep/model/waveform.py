@@ -353,6 +353,7 @@ def fit(
         p, w, c, s = (v[np.ix_(kind, here)] for v in (peaks, weights, carriers, rates))
         if kind.sum() < 2 or not np.all(np.ptp(s, axis=0) > 0):
             continue
+        w = w / w.max(axis=0)  # products of two do not vanish
         signs = _by_turns if signed else _by_signs
         found[:, here] = signs(p, w, c, s, sample_rate[here], bin_width[here], assumed)
     beta, x = found
