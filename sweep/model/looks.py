@@ -494,7 +494,8 @@ def fading_any_two(
         more[some] = both * (missed[k, some] - found[k, some])
     chances = any_two(found, missed) + more, any_two(missed, found) - more
     found, missed = (np.clip((each * weight).sum(axis=-1), 0.0, 1.0) for each in chances)
-    return np.where(there, found, np.nan), np.where(there, missed, np.nan)
+    whole = found + missed  # 1 but for the quadrature
+    return np.where(there, found / whole, np.nan), np.where(there, missed / whole, np.nan)
 
 
 def _bends(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

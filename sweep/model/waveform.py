@@ -371,10 +371,11 @@ def _least_squares(
     of_beta = [beats[j] * rates[i] - beats[i] * rates[j] for i, j in pairs]
     of_x = [carriers[i] * beats[j] - carriers[j] * beats[i] for i, j in pairs]
     whole = sum(w * m * m for w, m in zip(both, minors, strict=True))
-    beta, x = (
-        sum(w * m * v for w, m, v in zip(both, minors, own, strict=True)) / whole
-        for own in (of_beta, of_x)
-    )
+    with np.errstate(invalid="ignore"):  # carriers of 0 tell no velocity
+        beta, x = (
+            sum(w * m * v for w, m, v in zip(both, minors, own, strict=True)) / whole
+            for own in (of_beta, of_x)
+        )
     return beta, x
 
 
