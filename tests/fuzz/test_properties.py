@@ -91,10 +91,13 @@ def test_more_light_is_never_worse(path, factors, written):
     of direct detection, where light that is noise (echo, sun, air) grows with the aperture or the
     power at the most as the echo does; and the threshold over the noise does not rise. Clipping
     breaks it, which so is left out; and so does a focus, which a smaller aperture moves nearer to a
-    target beyond it.
+    target beyond it. The rim of an aperture may turn a waist's light by its own share, 4e-7 at 3.7
+    waists, either way.
     """
     written = steady(written, *CLIPPING)
     written["instrument"]["laser"].pop("focus", None)
+    if "aperture" in path:
+        drop(written, "instrument.laser.beam_waist")
     base = spec_of(written).parameters()[path] if path != "target.reflectance" else 1
     unit = {"power": " W", "aperture": " m"}.get(path.rsplit(".", 1)[-1], "")
     results = results_of(written | {"axes": {path: [f"{base * f!r}{unit}" for f in factors]}})
