@@ -99,7 +99,7 @@ class Shots:
     shot_detection: str
     """``both_chirps``: a shot is detected in up and down segment; ``any_two``: in any two."""
     two_beats: str
-    """What is taken for granted where two beats of real records tell: ``far`` or ``fast``."""
+    """Assumption by which two beats of real records tell: ``far`` or ``fast``."""
     noise_shape: str
     """``receiver``: noise passes the receiver as signals do; ``white``: none of it, as in [T]."""
     order: tuple[str, ...]

@@ -99,7 +99,7 @@ class Runs(NamedTuple):
     exempt: np.ndarray
     """Bins of them that can't raise a false alarm, bool."""
     inside: np.ndarray
-    """Whether the largest bin of all is searched, bool; else it is in no run."""
+    """True where the largest bin of all is searched, bool; else it is in no run."""
 
     def run(self, segment: int, i: int) -> np.ndarray:
         """|X| of one run, (count,)."""

@@ -41,7 +41,7 @@ class Parameter:
     """By default that of the least value."""
     options: tuple[str, ...] = ()
     table: bool = False
-    """Whether it is a table over time, given as text (:mod:`sweep.model.effects.sweep_table`)."""
+    """True for a table over time, given as text (:mod:`sweep.model.effects.sweep_table`)."""
     alone: bool = True
     """Tell whether nothing else can bring the effect."""
     category: bool = False

@@ -20,7 +20,7 @@ class Surface:
 
     name: str
     reflectance: float
-    """What its law, one of :data:`sweep.model.ground.LAWS`, takes as such, 0..1."""
+    """Reflectance as its law takes it, one of :data:`sweep.model.ground.LAWS`; 0..1."""
     law: str = "lambert"
 
 
