@@ -23,7 +23,7 @@ The same forms give the probability of detection of a signal that fluctuates as 
 by 1 + snr.
 
 The spectrum of a white record has no ends: training cells beyond DC are those below Nyquist, and
-the other way round.
+the other way round; in a complex record's spectrum those beyond its last bin are its first.
 """
 
 import math
@@ -61,7 +61,7 @@ class Setting:
     """Settings by which spectra were made, and by which they are detected."""
 
     fft_size: int
-    """Points N of the FFT; spectra have the bins 0..N/2."""
+    """Points N of the FFT; spectra have the bins 0..N/2, or -N/2..N/2 - 1 of a complex record."""
     sample_rate: float
     """[Hz]; a bin is ``sample_rate / fft_size`` wide."""
     window: Window
@@ -78,6 +78,8 @@ class Setting:
     """Rank of the ordered statistic among the training cells, 1 for the least."""
     pfa: float
     """Design probability of a false alarm in a bin of noise alone."""
+    complex_record: bool = False
+    """True for records of I and Q: bin k stands at index k + N/2."""
 
     @property
     def taper(self) -> np.ndarray:
@@ -86,7 +88,8 @@ class Setting:
 
 
 Detector = Callable[[np.ndarray, Setting], np.ndarray]
-"""From power |X|^2 (m, N/2 + 1) of m spectra and the setting to bool of the same shape."""
+"""From power |X|^2 (m, N/2 + 1) of m spectra, (m, N) of complex records, and the setting to bool of
+the same shape."""
 
 
 def crossing_probability(kind: str, factor: float, *, training: int, rank: int) -> float:
@@ -154,11 +157,12 @@ def goca_cfar(power: np.ndarray, setting: Setting) -> np.ndarray:
 
 def os_cfar(power: np.ndarray, setting: Setting) -> np.ndarray:
     """Bins at or above the threshold of an ordered statistic: so many cells stay below the bin."""
-    least, count = power[:, 1:-1] / _factor(OS, setting), np.zeros(power[:, 1:-1].shape, np.int64)
+    cells = _cells(power, setting)
+    least, count = cells / _factor(OS, setting), np.zeros(cells.shape, np.int64)
     for below, above in _training_cells(power, setting):
         count += below <= least
         count += above <= least
-    return np.pad(count >= setting.rank, ((0, 0), (1, 1)))
+    return _of_all(count >= setting.rank, setting)
 
 
 DETECTORS: dict[str, Detector] = {FIXED: fixed, CA: ca_cfar, OS: os_cfar, GOCA: goca_cfar}
@@ -168,14 +172,24 @@ def _factor(kind: str, setting: Setting) -> float:
     return cfar_factor(kind, training=setting.training, rank=setting.rank, pfa=setting.pfa)
 
 
+def _cells(power: np.ndarray, setting: Setting) -> np.ndarray:
+    """Bins whose noise is circular: all but DC and Nyquist of a real record."""
+    return power if setting.complex_record else power[:, 1:-1]
+
+
+def _of_all(flags: np.ndarray, setting: Setting) -> np.ndarray:
+    """Extend flags to all bins from those of :func:`_cells`."""
+    return flags if setting.complex_record else np.pad(flags, ((0, 0), (1, 1)))
+
+
 def _training_cells(power: np.ndarray, setting: Setting) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Training cells of all bins but DC and Nyquist, one below and one above at a time.
+    """Training cells of the bins of :func:`_cells`, one below and one above at a time.
 
     The spectrum goes on at either end with its other end's bins.
     """
-    half, number = setting.training // 2, power.shape[1] - 2
-    reach = half + setting.guard
-    cells = power[:, 1 + np.arange(-reach, number + reach) % number]
+    cells, half = _cells(power, setting), setting.training // 2
+    number, reach = cells.shape[1], half + setting.guard
+    cells = cells[:, np.arange(-reach, number + reach) % number]
     for i in range(half):
         above = reach + setting.guard + 1 + i
         yield cells[:, i : i + number], cells[:, above : above + number]
@@ -183,12 +197,11 @@ def _training_cells(power: np.ndarray, setting: Setting) -> Iterator[tuple[np.nd
 
 def _sums(power: np.ndarray, setting: Setting) -> tuple[np.ndarray, np.ndarray]:
     """Sum the training cells below and above each bin."""
-    sums = np.zeros((2, len(power), power.shape[1] - 2))
+    sums = np.zeros((2, *_cells(power, setting).shape))
     for pair in _training_cells(power, setting):
         sums += pair
     return sums[0], sums[1]
 
 
 def _at_or_above(power: np.ndarray, level: np.ndarray, kind: str, setting: Setting) -> np.ndarray:
-    found = power[:, 1:-1] >= _factor(kind, setting) * level
-    return np.pad(found, ((0, 0), (1, 1)))
+    return _of_all(_cells(power, setting) >= _factor(kind, setting) * level, setting)

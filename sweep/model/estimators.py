@@ -1,6 +1,7 @@
 """Estimators of a peak's frequency from the complex spectrum around it, and their bounds.
 
-All take spectra of real records, windowed and transformed, and give frequencies in bins; where a
+All take spectra of records, windowed and transformed, and give places by index: frequencies in
+bins of a real record, with N/2 added of a complex one, whose last bin is beside its first. Where a
 window matters, what they need of it comes from its own samples, so that any window and any padding
 will do. With Z_j the bins about the peak, turned so that a lone tone's are real and even in its
 distance (the phase of half a record a bin taken off):
@@ -33,7 +34,8 @@ f and phi unknown: with cnr = A^2 / (2 s^2), the tone's power over the noise's b
 
 [Rife and Boorstyn, IEEE Trans. Inf. Theory 20, 591, 1974; Kay, Fundamentals of Statistical Signal
 Processing: Estimation Theory, 1993, section 3.11]. For a tone some bins away from DC and Nyquist,
-where the bound does not depend on its phase. It is that of the whole record: a window throws away
+where the bound does not depend on its phase. Of a complex tone of power cnr over the noise's, I and
+Q together, it is half as much. It is that of the whole record: a window throws away
 what it tapers off, and the largest value of a windowed spectrum knows the tone less well
 (:func:`windowed_deviation`), unless the window is taken back first.
 
@@ -66,7 +68,8 @@ if TYPE_CHECKING:
 
 Estimator = Callable[[np.ndarray, np.ndarray, Setting], np.ndarray]
 """From complex spectra (m, N/2 + 1), the bins of their peaks (m,) int64, 1..N/2 - 1, and the
-setting to frequencies (m,) [bins], float64."""
+setting to frequencies (m,) [bins], float64; by index 0..N - 1 in spectra (m, N) of complex
+records."""
 
 PEAK_BIN = "peak_bin"
 
@@ -129,8 +132,11 @@ def centroid(spectrum: np.ndarray, peak: np.ndarray, setting: Setting) -> np.nda
     """Centre of the power about the peak, less that of the noise."""
     reach = math.ceil(_CELLS * setting.fft_size / setting.window.length)
     apart = np.arange(-reach, reach + 1)
-    bins = np.clip(peak[:, None] + apart, 0, setting.fft_size // 2)
-    power = np.abs(np.take_along_axis(spectrum, bins, axis=1)) ** 2 - setting.noise_power
+    bins = peak[:, None] + apart
+    if not setting.complex_record:
+        bins = np.clip(bins, 0, setting.fft_size // 2)
+    own = np.take_along_axis(spectrum, bins % spectrum.shape[1], axis=1)
+    power = np.abs(own) ** 2 - setting.noise_power
     weight = np.where(apart == 0, np.maximum(power, setting.noise_power), np.maximum(power, 0.0))
     return peak + (weight * (bins - peak[:, None])).sum(axis=1) / weight.sum(axis=1)
 
@@ -158,10 +164,12 @@ def maximum_likelihood(spectrum: np.ndarray, peak: np.ndarray, setting: Setting)
     size, number, found = float(setting.fft_size), float(used.sum()), start.copy()
     for row in range(peak.size):
         record = _record(spectrum[row], setting) * weight
-        turned = phasors(_climb(record, start[row], size) / size, record.size)
-        image = ((record * turned).sum() / number).conjugate() * turned
-        # Where the window was not undone there is no tone.
-        found[row] = _climb(np.where(used, record - image, 0.0), found[row], size)
+        found[row] = _climb(record, start[row], size)
+        if not setting.complex_record:
+            turned = phasors(found[row] / size, record.size)
+            image = ((record * turned).sum() / number).conjugate() * turned
+            # Where the window was not undone there is no tone.
+            found[row] = _climb(np.where(used, record - image, 0.0), start[row], size)
     return found
 
 
@@ -179,7 +187,8 @@ ESTIMATORS: dict[str, Estimator] = {
 
 def _three(spectrum: np.ndarray, peak: np.ndarray) -> np.ndarray:
     """Bins below, at and above each peak, (m, 3)."""
-    return np.take_along_axis(spectrum, peak[:, None] + np.array([-1, 0, 1]), axis=1)
+    bins = (peak[:, None] + np.array([-1, 0, 1])) % spectrum.shape[1]
+    return np.take_along_axis(spectrum, bins, axis=1)
 
 
 def _turned(spectrum: np.ndarray, peak: np.ndarray, setting: Setting) -> np.ndarray:
@@ -236,7 +245,12 @@ def _zoom(length: int, fft_size: int) -> signal.ZoomFFT:
 
 
 def _record(spectrum: np.ndarray, setting: Setting) -> np.ndarray:
-    """Return the windowed record (L,) of a spectrum."""
+    """Return the windowed record (L,) of a spectrum; of a complex one shifted by half its rate.
+
+    A tone then has the frequency that its index says.
+    """
+    if setting.complex_record:
+        return np.asarray(fft.ifft(spectrum))[: setting.window.length]
     return np.asarray(fft.irfft(spectrum, setting.fft_size))[: setting.window.length]
 
 
@@ -293,7 +307,8 @@ def beat_deviation(*, cnr: ArrayLike, samples: ArrayLike, sample_rate: ArrayLike
     Parameters
     ----------
     cnr : array_like
-        Power of the tone over that of the noise, before the FFT; 0 gives inf.
+        Power of the tone over that of the noise, before the FFT; 0 gives inf. Of a complex record
+        twice that.
     samples : array_like
         Length of the record L, 2 or more; zeros appended to it do not count.
     sample_rate : array_like

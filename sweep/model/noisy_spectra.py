@@ -4,6 +4,9 @@ Noise is drawn as the receiver makes it: white Gaussian in the record, which is 
 transformed; so bins are alike as far as window and padding make them, and DC and Nyquist are what
 they are. Every sample is addressed by point, draw, segment and place (:mod:`sweep.model.philox`).
 
+A real record has bins 0..N/2. A complex one, of I and Q, has N: bin k stands at index k + N/2, and
+the last is beside the first. Indices that name an echo's bins may go on below 0 and beyond N - 1.
+
 The signal has the magnitudes that :func:`sweep.model.segments.spectrum` gives, with all
 effects. Where beamlets add as powers these are root mean squares, and have no phases: the signal
 is then given those of a lone tone at its place, bin by bin. For footprints of less than a bin that
@@ -73,9 +76,10 @@ class Signal(NamedTuple):
     """A segment's spectrum without noise, and what is true of it."""
 
     spectrum: np.ndarray
-    """(N/2 + 1,) complex [V]."""
+    """(N/2 + 1,) complex [V]; of a complex record (N,)."""
     strongest: int
-    """Largest bin; 1..N/2 - 1 where noise is taken to be circular in all."""
+    """Index of the largest bin; of a real record 1..N/2 - 1 where noise is taken to be circular in
+    all."""
     first: int
     """First of the bins that the signal occupies: those from the first to the last of half its
     largest magnitude, and a main lobe's half-width to either side. What is detected elsewhere is
@@ -83,13 +87,13 @@ class Signal(NamedTuple):
     last: int
     """Last of them; below ``first`` where there is no echo, or its largest bin is not searched."""
     frequency: float
-    """Where a lone tone of these magnitudes about the largest bin stands [bins]."""
+    """Where a lone tone of these magnitudes about the largest bin stands [bins], with its sign."""
     cnr: float
     """Power of the signal over that of the noise in the record, before the FFT."""
     segment: int
     """0 up, 1 Doppler, 2 down."""
     echo: np.ndarray | None = None
-    """(N/2 + 1,) int64: number of the echo that each bin is nearest to; None where all are one."""
+    """Number of the echo that each bin is nearest to, int64; None where all are one."""
 
 
 def signal_of(
@@ -99,57 +103,114 @@ def signal_of(
 
     ``echoes``: strongest bins of the echoes of several surfaces, where there are several.
     """
-    _, magnitude = segment_spectrum(shots, i, segment)
+    magnitude = _magnitude(shots, i, segment)
     if (laser := _laser(shots, i))["line_width"] > 0:  # as it is before its phase walks
         kept = seen_line(window=shots.window, looks=shots.looks.added, **laser)[0][0]
         magnitude = magnitude / math.sqrt(kept)
-    half, window = shots.fft_size // 2, shots.window
-    least = 0 if shots.real_ends else 1  # at DC and Nyquist, else taken for circular
-    k = int(np.clip(np.argmax(magnitude), least, half - least))
+    window, last = shots.window, magnitude.size - 1
+    least = 0 if shots.real_ends or shots.complex_record else 1  # at DC and Nyquist taken as 0
+    k = int(np.clip(np.argmax(magnitude), least, last - least))
     if not magnitude[k] > 0:
-        return Signal(magnitude.astype(complex), k, 1, 0, float(k), 0.0, segment)
-    tables = interpolator(window, shots.fft_size)
-    below, above = magnitude[abs(k - 1)], magnitude[min(k + 1, 2 * half - k - 1)]
-    place = k + sub_bin(below, magnitude[k], above, tables)
-    high = np.flatnonzero(magnitude >= 0.5 * magnitude[k])
+        place = float(k - index_of_zero(shots))
+        return Signal(magnitude.astype(complex), k, 1, 0, place, 0.0, segment)
+    place = _between(shots, magnitude, k)
+    turn = turn_of(shots, k)
+    high = np.flatnonzero(unrolled(shots, magnitude, k) >= 0.5 * magnitude[k]) - turn
     beside = math.ceil(main_lobe(window) * shots.fft_size / window.length)
-    total = 2 * (magnitude**2).sum() - magnitude[0] ** 2 - magnitude[half] ** 2
+    total = (magnitude**2).sum()
+    if not shots.complex_record:  # and as much at negative frequencies
+        total = 2 * total - magnitude[0] ** 2 - magnitude[-1] ** 2
     power = total / (shots.fft_size * window.energy)
-    first, last = max(int(high[0]) - beside, least), min(int(high[-1]) + beside, half - least)
+    first, end = int(high[0]) - beside, int(high[-1]) + beside
+    if not shots.complex_record:
+        first, end = max(first, least), min(end, last - least)
     phases = _tone_phases(place, shots)
     if high[-1] - high[0] > beside:  # wider than a tone: in step, as in one's main lobe
-        apart = np.arange(first, last + 1) - k
-        phases[first : last + 1] = phases[k] * np.exp(
+        apart = np.arange(first, end + 1) - k
+        phases[(k + apart) % phases.size] = phases[k] * np.exp(
             -1j * np.pi * apart * (window.length / shots.fft_size)
         )
-    if not is_searched(shots, segment, i, k):
-        first, last = 1, 0
+    if not is_searched(shots, segment, i, k - index_of_zero(shots)):
+        first, end = 1, 0
     echo = None
     if len(echoes) > 1:
-        echo = np.abs(np.arange(half + 1)[:, None] - np.asarray(echoes)).argmin(axis=1)
+        apart = np.arange(magnitude.size)[:, None] - np.asarray(echoes)
+        if shots.complex_record:
+            apart -= shots.fft_size * np.rint(apart / shots.fft_size).astype(np.int64)
+        echo = np.abs(apart).argmin(axis=1)
         for number, own in enumerate(echoes):
-            if not first <= own <= last:
-                beyond = magnitude[abs(own - 1)], magnitude[min(own + 1, 2 * half - own - 1)]
-                at = own + sub_bin(beyond[0], magnitude[own], beyond[1], tables)
+            if (own - first) % magnitude.size > end - first:
+                at = _between(shots, magnitude, int(own))
                 phases = np.where(echo == number, _tone_phases(at, shots), phases)
     return Signal(
         spectrum=magnitude * phases,
         strongest=k,
         first=first,
-        last=last,
-        frequency=place,
+        last=end,
+        frequency=place - index_of_zero(shots),
         cnr=float(power / shots.noise_variance[i]),
         segment=segment,
         echo=echo,
     )
 
 
+def index_of_zero(shots: Shots) -> int:
+    """Index of the bin at frequency 0 in a spectrum."""
+    return shots.fft_size // 2 if shots.complex_record else 0
+
+
+def turn_of(shots: Shots, middle: int) -> int:
+    """Places by which :func:`unrolled` moves a bin."""
+    return 1 + shots.fft_size // 2 - middle if shots.complex_record else 0
+
+
+def unrolled(shots: Shots, values: np.ndarray, middle: int) -> np.ndarray:
+    """Values of bins (..., bins) without a seam near one of them.
+
+    Those of a complex record are turned until index ``middle`` stands in the middle, with a 0 put
+    at either end as if it were DC and Nyquist of a real one; those of a real one are as they are.
+    """
+    if not shots.complex_record:
+        return values
+    values = np.roll(values, turn_of(shots, middle) - 1, axis=-1)
+    return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(1, 1)])
+
+
+def _magnitude(shots: Shots, i: int, segment: int) -> np.ndarray:
+    """|X| of all bins of a segment, without noise [V]."""
+    bins, magnitude = segment_spectrum(shots, i, segment)
+    if not shots.complex_record:
+        return magnitude
+    whole = np.zeros(shots.fft_size)
+    whole[(bins + index_of_zero(shots)) % shots.fft_size] = magnitude
+    return whole
+
+
+def _between(shots: Shots, magnitude: np.ndarray, k: int) -> float:
+    """Place of a lone tone whose largest bin is k, as an index."""
+    last = magnitude.size - 1
+    if shots.complex_record:
+        below, above = magnitude[k - 1], magnitude[(k + 1) % magnitude.size]
+    else:
+        below, above = magnitude[abs(k - 1)], magnitude[min(k + 1, 2 * last - k - 1)]
+    return k + sub_bin(below, magnitude[k], above, interpolator(shots.window, shots.fft_size))
+
+
 def _tone_phases(place: float, shots: Shots) -> np.ndarray:
-    """Phase factors (N/2 + 1,) of a lone tone at a place [bins]; 1 where it vanishes."""
-    record = phasors(place / shots.fft_size, shots.window.length).real
-    tone = fft.rfft(taper(shots.window) * record, shots.fft_size)
+    """Phase factors of a lone tone at a place, by index; 1 where it vanishes."""
+    size = shots.fft_size
+    cycles = (place - index_of_zero(shots)) / size
+    record = taper(shots.window) * phasors(-cycles, shots.window.length)
+    tone = transformed(shots, record if shots.complex_record else record.real)
     magnitude = np.abs(tone)
     return np.where(magnitude > 0, tone / np.where(magnitude > 0, magnitude, 1.0), 1.0)
+
+
+def transformed(shots: Shots, record: np.ndarray) -> np.ndarray:
+    """Spectrum of a windowed record (L,), which is padded."""
+    if shots.complex_record:
+        return np.asarray(fft.fftshift(fft.fft(record, shots.fft_size)))
+    return np.asarray(fft.rfft(record, shots.fft_size))
 
 
 def _laser(shots: Shots, i: int) -> dict[str, np.ndarray]:
@@ -164,15 +225,18 @@ def _laser(shots: Shots, i: int) -> dict[str, np.ndarray]:
 def drawn_of(
     shots: Shots, i: int, segment: int, signal: Signal, *, key: np.ndarray, draws: np.ndarray
 ) -> np.ndarray:
-    """Spectra (m or 1, N/2 + 1) complex of the signal in some draws, without noise [V]."""
+    """Spectra (m or 1, bins) complex of the signal in some draws, without noise [V]."""
     laser, rate = _laser(shots, i), float(_at(shots.sample_rate, i))
     if not laser["line_width"] > 0:
         return signal.spectrum[None]
     length, size = shots.window.length, shots.fft_size
     delay = float(laser["delay"]) * rate
     both = np.zeros(size, complex)  # spectrum of the analytic record
-    both[: size // 2 + 1] = 2 * signal.spectrum
-    both[[0, size // 2]] /= 2
+    if shots.complex_record:
+        both = fft.ifftshift(signal.spectrum)
+    else:
+        both[: size // 2 + 1] = 2 * signal.spectrum
+        both[[0, size // 2]] /= 2
     record = fft.ifft(both)[:length]
     per_sample, spectra = 2 * math.pi * float(laser["line_width"]) / rate, []
     for draw in draws:
@@ -184,20 +248,24 @@ def drawn_of(
         phase = walked_phase(
             normals(numbers)[0], per_sample=per_sample, delay=delay, whole=shots.looks.added > 1
         )
-        spectra.append(fft.rfft((record * np.exp(1j * phase)).real, size))
+        turned = record * np.exp(1j * phase)
+        spectra.append(transformed(shots, turned if shots.complex_record else turned.real))
     return np.array(spectra)
 
 
 def noise_of(
     shots: Shots, i: int, segment: int, *, key: np.ndarray, draws: np.ndarray
 ) -> np.ndarray:
-    """Noise (m, N/2 + 1) complex of some draws of point i's segment, by their numbers [V]."""
+    """Noise (m, bins) complex of some draws of point i's segment, by their numbers [V]."""
     length, stream = shots.window.length, STREAM_RECORD[segment]
     keys = np.broadcast_to(key, (draws.size, 2))
-    record = normals(uniforms(keys, draws, stream, length + length % 2))[:, :length]
-    record *= math.sqrt(float(shots.noise_variance[i])) * taper(shots.window)
+    numbers = 2 * length if shots.complex_record else length + length % 2
+    record = normals(uniforms(keys, draws, stream, numbers))
+    if shots.complex_record:  # I and Q with half of the noise each
+        record = (record[:, :length] + 1j * record[:, length:]) * math.sqrt(0.5)
+    record = record[:, :length] * math.sqrt(float(shots.noise_variance[i])) * taper(shots.window)
     # A transform at a time: bits do not depend on how many there are.
-    return np.array([fft.rfft(each, shots.fft_size) for each in record])
+    return np.array([transformed(shots, each) for each in record])
 
 
 def fading_of(
@@ -216,7 +284,7 @@ _LOOK = np.int64(1 << 48)
 
 
 def spectra_of(view: "View", segment: int, draws: np.ndarray) -> Iterator[np.ndarray]:
-    """Spectra (m, N/2 + 1) complex of a segment in some draws, with noise [V], look by look.
+    """Spectra (m, bins) complex of a segment in some draws, with noise [V], look by look.
 
     Of looks that are added in amplitude their mean alone.
     """
@@ -268,9 +336,12 @@ class View(NamedTuple):
     """(3, k) int64: strongest bins of the shot's echoes in each segment, -1 for none."""
 
     def echoes_of(self, segment: int) -> np.ndarray:
-        """Strongest bins of the echoes in a segment; none where echoes are not told apart."""
+        """Return indices of the echoes' strongest bins in a segment; none where echoes are one."""
         bins = np.empty(0, np.int64) if self.echoes is None else self.echoes[segment]
-        return bins[bins >= 0]
+        bins = bins[bins >= 0]
+        if self.shots.complex_record:
+            bins = (bins + self.shots.fft_size // 2) % self.shots.fft_size
+        return bins
 
 
 class Found(NamedTuple):
@@ -282,7 +353,7 @@ class Found(NamedTuple):
     flagged: np.ndarray
     """Bins in them."""
     frequency: np.ndarray
-    """[bins]"""
+    """[bins], with signs of a complex record."""
 
 
 def view_of(
@@ -301,6 +372,7 @@ def view_of(
         guard=int(p[DETECTOR + "guard"]),
         rank=rank or math.ceil(0.75 * training),  # 0 stands for three quarters
         pfa=float(p[DETECTOR + "pfa"]),
+        complex_record=shots.complex_record,
     )
     view = View(
         shots, i, key, (), looks_of(shots), setting,
@@ -318,7 +390,7 @@ def view_of(
 def flagged(
     spectra: Sequence[np.ndarray], view: View, segment: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean power of a segment's looks, and the bins that are flagged, (m, N/2 + 1) each."""
+    """Mean power of a segment's looks, and the bins that are flagged, (m, bins) each."""
     powers = [each.real**2 + each.imag**2 for each in spectra]
     power = powers[0] if len(powers) == 1 else np.mean(powers, axis=0)
     if view.shots.looks.combine == BINARY:
@@ -326,42 +398,50 @@ def flagged(
         flags = np.asarray(votes >= view.shots.looks.votes)
     else:
         flags = np.array(view.detect(power, view.setting), bool)
-    return power, flags & is_searched(view.shots, segment, view.i, np.arange(flags.shape[1]))
+    bins = np.arange(flags.shape[1]) - index_of_zero(view.shots)
+    return power, flags & is_searched(view.shots, segment, view.i, bins)
 
 
 def placed(spectra: Sequence[np.ndarray], peak: np.ndarray, view: View) -> np.ndarray:
-    """Frequencies (m,) [bins] of peaks in a segment's spectra: the mean of the looks' estimates."""
+    """Places (m,) of peaks in a segment's spectra, by index: the mean of the looks' estimates."""
     places = [view.estimate(each, peak, view.setting) for each in spectra]
     return places[0] if len(places) == 1 else np.asarray(np.mean(places, axis=0))
 
 
 def look(spectra: Sequence[np.ndarray], signal: Signal, view: View) -> Found:
-    """Detect and estimate in spectra (m, N/2 + 1) of a segment, of one or several looks."""
+    """Detect and estimate in spectra (m, bins) of a segment, of one or several looks."""
     power, flags = flagged(spectra, view, signal.segment)
-    shots, bins, half = view.shots, np.arange(power.shape[1]), power.shape[1] - 1
-    low, high = max(signal.strongest - 1, 0), min(signal.strongest + 2, half + 1)
-    if shots.detection == "any_bin" and signal.last >= signal.first:
-        low, high = signal.first, signal.last + 1
+    shots, turn = view.shots, turn_of(view.shots, signal.strongest)
+    power, flags = (unrolled(shots, each, signal.strongest) for each in (power, flags))
+    strongest, before, last = (k + turn for k in (signal.strongest, signal.first, signal.last))
+    bins, half = np.arange(power.shape[1]), power.shape[1] - 1
+    low, high = max(strongest - 1, 0), min(strongest + 2, half + 1)
+    if shots.detection == "any_bin" and last >= before:
+        low, high = before, last + 1
     if not shots.real_ends:
         low, high = max(low, 1), min(high, half)
-    own = flags[:, low:high] & is_searched(shots, signal.segment, view.i, signal.strongest)
+    place = signal.strongest - index_of_zero(shots)
+    own = flags[:, low:high] & is_searched(shots, signal.segment, view.i, place)
     near = np.where(own, power[:, low:high], -1.0)
     hit, detected = low + near.argmax(axis=1), near.max(axis=1) >= 0
     flags[:, [0, -1]] = False  # DC and Nyquist
     edges = np.diff(flags.astype(np.int8), axis=1)
     row, start = np.nonzero(edges > 0)  # of each group of flagged bins
     start, end = start + 1, np.nonzero(edges < 0)[1] + 1
-    false = (start > signal.last) | (end <= signal.first)
+    false = (start > last) | (end <= before)
     false &= (start <= half - shots.searched_from) & (end > shots.searched_from)
     alarms, bins_flagged = (
         np.bincount(row[false], weights, len(power)).astype(np.int64)
         for weights in (None, (end - start)[false])
     )
     own = detected[row] & (start <= hit[row]) & (hit[row] < end)
-    first, last = np.ones((len(power), 1)), np.full((len(power), 1), power.shape[1] - 1)
-    first[row[own], 0], last[row[own], 0] = start[own], end[own]
-    peak = np.where((first <= bins) & (bins < last), power, -1.0).argmax(axis=1)
-    return Found(detected, alarms, bins_flagged, placed(spectra, peak, view))
+    first, beyond = np.ones((len(power), 1)), np.full((len(power), 1), half)
+    first[row[own], 0], beyond[row[own], 0] = start[own], end[own]
+    peak = np.where((first <= bins) & (bins < beyond), power, -1.0).argmax(axis=1)
+    if shots.complex_record:
+        peak = (peak - turn) % shots.fft_size
+    frequency = placed(spectra, peak, view) - index_of_zero(shots)
+    return Found(detected, alarms, bins_flagged, frequency)
 
 
 def counted(view: View, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -380,10 +460,11 @@ def counted(view: View, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     for s, signal in enumerate(view.signals):
         if signal is not None:
             found[s] = look(list(spectra_of(view, s, draws)), signal, view)
-            first, last = view.shots.searched_from, view.setting.fft_size // 2 + 1
-            inside = is_searched(view.shots, s, view.i, np.arange(last))
-            occupied = inside[signal.first : signal.last + 1].sum()
-            searched += int(inside[first : last - first].sum() - occupied)
+            bins = np.arange(view.shots.bins)
+            inside = is_searched(view.shots, s, view.i, bins - index_of_zero(view.shots))
+            occupied = inside[np.arange(signal.first, signal.last + 1) % bins.size].sum()
+            least = 0 if view.shots.complex_record else view.shots.searched_from
+            searched += int(inside[least : bins.size - least].sum() - occupied)
     up, doppler, down = found
     detected, alarm = np.array([f.detected for f in found]), (up.alarms > 0, down.alarms > 0)
     shot = up.detected & down.detected
@@ -421,12 +502,14 @@ def resolved_bound(view: View, used: Sequence[bool] | np.ndarray | None = None) 
     shots, i = view.shots, view.i
     length, rate = shots.window.length, float(shots.sample_rate[i])
     walk, looks = phase_deviation(**_laser(shots, i)), math.sqrt(shots.looks.number)
+    more = 2 if shots.complex_record else 1  # as much noise has two samples for one
     if used is None:
         used = (True, shots.slopes != waveform.SIGNS, True)
     up, doppler, down = (
         np.inf
         if s is None or not there
-        else np.hypot(beat_deviation(cnr=s.cnr, samples=length, sample_rate=rate), walk) / looks
+        else np.hypot(beat_deviation(cnr=more * s.cnr, samples=length, sample_rate=rate), walk)
+        / looks
         for s, there in zip(view.signals, used, strict=True)
     )
     return resolved_deviation(
@@ -451,6 +534,7 @@ def _errors(
         carrier=_carriers(shots, i)[0],
         bandwidth=_at(shots.bandwidth, i), duration=_at(shots.duration, i),
         sample_rate=shots.sample_rate[i], bin_width=np.asarray(width), assumed=shots.two_beats,
+        signed=shots.complex_record,
     )  # fmt: skip
     velocity = reported.radial_velocity * (1 + _at(shots.slowing, i))
     walked = _at(shots.walk, i) * velocity  # within the shot

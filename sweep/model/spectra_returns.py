@@ -24,7 +24,18 @@ from sweep.model.detectors import FIXED, main_lobe
 from sweep.model.estimators import DEFAULTS, DETECTOR, ESTIMATOR, PEAK_BIN
 from sweep.model.groups import Groups
 from sweep.model.interpolation import interpolator, sub_bin_error
-from sweep.model.noisy_spectra import Methods, Signal, View, flagged, placed, spectra_of, view_of
+from sweep.model.noisy_spectra import (
+    Methods,
+    Signal,
+    View,
+    flagged,
+    index_of_zero,
+    placed,
+    spectra_of,
+    turn_of,
+    unrolled,
+    view_of,
+)
 from sweep.model.pairing import FALSE
 from sweep.model.preparation import Parameters, Shots
 from sweep.model.returns import Drawn, How, Returns, known_of, measured, put, report
@@ -34,7 +45,7 @@ class Peak(NamedTuple):
     """Adjacent bins that a detector flags."""
 
     bin: int
-    """The strongest of them."""
+    """Index of the strongest of them."""
     group: int
     """Echo whose bins they touch, or FALSE."""
 
@@ -76,6 +87,7 @@ def spectra_returns(
     how, tables = How.of(shots, first_draw, True), interpolator(shots.window, shots.fft_size)
     peaks, which = np.zeros((3, most + 1, 4)), np.empty((3, most + 1), np.int64)
     pairs, looks = np.empty((most + 1, 4), np.int64), math.sqrt(shots.looks.number)
+    zero = index_of_zero(shots)
     rounded = math.sqrt(1 / 12) if str(p[ESTIMATOR + "kind"]) == PEAK_BIN else 0.0
     for i in range(shots.size):
         view = view_of(shots, i, p, keys[i], methods, found.bin[i])
@@ -97,7 +109,8 @@ def spectra_returns(
                     error = sub_bin_error(delta, ratio / under_lines, tables) / looks
                     wide = known.spread[i, s, peak.group] if peak.group >= 0 else 0.0
                     error = math.hypot(error, rounded)
-                    put(peaks[s, k], peak.bin, place, error, ratio, wide, how, tables)
+                    at = peak.bin - zero, place - zero
+                    put(peaks[s, k], *at, error, ratio, wide, how, tables)
                     which[s, k] = peak.group
                 number[s] = bins.size
             report((i, d), how, known, (peaks, which, number), pairs, drawn)
@@ -105,15 +118,22 @@ def spectra_returns(
 
 
 def _bins_of(view: View, segment: int, signal: Signal | None) -> np.ndarray:
-    """First and last bin of each echo in a segment, (echoes, 2)."""
+    """First and last bin of each echo in a segment, where :func:`unrolled` puts them, (echoes, 2).
+
+    The strongest of all stands in the middle of a complex record's bins.
+    """
     places = view.echoes_of(segment)
     if signal is None or not places.size:
         return np.empty((0, 2), np.int64)
-    if view.shots.detection != "any_bin":
+    shots, setting = view.shots, view.setting
+    turn = turn_of(shots, signal.strongest)
+    if shots.complex_record:
+        places = (places + turn - 1) % shots.fft_size + 1
+    if shots.detection != "any_bin":
         return np.stack([places - 1, places + 1], axis=1)
     if places.size == 1:
-        return np.array([[signal.first, signal.last]])
-    setting, magnitude = view.setting, np.abs(signal.spectrum)
+        return np.array([[signal.first + turn, signal.last + turn]])
+    magnitude = unrolled(shots, np.abs(signal.spectrum), signal.strongest)
     beside = math.ceil(main_lobe(setting.window) * setting.fft_size / setting.window.length)
     found = []
     for place in places:
@@ -128,11 +148,13 @@ def _bins_of(view: View, segment: int, signal: Signal | None) -> np.ndarray:
 def peaks_of(
     spectra: Sequence[np.ndarray], signal: Signal, echoes: np.ndarray, view: View, most: int
 ) -> tuple[np.ndarray, list[Peak]]:
-    """Power (N/2 + 1,) of one draw of a segment, and the peaks in it, strongest first.
+    """Power (bins,) of one draw of a segment, and the peaks in it, strongest first.
 
-    ``spectra``: (1, N/2 + 1) each, of one or several looks; ``echoes``: first and last bins.
+    ``spectra``: (1, bins) each, of one or several looks; ``echoes``: of :func:`_bins_of`.
     """
-    (power,), (flags,) = flagged(spectra, view, signal.segment)
+    (whole,), (flags,) = flagged(spectra, view, signal.segment)
+    shots, turn = view.shots, turn_of(view.shots, signal.strongest)
+    power, flags = (unrolled(shots, each, signal.strongest) for each in (whole, flags))
     half = power.size - 1
     if view.shots.real_ends and signal.last >= signal.first:  # an echo on DC or Nyquist
         flags[1] |= flags[0] and signal.first == 0
@@ -144,7 +166,7 @@ def peaks_of(
     seen: set[int] = set()
     least = view.shots.searched_from
     if not starts.size:
-        return power, []
+        return whole, []
     strength = np.maximum.reduceat(np.where(flags, power, 0.0), starts)
     for run in np.argsort(-strength, kind="stable"):
         start, end = int(starts[run]), int(ends[run])
@@ -153,7 +175,7 @@ def peaks_of(
         if group in seen or (group == FALSE and (start > half - least or end <= least)):
             continue
         seen |= {group} - {FALSE}
-        found.append(Peak(start + int(power[start:end].argmax()), group))
+        found.append(Peak((start + int(power[start:end].argmax()) - turn) % whole.size, group))
         if len(found) == most:
             break
-    return power, found
+    return whole, found

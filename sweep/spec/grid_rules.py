@@ -616,10 +616,6 @@ def spectra_findings(draws: Draws | SceneDraws, grid: Grid) -> Iterator[Finding]
     elif not draws.any:
         rule, remedy = "draws whole spectra, and draws none", "set draws.number or draws.limit"
         yield Finding(("draws", "method"), rule, remedy, draws.method)
-    elif grid.has_point({RECORD: _is("complex")}):
-        rule = "draws whole spectra of real records, and the record is complex"
-        remedy = "take draws.method: noise, or instrument.receiver.record: real"
-        yield Finding(("draws", "method"), rule, remedy, draws.method)
     else:
         yield from _misfits(grid)
 

@@ -13,8 +13,6 @@ import numpy as np
 from sweep.model.detectors import taper
 from sweep.model.effects.catalogue import DEFAULTS, EFFECTS
 from sweep.model.looks import NUMBER, Looks
-from sweep.model.preparation import RECORD
-from sweep.model.unsupported import UnsupportedShot
 from sweep.storage.atomic_replace import draft
 from sweep.tasks.errors import StoreError
 from sweep.tasks.grid_study import draw_keys
@@ -41,11 +39,6 @@ def spectra(
     from sweep.model.noisy_spectra import drawn_of, fading_of, noise_of, signal_of
     from sweep.model.realisations import random_effects, realise
 
-    if str(parameters.get(RECORD, "real")) == "complex":
-        raise UnsupportedShot(
-            "instrument.receiver.record is complex, and spectra are drawn of real records: set it "
-            "to real"
-        )
     if Looks.of(parameters).number > 1:
         raise ValueError(
             f"a file of spectra holds one record of each segment, and {NUMBER} takes "
@@ -102,6 +95,8 @@ def _dataset(
 ) -> xr.Dataset:
     import xarray as xr
 
+    from sweep.model.noisy_spectra import index_of_zero
+
     width = float(shots.sample_rate[0]) / shots.fft_size
     there = [name for name, is_there in zip(SEGMENTS, shots.segments, strict=True) if is_there]
     of_signal = ("draw", "segment") if len(found) > 1 else ("segment",)
@@ -127,7 +122,7 @@ def _dataset(
         "radial_velocity": ((), float(shots.radial_velocity[-1])),
         "draw": (("draw",), numbers),
         "segment": (("segment",), np.array(there, dtype=object)),
-        "frequency": (("frequency",), np.arange(shots.fft_size // 2 + 1) * width),
+        "frequency": (("frequency",), (np.arange(shots.bins) - index_of_zero(shots)) * width),
     }
     variables = {
         name: (dims, values, dict(zip(("units", "long_name"), TOLD[name], strict=True)))

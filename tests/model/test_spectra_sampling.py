@@ -26,6 +26,10 @@ EFFECTS = ("doppler",)
 WHOLE = {"method": "spectra"}
 
 
+RECORD = "instrument.receiver.record"
+BOTH = pytest.mark.parametrize("record", ["real", "complex"])
+
+
 def _points(table_4_1, **changes):
     given = {
         "instrument.processing.fft_size": 2048,
@@ -40,10 +44,14 @@ def _drawn(parameters, number=400, effects=EFFECTS, **place):
     return simulate(parameters, effects, keys=keys(size), batch_sizes=[number], **place, **WHOLE)
 
 
+@BOTH
 @pytest.mark.parametrize(("window", "duration"), [("rectangular", 5e-4), ("hamming", 2.5e-6)])
-def test_noise_has_the_power_and_the_correlation_of_window_and_padding(table_4_1, window, duration):
+def test_noise_has_the_power_and_the_correlation_of_window_and_padding(
+    table_4_1, window, duration, record
+):
     """2.5 us are 1500 samples in 2048 points. 5 sigma of a mean over 300 spectra of 1000 bins."""
     changes = {"instrument.processing.window": window, "instrument.chirp.duration": duration}
+    changes[RECORD] = record
     ((_, shots),) = prepare(_points(table_4_1, **changes) | {"target.range": 100.0}, EFFECTS)
     noise = noise_of(shots, 0, 0, key=keys(1)[0], draws=np.arange(300))[:, 8:-8]
     power = 2 * float(shots.bin_deviation[0]) ** 2
@@ -56,15 +64,18 @@ def test_noise_has_the_power_and_the_correlation_of_window_and_padding(table_4_1
     assert near == pytest.approx(expected, abs=5 / np.sqrt(independent))
 
 
-def test_the_signal_is_that_of_the_time_domain(table_4_1):
+@BOTH
+def test_the_signal_is_that_of_the_time_domain(table_4_1, record):
     """A lone line: magnitudes of the record's own FFT; its place, but for its image."""
     parameters = _points(table_4_1) | {"target.range": 1000.0, "footprint.beamlets": 1}
+    parameters[RECORD] = record
     ((_, shots),) = prepare(parameters, (*EFFECTS, "image"))
     expected = spectrum(shots, 0, 2, range_walk=False)
     signal = signal_of(shots, 0, 2)
     np.testing.assert_allclose(np.abs(signal.spectrum), expected, atol=1e-8 * expected.max())
     assert signal.strongest == np.argmax(expected)
     up, down = signal_of(shots, 0, 0).frequency, signal.frequency
+    assert (up > 0) == (record == "real" or 2 * 150.0 / 1550e-9 > 1000.0 * 2e12 / 1.5e8)
     beat = 2 * 150.0 / 1550e-9 / 600e6 * 2048  # half sum of up and down [bins]
     assert (up + down) / 2 == pytest.approx(beat, abs=5e-3)
 
