@@ -8,14 +8,17 @@ from sweep.model import philox, sampling
 from sweep.model.accuracy import Accuracy
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.line_width import walk_steps, walked_phase
+from sweep.model.estimators import DEFAULTS
 from sweep.model.interpolation import noise_correlation
 from sweep.model.noisy_spectra import (
     DETECTOR,
     ESTIMATOR,
     Methods,
     drawn_of,
+    flagged,
     noise_of,
     signal_of,
+    view_of,
 )
 from sweep.model.outputs import DRAW_OUTPUTS, SPECTRA_OUTPUTS
 from sweep.model.sampling import Before, simulate
@@ -24,9 +27,8 @@ from sweep.model.truth import spectrum
 
 EFFECTS = ("doppler",)
 WHOLE = {"method": "spectra"}
-
-
 RECORD = "instrument.receiver.record"
+COMPLEX = {RECORD: "complex"}
 BOTH = pytest.mark.parametrize("record", ["real", "complex"])
 
 
@@ -80,7 +82,8 @@ def test_the_signal_is_that_of_the_time_domain(table_4_1, record):
     assert (up + down) / 2 == pytest.approx(beat, abs=5e-3)
 
 
-def test_a_fixed_threshold_detects_as_the_closed_form_says(table_4_1):
+@BOTH
+def test_a_fixed_threshold_detects_as_the_closed_form_says(table_4_1, record):
     """Tones on bins of an untapered record: nothing beside them, where one more look is taken.
 
     The Doppler beat is on bin 660, and the range beat 30 bins from it.
@@ -96,6 +99,7 @@ def test_a_fixed_threshold_detects_as_the_closed_form_says(table_4_1):
             "target.radial_velocity": speed,
             "target.range": np.full(3, 660.0),
             "footprint.beamlets": 1,
+            RECORD: record,
         },
     )
     closed, drawn = evaluate(parameters, EFFECTS), _drawn(parameters, 2000)
@@ -107,10 +111,11 @@ def test_a_fixed_threshold_detects_as_the_closed_form_says(table_4_1):
     assert (drawn["pfa_bin_error"] < 0.05 * drawn["pfa_bin"]).all()
 
 
-def test_the_most_likely_range_and_velocity_reach_the_bound(table_4_1):
+@BOTH
+def test_the_most_likely_range_and_velocity_reach_the_bound(table_4_1, record):
     """Within 10 %, of a lone line; 5 standard errors of 1500 draws are 9 %."""
     parameters = _points(table_4_1, **{"footprint.beamlets": 1, "target.range": np.array([600.0])})
-    parameters |= {ESTIMATOR + "kind": "maximum_likelihood"}
+    parameters |= {ESTIMATOR + "kind": "maximum_likelihood", RECORD: record}
     found = _drawn(parameters, 1500)
     for name in ("range", "radial_velocity"):
         assert found[f"{name}_rmse"] == pytest.approx(found[f"{name}_bound"], rel=0.1)
@@ -135,9 +140,13 @@ def test_range_is_that_at_the_beginning_though_the_ground_walks(table_4_1):
     assert found["range_bias_error"] < 2e-3
 
 
-@pytest.mark.parametrize("effects", [EFFECTS, (*EFFECTS, "speckle")])
-def test_batches_points_and_their_order_change_no_bit(table_4_1, effects):
+@pytest.mark.parametrize(
+    ("effects", "record"),
+    [(EFFECTS, "real"), ((*EFFECTS, "speckle"), "real"), (EFFECTS, "complex")],
+)
+def test_batches_points_and_their_order_change_no_bit(table_4_1, effects, record):
     parameters = _points(table_4_1, **{"target.roughness": 1e-6, "footprint.beamlets": 4})
+    parameters |= {RECORD: record}
     parameters |= {DETECTOR + "kind": "os_cfar", ESTIMATOR + "kind": "candan"}
     given = keys(3)
     whole = simulate(parameters, effects, keys=given, batch_sizes=[40, 30], **WHOLE)
@@ -176,6 +185,46 @@ def _in_pieces(**given):
         number, pieces = found["n_draws"].sum(), pieces + 1
         counts = np.stack([found[name].reshape(len(found["n_draws"]), -1) for name in DRAW_OUTPUTS])
         before = Before(found["n_draws"], counts, found)
+
+
+@pytest.mark.parametrize("kind", ["ca_cfar", "os_cfar", "goca_cfar"])
+def test_cells_of_an_iq_spectrum_have_neighbours_all_round(table_4_1, kind):
+    """Of noise alone every bin alarms as often as designed, the first and the last included.
+
+    10,000 spectra of an untapered record, whose bins are independent.
+    """
+    changes = {"instrument.processing.window": "rectangular", "instrument.processing.fft_size": 64}
+    parameters = _points(table_4_1, **changes) | COMPLEX | {"target.range": 1000.0}
+    parameters |= DEFAULTS | {DETECTOR + "kind": kind, DETECTOR + "pfa": 0.02}
+    ((_, shots),) = prepare(parameters, EFFECTS)
+    view = view_of(shots, 0, parameters, keys(1)[0], Methods())
+    noise = noise_of(shots, 0, 0, key=keys(1)[0], draws=np.arange(10_000))
+    _, flags = flagged([noise], view, 0)
+    assert flags.shape == (10_000, 64)
+    np.testing.assert_allclose(flags.mean(axis=0), 0.02, atol=5 * np.sqrt(0.02 * 0.98 / 10_000))
+
+
+@pytest.mark.parametrize("edge", [0.0, -512.0])
+def test_an_iq_echo_on_the_seam_or_at_zero_is_found_as_any_other(table_4_1, edge):
+    """A beat walked across 0 and across Nyquist: detected as often, and placed as well.
+
+    5 sigma of two shares of 600 draws, and of two root mean squares.
+    """
+    bins = edge + np.array([-0.3, 0.3, 200.3])  # of the Doppler segment's beat
+    parameters = COMPLEX | {
+        "instrument.processing.fft_size": 1024, "footprint.beamlets": 1,
+        "target.radial_velocity": bins * (600e6 / 1024) * 1550e-9 / 2,
+        "target.range": np.full(3, 600.0), ESTIMATOR + "kind": "maximum_likelihood",
+    }  # fmt: skip
+    parameters = _points(table_4_1, **parameters) | {"instrument.laser.power": 0.06}
+    snr = evaluate(parameters, EFFECTS)["snr_doppler"]  # of three bins that the receiver passes
+    as_loud = {"instrument.laser.power": 0.06 * 5.0 / snr}
+    pd = _drawn(parameters | as_loud, 600)["pd_doppler"]
+    assert 0.2 < pd[2] < 0.8
+    assert np.abs(pd - pd[2]).max() < 5 * np.sqrt(2 * pd[2] * (1 - pd[2]) / 600)
+    found = _drawn(parameters | {"instrument.laser.power": 10.0}, 300)
+    assert (found["pd_shot"] == 1).all()
+    np.testing.assert_allclose(found["range_rmse"], found["range_bound"], rtol=5 / np.sqrt(600))
 
 
 @pytest.mark.parametrize("much", [{"batch_sizes": [40, 30]}, {"batch": 16, "limit": 70}])
