@@ -174,15 +174,3 @@ def test_what_makes_no_complex_record_is_told(changed, told):
               "grazing_angle": "90 deg"}  # fmt: skip
     with pytest.raises(SpecError, match=told):
         Spec.from_mapping({"title": "x", "instrument": written, "target": target})
-
-
-def test_whole_spectra_are_of_real_records():
-    written = instrument()
-    written["receiver"] |= {"record": "complex"}
-    target = {"range": "100 m", "reflectance": 0.1, "radial_velocity": "5 m/s",
-              "grazing_angle": "90 deg"}  # fmt: skip
-    with pytest.raises(SpecError, match="method: noise"):
-        Spec.from_mapping({
-            "title": "x", "instrument": written, "target": target,
-            "draws": {"method": "spectra", "number": 10},
-        })  # fmt: skip

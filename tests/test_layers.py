@@ -34,7 +34,7 @@ NOT_IN_THE_MODEL = {
 """Pure physics: arrays in, arrays out."""
 
 LARGEST_HOUSE = {
-    "lines": 50_040, "modules": 183, "lines of the model": 19_320, "modules of the model": 76,
+    "lines": 50_040, "modules": 183, "lines of the model": 19_540, "modules of the model": 76,
     "compiled functions": 134, "arguments of a compiled function": 10,
 }  # fmt: skip
 """Upper limits on the size of sweep/."""

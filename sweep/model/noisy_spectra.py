@@ -542,7 +542,7 @@ def _errors(
     fitted = shots.slopes != waveform.SIGNS or (shots.any_two & ~detected.all(axis=0))
     if np.any(fitted):
         cnr = np.array([[0.0 if s is None else s.cnr] for s in view.signals])
-        own = fit(shots, np.array([up, doppler, down]), detected * cnr, i)
+        own = fit(shots, np.array([up, doppler, down]), detected * cnr, np.array([i]))
         metres = np.where(fitted, own.range, metres)
         velocity = np.where(fitted, own.radial_velocity, velocity)
     return metres - shots.range[i], velocity - shots.radial_velocity[i]

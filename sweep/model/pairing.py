@@ -17,11 +17,13 @@ where there is none, **with the half sum as the Doppler frequency**, the order o
 An up (or down) peak in which two surfaces coincide serves one return only.
 
 Complex records keep their beats' signs: there is the one reading
-:data:`sweep.model.waveform.SIGNED`, and each surface's Doppler peak confirms it.
+:data:`sweep.model.waveform.SIGNED`, and each surface's Doppler peak confirms it. Segments of other
+slopes are paired alike, by the Doppler beat that an up and a down beat predict; readings of a pair
+that is found are left to :func:`sweep.model.waveform.fit`.
 
 Without a Doppler segment nothing tells which peaks belong together, and none is unconfirmed: the
 strongest up peak goes with the strongest down peak, and so on, by the reading
-:data:`sweep.model.waveform.FAR`, or SIGNED.
+:data:`sweep.model.waveform.FAR`, FAST or SIGNED.
 """
 
 import math
@@ -30,7 +32,7 @@ import numpy as np
 from numba import njit
 
 from sweep.model.groups import FIRST, LAST
-from sweep.model.waveform import FAR, FOLD_PENALTY, READINGS, SIGNED, reading
+from sweep.model.waveform import BELOW, FOLD_PENALTY, READINGS, SIGNED
 
 TOLERANCE = 3.0
 """Default mismatch [bins] up to which a Doppler peak confirms a pair.
@@ -69,11 +71,8 @@ FALSE, ABSENT = -1, -2
 """In place of a peak's group: a false peak; no Doppler peak, or no Doppler segment."""
 
 
-_reading = njit(cache=True, error_model="numpy")(reading)
-
-
 @njit(cache=True, error_model="numpy")
-def pair_peaks(up, doppler, down, at_start, fft_size, signed, tolerance, pairs):
+def pair_peaks(up, doppler, down, third, fft_size, signed, tolerance, pairs):
     """Pairs of peaks, one to one: confirmed ones first, in the order of the up peaks.
 
     Peaks are positions [bins], strongest first, with signs if ``signed``; the rest as of
@@ -85,7 +84,7 @@ def pair_peaks(up, doppler, down, at_start, fft_size, signed, tolerance, pairs):
     for i in range(up.size):
         for j in range(down.size):
             cost[i, j], via[i, j, 0], via[i, j, 1] = confirm(
-                up[i], doppler, down[j], at_start, fft_size, signed, tolerance
+                up[i], doppler, down[j], third, fft_size, signed, tolerance
             )
     chosen, used = _match(cost)
     number = 0
@@ -100,7 +99,7 @@ def pair_peaks(up, doppler, down, at_start, fft_size, signed, tolerance, pairs):
         while j < down.size and used[j]:
             j += 1
         if chosen[i] < 0 and j < down.size:
-            _, _, code = confirm(up[i], doppler, down[j], at_start, fft_size, signed, np.inf)
+            _, _, code = confirm(up[i], doppler, down[j], third, fft_size, signed, np.inf)
             pairs[number, 0], pairs[number, 1], pairs[number, 2] = i, -1, j
             pairs[number, 3] = code if doppler.size else SIGNED if signed else ASSUMED
             number, j = number + 1, j + 1
@@ -108,31 +107,40 @@ def pair_peaks(up, doppler, down, at_start, fft_size, signed, tolerance, pairs):
 
 
 @njit(cache=True, error_model="numpy")
-def pair_by_strength(ups, downs, signed, pairs):
-    """Pairs of as many up and down peaks in their order, as of :func:`pair_peaks`; their number."""
-    number, code = min(ups, downs), SIGNED if signed else FAR
+def pair_by_strength(ups, downs, code, pairs):
+    """Pairs of as many up and down peaks in their order, as of :func:`pair_peaks`; their number.
+
+    All have the reading ``code``.
+    """
+    number = min(ups, downs)
     for i in range(number):
         pairs[i, 0], pairs[i, 1], pairs[i, 2], pairs[i, 3] = i, -1, i, code
     return number
 
 
 @njit(cache=True, error_model="numpy")
-def confirm(up, doppler, down, at_start, fft_size, signed, tolerance):
+def confirm(up, doppler, down, third, fft_size, signed, tolerance):
     """Doppler peak and reading of an up and a down peak that fit best, within a tolerance [bins].
 
-    ``at_start`` is the Doppler segment's carrier over that at mid-chirp, which the chirps see.
-    Returns mismatch and penalties [bins], inf where none comes within the tolerance; the Doppler
-    peak and the reading, -1 for none.
+    ``third`` (2,) is the share of up and of down beat in the Doppler segment's. ``signed``, of
+    complex records, is 1 where the down beat rises against the up beat as the range does, -1 where
+    it falls; 0 of real records. Returns mismatch and penalties [bins], inf where none comes within
+    the tolerance; the Doppler peak and the reading, -1 for none.
     """
     least, peak, best = np.inf, -1, -1
     for k in range(doppler.size):
         for code in range(SIGNED if signed else 0, SIGNED + 1 if signed else READINGS):
-            shift, _ = _reading(code, up, down, fft_size)
-            place = fft_size - doppler[k] if code & 4 else doppler[k]
-            mismatch = abs(abs(shift) * at_start - place)
             if signed:
-                apart = shift * at_start - place
-                mismatch = abs(apart - fft_size * math.floor(apart / fft_size + 0.5))
+                turns = signed * (down - up) / fft_size
+                apart = signed * (turns - math.floor(turns + BELOW)) * fft_size
+                mismatch = third[0] * up + third[1] * (up + apart) - doppler[k]
+                mismatch = abs(mismatch - fft_size * math.floor(mismatch / fft_size + 0.5))
+            else:
+                u = fft_size - up if code & 8 else up
+                place = fft_size - doppler[k] if code & 4 else doppler[k]
+                d = fft_size - down if code & 2 else down
+                shift = third[0] * (-u if code & 1 else u) + third[1] * d
+                mismatch = abs(abs(shift) - place)
             folds = (code >> 3 & 1) + (code >> 2 & 1) + (code >> 1 & 1)
             cost = mismatch + folds * FOLD_PENALTY
             if cost < least and mismatch <= tolerance:

@@ -12,7 +12,8 @@ neighbours, so that another may be the largest, or to all bins of a group's echo
 
 Ranges and velocities are those at the shot's start, the instant of the truth. What range walk moves
 the interpolated range by, v_r (T_w + 2 t_0), and what motion between segments moves both by, is put
-right by the velocity that is measured with them; nothing tells of the acceleration.
+right by the velocity that is measured with them; nothing tells of the acceleration. Of segments
+with slopes other than 1, 0 and -1 a return is the fit of all its peaks.
 
 Echoes in developed speckle fade: in noise by factors on each group's magnitudes in the three
 segments, which share what their speckles do; against probabilities the down segment's chance
@@ -45,6 +46,7 @@ from sweep.model.draws import (
     noise_levels,
     seen_spectra,
 )
+from sweep.model.estimators import Deviation, resolved_deviation
 from sweep.model.groups import BIN, FIRST, LAST, Groups
 from sweep.model.interpolation import interpolator, spread_error, sub_bin, sub_bin_error
 from sweep.model.marcum import at_least_one
@@ -61,6 +63,7 @@ from sweep.model.pairing import (
 )
 from sweep.model.preparation import Shots
 from sweep.model.search import beamlet_lines, columns
+from sweep.model.shot import fit
 
 WHOLE, FINE, ERROR, RATIO = range(4)
 """Fields of a peak: bin; position between bins and its standard error [bins]; |X| / sigma."""
@@ -155,6 +158,10 @@ class How(NamedTuple):
     """N/2."""
     signed: bool
     """Bins are -N/2 .. N/2 - 1, of a complex record, not 1 .. N/2."""
+    rising: float
+    """1 where the down beat rises against the up beat as the range does, else -1."""
+    alone: int
+    """Reading of up and down peak without a Doppler segment."""
     ends: int
     """N where noise at DC and Nyquist is real, else 0."""
     beside: int
@@ -169,9 +176,12 @@ class How(NamedTuple):
     @classmethod
     def of(cls, shots: Shots, first_draw: int, noisy: bool) -> "How":
         """Draw some shots from a draw on."""
+        alone = waveform.FAST if shots.two_beats == waveform.FAST_TARGET else waveform.FAR
+        if shots.complex_record:
+            alone = waveform.SIGNED
         return cls(
             int(first_draw), noisy, shots.incoherent, bool(shots.segments[1]), shots.fft_size // 2,
-            shots.complex_record,
+            shots.complex_record, math.copysign(1.0, 1.0 - shots.slopes[2]), alone,
             shots.real_ends, shots.echo_rule[1], echo_filter(shots, Seen.nothing(0)),
             shots.looks.number if shots.looks.several else 1, shots.looks.independent,
         )  # fmt: skip
@@ -197,8 +207,8 @@ class Known(NamedTuple):
     """(n, 3): sigma [V]; over it, the threshold and the noise of bins that hold lines."""
     alarm: np.ndarray
     """(n, 3): chance of a false alarm in bins that are not drawn one by one."""
-    at_start: np.ndarray
-    """(n,): as of :func:`sweep.model.pairing.confirm`."""
+    third: np.ndarray
+    """(n, 2): as of :func:`sweep.model.pairing.confirm`."""
     beside: np.ndarray
     """(n, 2, most): chance of a group in the down segment, where the up segment's of the same
     number is missed, or detected."""
@@ -212,9 +222,9 @@ class Drawn(NamedTuple):
     """Results of the draws of n points."""
 
     peaks: np.ndarray
-    """(n, draws, most, 2, 4): up and down peak of each return."""
+    """(n, draws, most, 3, 4): up, Doppler and down peak of each return; nan for none."""
     code: np.ndarray
-    """(n, draws, most) int64: reading; -1 where there is no return."""
+    """(n, draws, most) int64: reading of the default slopes; -1 where there is no return."""
     group: np.ndarray
     """(n, draws, most, 3) int8: group of the up, Doppler and down peak, FALSE or ABSENT."""
     flags: np.ndarray
@@ -225,7 +235,7 @@ class Drawn(NamedTuple):
         """No returns of shots with these groups."""
         n, _, most = found.bin.shape
         return cls(
-            np.full((n, draws, most, 2, 4), np.nan), np.full((n, draws, most), -1),
+            np.full((n, draws, most, 3, 4), np.nan), np.full((n, draws, most), -1),
             np.full((n, draws, most, 3), ABSENT, np.int8),
             np.zeros((n, draws, most), np.uint8), np.full((n, draws, most), -1, np.int32),
         )  # fmt: skip
@@ -233,7 +243,6 @@ class Drawn(NamedTuple):
 
 def known_of(shots: Shots, found: Groups) -> Known:
     """Return what is known of shots and their groups before any draw."""
-    n = shots.size
     lines, amplitude = beamlet_lines(shots), shots.amplitude[shots.row]
     if shots.complex_record:
         apart = (lines - found.bin[:, :, :1]) / shots.fft_size
@@ -248,14 +257,23 @@ def known_of(shots: Shots, found: Groups) -> Known:
     total[total == 0] = 1.0
     mean = (weight * apart).sum(axis=-1) / total
     square = (weight * apart**2).sum(axis=-1) / total
-    carrier = shots.carriers[0]
     return Known(
         bins, found.pd, found.neighbours, np.sqrt(np.maximum(square - mean**2, 0.0)), lines,
         amplitude, np.stack([shots.bin_deviation, *noise_levels(shots)], axis=1), found.leakage,
-        np.broadcast_to(carrier / (carrier + shots.bandwidth / 2), n).copy(), _beside(shots, found),
-        _searched(shots),
-        np.empty((n, 0)) if shots.fading is None else shots.fading.mixing().T.copy(),
+        np.stack([np.broadcast_to(part, shots.size) for part in _third(shots)], axis=1),
+        _beside(shots, found), _searched(shots),
+        np.empty((shots.size, 0)) if shots.fading is None else shots.fading.mixing().T.copy(),
     )  # fmt: skip
+
+
+def _third(shots: Shots) -> tuple[np.ndarray, np.ndarray]:
+    """Share of the up and of the down beat in the Doppler segment's, which these two tell."""
+    _, doppler, down = shots.slopes
+    up_carrier, at_doppler, at_down = (np.asarray(carrier) for carrier in shots.carriers)
+    whole = at_down - down * up_carrier
+    return (doppler * at_down - down * at_doppler) / whole, (
+        at_doppler - doppler * up_carrier
+    ) / whole
 
 
 def _searched(shots: Shots) -> np.ndarray:
@@ -277,17 +295,60 @@ def _beside(shots: Shots, found: Groups) -> np.ndarray:
     return np.ascontiguousarray(np.moveaxis(down_given_up(up, down, both), 0, 1))
 
 
+class Told(NamedTuple):
+    """Range [m] and radial velocity [m/s] of returns by WHOLE and FINE peaks, (n, draws, most, 2).
+
+    And their standard errors by noise, and what half a bin of the chirps is worth, (n, 1, 1).
+    """
+
+    range: np.ndarray
+    velocity: np.ndarray
+    range_error: np.ndarray
+    velocity_error: np.ndarray
+    metre: np.ndarray
+    speed: np.ndarray
+    pulled: np.ndarray | float
+    """How much further than at the shot's start the range is told [m], (n, 1, 1)."""
+
+
 def measured(shots: Shots, found: Groups, drawn: Drawn) -> Returns:
     """Compute returns from pairs of peaks; flag those that misread their common beamlet."""
-    carrier, bandwidth, duration, rate, deepest, walk = (
-        columns(shots, column, 3)
-        for column in (
-            shots.carriers[0], shots.bandwidth, shots.duration, shots.sample_rate, shots.range,
-            shots.walk,
-        )
+    fitted = shots.slopes != waveform.SIGNS
+    told = _fitted(shots, drawn) if fitted else _read(shots, drawn)
+    point, group = np.arange(shots.size)[:, None, None], np.maximum(drawn.group, 0)
+    sizes = (found.last - found.first)[point[..., None], np.arange(3), group]
+    reach = 2 * (4 + np.where(drawn.group >= 0, sizes, 0).sum(axis=-1))  # of half bins
+    offset, doppler = shots.offset[shots.row], SPEED_OF_LIGHT / 2 * shots.doppler[shots.row]
+    truth = columns(shots, shots.radial_velocity) + doppler
+    deepest, seen = columns(shots, shots.range, 2), np.maximum(drawn.beamlet, 0)
+    off = told.range[..., FINE] - told.pulled - deepest * (1 + offset[point, seen])
+    right = abs(off) <= reach * told.metre
+    right &= abs(told.velocity[..., FINE] - truth[point, seen]) <= reach * told.speed
+    signal = (drawn.group[..., 0] >= 0) & (drawn.group[..., 2] >= 0)
+    pd = found.pd[point, 0, group[..., 0]] * _beside(shots, found)[point, 1, group[..., 2]]
+    misread = (drawn.flags & TRUE > 0) & ~right
+    if not fitted:  # what the ground came nearer by within the shot: the measured velocity tells
+        told.velocity[..., FINE] *= 1 + columns(shots, shots.slowing, 2)
+        told.range[..., FINE] += told.velocity[..., FINE] * columns(shots, shots.walk, 2)
+    return Returns(
+        told.range[..., WHOLE], told.range[..., FINE],
+        told.velocity[..., WHOLE], told.velocity[..., FINE],
+        told.range_error[..., WHOLE], told.range_error[..., FINE],
+        told.velocity_error[..., WHOLE], told.velocity_error[..., FINE],
+        drawn.peaks[..., ::2, RATIO].min(axis=-1) ** 2 / 2, np.where(signal, pd, np.nan),
+        np.where(misread, drawn.flags ^ (TRUE | MISREAD), drawn.flags), drawn.beamlet,
+        np.maximum(drawn.group, FALSE),
     )  # fmt: skip
-    width = rate / shots.fft_size
-    up, down = (drawn.peaks[..., side, : FINE + 1] * width for side in range(2))
+
+
+def _read(shots: Shots, drawn: Drawn) -> Told:
+    """Tell range and velocity at mid-chirp by each return's reading of its up and down peak."""
+    carrier, bandwidth, duration, rate = (
+        columns(shots, column, 3)
+        for column in (shots.carriers[0], shots.bandwidth, shots.duration, shots.sample_rate)
+    )
+    width, chirp_rate = rate / shots.fft_size, bandwidth / duration
+    up, down = (drawn.peaks[..., side, : FINE + 1] * width for side in (0, 2))
     f_d, f_r = np.full((2, *up.shape), np.nan)
     for code in np.unique(drawn.code[drawn.code >= 0]):
         there = (drawn.code == code)[..., None]
@@ -296,37 +357,52 @@ def measured(shots: Shots, found: Groups, drawn: Drawn) -> Returns:
             for new, old in zip(waveform.reading(code, up, down, rate), (f_d, f_r), strict=True)
         )
     distance, velocity = waveform.measured(f_d, f_r, carrier, bandwidth, duration)
-    metre = (SPEED_OF_LIGHT / 4 * width / (bandwidth / duration))[..., 0]
-    speed = (SPEED_OF_LIGHT / 4 * width / (carrier + bandwidth / 2))[..., 0]
-    variance = (drawn.peaks[..., ERROR] ** 2).sum(axis=-1)
-    whole, fine = np.sqrt(variance + 1 / 6), np.sqrt(variance)
-    point, group = np.arange(shots.size)[:, None, None], np.maximum(drawn.group, 0)
-    sizes = (found.last - found.first)[point[..., None], np.arange(3), group]
-    reach = 2 * (4 + np.where(drawn.group >= 0, sizes, 0).sum(axis=-1))  # of half bins
-    offset, doppler = shots.offset[shots.row], SPEED_OF_LIGHT / 2 * shots.doppler[shots.row]
-    truth = columns(shots, shots.radial_velocity) + doppler
-    seen = np.maximum(drawn.beamlet, 0)
+    metre = SPEED_OF_LIGHT / 4 * width / chirp_rate
+    speed = SPEED_OF_LIGHT / 4 * width / (carrier + bandwidth / 2)
+    variance = (drawn.peaks[..., ::2, ERROR] ** 2).sum(axis=-1)
+    error = np.sqrt(np.stack([variance + 1 / 6, variance], axis=-1))
     # Up and down beat tell the range at the middle of their starts; acceleration adds to it.
     first, last = (columns(shots, shots.starts[s], 2) for s in (0, 2))
-    pulled = carrier / (bandwidth / duration) * columns(shots, shots.acceleration, 3)
-    pulled = 0.5 * (last - first) * pulled[..., 0]
+    pulled = (carrier / chirp_rate)[..., 0] * columns(shots, shots.acceleration, 2)
+    pulled = 0.5 * (last - first) * pulled
     pulled -= 0.5 * (last + first) * columns(shots, shots.approach, 2)
-    off = distance[..., FINE] - pulled - deepest[..., 0] * (1 + offset[point, seen])
-    right = abs(off) <= reach * metre
-    right &= abs(velocity[..., FINE] - truth[point, seen]) <= reach * speed
-    signal = (drawn.group[..., 0] >= 0) & (drawn.group[..., 2] >= 0)
-    pd = found.pd[point, 0, group[..., 0]] * _beside(shots, found)[point, 1, group[..., 2]]
-    misread = (drawn.flags & TRUE > 0) & ~right
-    # What the ground came nearer by within the shot, which the measured velocity tells.
-    velocity[..., FINE] *= 1 + columns(shots, shots.slowing, 2)
-    distance[..., FINE] += velocity[..., FINE] * walk[..., 0]
-    return Returns(
-        distance[..., WHOLE], distance[..., FINE], velocity[..., WHOLE], velocity[..., FINE],
-        metre * whole, metre * fine, speed * whole, speed * fine,
-        drawn.peaks[..., RATIO].min(axis=-1) ** 2 / 2, np.where(signal, pd, np.nan),
-        np.where(misread, drawn.flags ^ (TRUE | MISREAD), drawn.flags), drawn.beamlet,
-        np.maximum(drawn.group, FALSE),
-    )  # fmt: skip
+    return Told(
+        distance, velocity, metre * error, speed * error, metre[..., 0], speed[..., 0], pulled
+    )
+
+
+def _fitted(shots: Shots, drawn: Drawn) -> Told:
+    """Tell range and velocity at the shot's start by the fit of each return's peaks."""
+    shape = drawn.flags.shape
+    point = np.repeat(np.arange(shots.size), shape[1] * shape[2])
+    width = np.broadcast_to(shots.sample_rate / shots.fft_size, shots.size)
+    carriers = [np.broadcast_to(carrier, shots.size) for carrier in shots.carriers]
+    rate = np.broadcast_to(shots.chirp_rate, shots.size)
+    peaks = np.moveaxis(drawn.peaks, 3, 0).reshape(3, point.size, -1)
+    there = np.isfinite(peaks[..., ERROR])
+
+    def deviation(errors: np.ndarray, at: np.ndarray) -> Deviation:
+        """Of errors [bins], (3, m), of points."""
+        up, doppler, down = errors * width[at]
+        return resolved_deviation(
+            up=up, doppler=doppler, down=down, carriers=tuple(each[at] for each in carriers),
+            chirp_rate=rate[at], slopes=shots.slopes, range=shots.range[at],
+            radial_velocity=shots.radial_velocity[at],
+        )  # fmt: skip
+
+    columns_of = []
+    for kind in (WHOLE, FINE):
+        errors = np.where(there, peaks[..., ERROR], np.inf)
+        errors = np.hypot(errors, math.sqrt(1 / 12) if kind == WHOLE else 0.0)
+        found = fit(shots, peaks[..., kind] * width[point], 1 / errors**2, point)
+        columns_of.append((*found, *deviation(errors, point)))
+    distance, velocity, range_error, velocity_error = (
+        np.stack(pair, axis=-1).reshape(*shape, 2) for pair in zip(*columns_of, strict=True)
+    )
+    segments = np.array(shots.segments)[:, None]
+    half = deviation(np.where(segments, np.sqrt(0.5), np.inf) + 0 * width, np.arange(shots.size))
+    metre, speed = (value[:, None, None] for value in half)
+    return Told(distance, velocity, range_error, velocity_error, metre, speed, 0.0)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -357,11 +433,11 @@ def report(at, how, known, found, pairs, out):
     if how.doppler:
         confirmed, count = pair_peaks(
             peaks[0, : number[0], FINE], peaks[1, : number[1], FINE],
-            peaks[2, : number[2], FINE], known.at_start[i], 2.0 * how.half, how.signed,
-            TOLERANCE, pairs,
+            peaks[2, : number[2], FINE], known.third[i], 2.0 * how.half,
+            how.rising if how.signed else 0.0, TOLERANCE, pairs,
         )  # fmt: skip
     else:
-        confirmed = count = pair_by_strength(number[0], number[2], how.signed, pairs)
+        confirmed = count = pair_by_strength(number[0], number[2], how.alone, pairs)
     for r in range(min(count, out.flags.shape[2])):
         u, k, v, out.code[i, d, r] = pairs[r]
         group, centres = out.group[i, d, r], np.zeros(3)
@@ -369,9 +445,10 @@ def report(at, how, known, found, pairs, out):
         centres[0], centres[2] = peaks[0, u, FINE], peaks[2, v, FINE]
         if k >= 0:
             group[1], centres[1] = which[1, k], peaks[1, k, FINE]
-        both = out.peaks[i, d, r]
+        own = out.peaks[i, d, r]
         for f in range(4):  # slices would compile an error message of shapes
-            both[0, f], both[1, f] = peaks[0, u, f], peaks[2, v, f]
+            own[0, f], own[2, f] = peaks[0, u, f], peaks[2, v, f]
+            own[1, f] = peaks[1, k, f] if k >= 0 else np.nan
         flag, out.beamlet[i, d, r] = judge(
             group, centres, known.bins[i], known.lines[i], known.amplitude[i]
         )

@@ -186,7 +186,7 @@ def report(shots: Shots, found: np.ndarray) -> waveform.Resolution:
 
 
 def fit(
-    shots: Shots, peaks: np.ndarray, weights: np.ndarray, point: int | None = None
+    shots: Shots, peaks: np.ndarray, weights: np.ndarray, point: np.ndarray | slice = slice(None)
 ) -> waveform.Resolution:
     """Range and radial velocity at the shot's start, by :func:`sweep.model.waveform.fit`.
 
@@ -196,8 +196,8 @@ def fit(
         Prepared points.
     peaks, weights : (3, n) ndarray
         Frequencies [Hz] by segment, and their weights, 0 where a segment is not detected.
-    point : int, optional
-        The only point that all peaks are of.
+    point : ndarray of int, optional
+        Point that each peak is of; by default one after the other.
     """
     size = (shots.size,)
     walk, rate = np.broadcast_to(shots.walk, size), np.broadcast_to(shots.sample_rate, size)
@@ -208,10 +208,10 @@ def fit(
     # A record tells the delay at its middle, and at twice that by the phase's own curve.
     times = starts + walk - (starts[0] + starts[2]) / 2
     rates = slopes * shots.chirp_rate
-    one = slice(None) if point is None else slice(point, point + 1)
-    rate = rate[one]
+    rate = rate[point]
+    carriers = carriers + rates * times
     return waveform.fit(
-        peaks, weights=weights, carriers=(carriers + rates * times)[:, one], rates=rates[:, one],
+        peaks, weights=weights, carriers=carriers[:, point], rates=rates[:, point],
         sample_rate=rate, bin_width=rate / shots.fft_size, signed=shots.complex_record,
         assumed=shots.two_beats,
     )  # fmt: skip

@@ -203,7 +203,7 @@ SIGNED = 16
 """Reading of peaks of a complex record, which keep their signs: 2 f_r = d - u, f_d = u + f_r, each
 up to whole sample rates; range beats up to half of it, Doppler shifts to half of either sign."""
 
-_BELOW = 1 / 64
+BELOW = 1 / 64
 """Share of the sample rate by which 2 f_r may be below 0, as that of peaks rounded to bins."""
 
 
@@ -216,7 +216,7 @@ def reading(code, up, down, sample_rate):  # type: ignore[no-untyped-def]  # of 
     """
     if code == SIGNED:
         turns = (down - up) / sample_rate
-        f_r = (turns - np.floor(turns + _BELOW)) * sample_rate / 2.0
+        f_r = (turns - np.floor(turns + BELOW)) * sample_rate / 2.0
         turns = (up + f_r) / sample_rate
         return (turns - np.floor(turns + 0.5)) * sample_rate, f_r
     u = sample_rate - up if code & 8 else up
@@ -412,7 +412,7 @@ def _by_turns(  # type: ignore[no-untyped-def]  # seven arrays and a word
     column = np.arange(peaks.shape[1])
     low, high = rates.argmin(axis=0), rates.argmax(axis=0)
     apart = (peaks[low, column] - peaks[high, column]) / sample_rate
-    apart = (apart - np.floor(apart + _BELOW)) * sample_rate
+    apart = (apart - np.floor(apart + BELOW)) * sample_rate
     x = apart / (rates[high, column] - rates[low, column])
     turns = (peaks[high, column] + rates[high, column] * x) / sample_rate
     shift = (turns - np.floor(turns + 0.5)) * sample_rate

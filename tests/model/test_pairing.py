@@ -13,7 +13,7 @@ from sweep.model.pairing import ASSUMED, TOLERANCE, confirm, pair_peaks
 N, FS = 2**17, 600e6
 WIDTH = FS / N
 OPTICS = {"carrier": 299792458.0 / 1550e-9, "bandwidth": 1e9, "duration": 500e-6}
-AT_START = OPTICS["carrier"] / (OPTICS["carrier"] + OPTICS["bandwidth"] / 2)
+AT_START = np.full(2, 0.5 * OPTICS["carrier"] / (OPTICS["carrier"] + OPTICS["bandwidth"] / 2))
 
 
 def _beats(target_range, radial_velocity):
@@ -37,7 +37,7 @@ def _pair(up, doppler, down, tolerance=TOLERANCE):
     lists = [np.array(x, float).ravel() for x in (up, doppler, down)]
     room = max(lists[0].size, lists[2].size, 1)
     pairs = np.full((room, 4), -9)
-    confirmed, number = pair_peaks(*lists, AT_START, float(N), False, tolerance, pairs)
+    confirmed, number = pair_peaks(*lists, AT_START, float(N), 0.0, tolerance, pairs)
     return confirmed, [tuple(map(int, p)) for p in pairs[:number]]
 
 
@@ -48,7 +48,7 @@ def _reported(up, down, code):
 
 def _confirmed(up, doppler, down, tolerance):
     """(reading, cost) of one triple [bins]."""
-    cost, _, code = confirm(up, np.array([doppler]), down, AT_START, float(N), False, tolerance)
+    cost, _, code = confirm(up, np.array([doppler]), down, AT_START, float(N), 0.0, tolerance)
     return code, cost
 
 
