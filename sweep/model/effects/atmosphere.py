@@ -98,7 +98,9 @@ def optical_depth(
     """Optical depth of a straight path `range` [m] long between two heights [m], one way."""
     ends = np.broadcast_arrays(np.asarray(start_height, float), np.asarray(end_height, float))
     low, high = np.minimum(*ends), np.maximum(*ends)
-    level = np.maximum(_LEVEL - (high - low), 0.0) / 2
+    # So high up that float64 knows no such difference, by what it does know.
+    least = np.maximum(_LEVEL, 4 * np.spacing(np.maximum(np.abs(low), np.abs(high))))
+    level = np.maximum(least - (high - low), 0.0) / 2
     low, high = low - level, high + level
     bottoms = (-np.inf, *profile.height[:-1])
     below = (profile.extinction[0], *profile.extinction[:-1])

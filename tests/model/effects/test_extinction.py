@@ -94,3 +94,11 @@ def test_paths_are_worked_out_together_as_one_by_one():
     for i, j in np.ndindex(table.shape):
         one = optical_depth(profile, start_height=start[i, 0], end_height=end[j], range=1e4)
         assert table[i, j] == one
+
+
+@pytest.mark.parametrize("height", [1e15, -1e15, 1e25])
+def test_paths_so_high_that_float64_knows_no_difference_have_a_depth(height):
+    found = optical_depth(
+        PROFILES["earth_haze"], start_height=height, end_height=height + 1e-3, range=10.0
+    )
+    assert found == pytest.approx(0.0 if height > 0 else PROFILES["earth_haze"].extinction[0] * 10)
