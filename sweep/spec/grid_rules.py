@@ -571,6 +571,7 @@ def not_in_flights(grid: Grid, draws: SceneDraws) -> Iterator[Finding]:
     yield from spectra_findings(draws, grid)
     for path in (
         waveform.DOPPLER_SLOPE, waveform.DOWN_SLOPE, waveform.SHOT_DETECTION, waveform.TWO_BEATS,
+        waveform.PEAKS,
     ):  # fmt: skip
         if grid.has_point({path: partial(operator.ne, waveform.DEFAULTS[path])}):
             remedy = f"leave it at {waveform.DEFAULTS[path]}, or study a flat target"
