@@ -34,6 +34,12 @@ ds.effects.cf.flags  # one boolean per effect
 SECTIONS: list[tuple[str, str, str, list[Mapping[str, Output]]]] = [
     ("Grids", "`sweep.open` opens a grid.", "axes", [outputs.OUTPUTS, outputs.SIMULATED]),
     (
+        "Grids that report the strongest peak alone",
+        "Further variables of a study with `instrument.processing.peaks: strongest`.",
+        "axes",
+        [outputs.STRONGEST_OUTPUTS],
+    ),
+    (
         "Grids with draws",
         "Further variables of a study with `draws`, whose pd is a mean or a share over draws.",
         "axes",

@@ -102,6 +102,15 @@ OUTPUTS: dict[str, Output] = {
     ),
 }  # fmt: skip
 
+STRONGEST_OUTPUTS: dict[str, Output] = _by_segment(
+    "p_wrong_range_{}",
+    "probability of a detection with a wrong range",
+    "a peak that is not the echo's crosses the threshold and is the strongest",
+    joint="; ",
+    shot="both chirps report a peak, and one of the echo not both",
+)
+"""Floats, one a point, of studies that report the strongest peak of a segment alone."""
+
 WITHOUT_ECHO = tuple(name for name, output in OUTPUTS.items() if NO_ECHO in output.comment)
 """What has no value where no light comes back."""
 

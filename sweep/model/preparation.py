@@ -98,6 +98,8 @@ class Shots:
     """``any_bin``: of the echo; ``peak_bin``: the largest alone, as in [T]."""
     shot_detection: str
     """``both_chirps``: a shot is detected in up and down segment; ``any_two``: in any two."""
+    peaks: str
+    """``all``: any crossing of a segment is reported; ``strongest``: its largest peak alone."""
     two_beats: str
     """Assumption by which two beats of real records tell: ``far`` or ``fast``."""
     noise_shape: str
@@ -438,10 +440,10 @@ class Shots:
         pairs = alarms.pair_nodes(self.correlation)
         return self.real_ends, math.ceil(lobe), pairs, fades
 
-    def counted_bins(
+    def searched_bins(
         self, exempted: np.ndarray, points: np.ndarray | slice = slice(None)
     ) -> np.ndarray:
-        """Independent bins that would raise a false alarm as often as those that can.
+        """Bins that can raise a false alarm.
 
         Parameters
         ----------
@@ -460,6 +462,16 @@ class Shots:
         bins = np.maximum(searched - exempted, 0.0)
         if self.bins_counted == "all" and self.band is None:
             bins = np.full(np.shape(exempted), float(self.fft_size))
+        return np.asarray(bins)
+
+    def counted_bins(
+        self, exempted: np.ndarray, points: np.ndarray | slice = slice(None)
+    ) -> np.ndarray:
+        """Independent bins that would raise a false alarm as often as those that can.
+
+        Parameters are those of :meth:`searched_bins`.
+        """
+        bins = self.searched_bins(exempted, points)
         if self.noise_bins == "independent":
             return bins
         level = np.broadcast_to(self.threshold / self.bin_deviation, self.size)[points]
@@ -540,6 +552,7 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
         noise_bins=str(p[PROCESSING + "noise_bins"]),
         detection=str(p[PROCESSING + "detection"]),
         shot_detection=str(p[waveform.SHOT_DETECTION]),
+        peaks=str(p[waveform.PEAKS]),
         two_beats=str(p[waveform.TWO_BEATS]),
         noise_shape=str(p[RECEIVER + "noise_shape"]),
         order=waveform.order_of(architecture, str(p[waveform.ORDER])),

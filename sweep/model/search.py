@@ -139,7 +139,7 @@ def _cut(numbers, where, levels, how, magnitudes, exempts, chances):
                     run, exempt, peak[s, j], low[s, j], rule, (levels[0, j], levels[1, j])
                 )
             if leaks[s]:
-                chances[2, s, j] = _leakage(run, exempt, levels[1:, j])
+                chances[2, s, j] = leakage_of(run, exempt, levels[1:, j])
 
 
 @njit(cache=True, error_model="numpy")
@@ -166,7 +166,7 @@ def _keep_echoes(run, exempt, low, level, beside, band, lines):
 
 
 @njit(cache=True, error_model="numpy")
-def _leakage(run, exempt, levels):
+def leakage_of(run, exempt, levels):
     """Chance that any bin of a run that is not exempt adds a crossing to that of noise."""
     level, sigma, floor = levels
     b, any_ = level / sigma, 0.0

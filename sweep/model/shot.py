@@ -19,6 +19,7 @@ from sweep.model.outputs import WITHOUT_ECHO
 from sweep.model.preparation import Parameters, Shots, as_arrays, bare
 from sweep.model.resolution import resolved_categories
 from sweep.model.segments import find
+from sweep.model.strongest import outcomes
 
 __all__ = ["Parameters", "Shots", "evaluate", "find", "prepare", "report", "statistics"]
 
@@ -143,6 +144,8 @@ def statistics(shots: Shots, found: np.ndarray | None = None) -> dict[str, np.nd
     }
     if shots.any_two:
         results["pd_both_chirps"] = shots.both(pd[0], pd[2], (magnitude[0], magnitude[2]))
+    if shots.peaks == waveform.STRONGEST:
+        results |= outcomes(shots, pd, miss)
     dark = (shots.echo_power == 0) | np.isnan(found[shots.segments, 3]).any(axis=0)
     return results | {name: np.where(dark, np.nan, results[name]) for name in WITHOUT_ECHO}
 

@@ -44,12 +44,14 @@ DOPPLER_SLOPE, DOWN_SLOPE = "instrument.chirp.doppler_slope", "instrument.chirp.
 SHOT_DETECTION = "instrument.processing.shot_detection"
 BOTH_CHIRPS, ANY_TWO = SHOT_DETECTIONS = ("both_chirps", "any_two")
 TWO_BEATS = "instrument.processing.two_beats"
+PEAKS = "instrument.processing.peaks"
+ALL, STRONGEST = REPORTED_PEAKS = ("all", "strongest")
 FAR_TARGET, FAST_TARGET = ASSUMPTIONS = ("far", "fast")
 SIGNS = (1, 0, -1)
 """Chirp rate of up, Doppler and down segment over the up-chirp's, by default."""
 DEFAULTS: dict[str, float | int | str | np.ndarray] = {
     ORDER: ORDERS[0], GAP: 0.0, DOPPLER_SLOPE: 0.0, DOWN_SLOPE: -1.0,
-    SHOT_DETECTION: BOTH_CHIRPS, TWO_BEATS: FAR_TARGET,
+    SHOT_DETECTION: BOTH_CHIRPS, TWO_BEATS: FAR_TARGET, PEAKS: ALL,
 }  # fmt: skip
 
 SEARCH = "instrument.processing.search."

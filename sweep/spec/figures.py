@@ -5,7 +5,7 @@ They are held against the study that they draw: its coordinates, stored quantiti
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import Field
@@ -20,6 +20,7 @@ from sweep.model.outputs import (
     SHOTS,
     SPECTRA_OUTPUTS,
     STATISTICS,
+    STRONGEST_OUTPUTS,
     XYZ,
 )
 from sweep.spec.axes import Axis
@@ -382,15 +383,17 @@ LEAST_BEAMS = 3
 """Shots of a cycle from which on there is navigation."""
 
 
-def figure_findings(written: Mapping[str, Any], axes: tuple[Axis, ...]) -> Iterator[Finding]:
-    """Mistakes in the figures of a grid's study, as written."""
+def figure_findings(
+    written: Mapping[str, Any], axes: tuple[Axis, ...], further: Collection[str] = ()
+) -> Iterator[Finding]:
+    """Mistakes in the figures of a grid's study, as written; ``further`` names it stores too."""
     draws = written.get("draws")
     for at, figure in _readable(written, Figure):
         yield from _coordinate_findings(figure, axes, at)
         if isinstance(draws, Mapping) and draws.get("method") == SPECTRA:
             yield from _spectra_findings(figure, at)
         else:
-            yield from _variable_findings(figure, draws, at)
+            yield from _variable_findings(figure, draws, further, at)
     yield from _name_findings(written, Figure, "makes the same picture file as another")
 
 
@@ -451,18 +454,24 @@ def _coordinate_findings(figure: Any, axes: tuple[Axis, ...], at: Location) -> I
             yield from _value_findings(paths[name], figure.where[name], location)
 
 
-def _variable_findings(figure: Any, draws: object, at: Location) -> Iterator[Finding]:
+def _variable_findings(
+    figure: Any, draws: object, further: Collection[str], at: Location
+) -> Iterator[Finding]:
     """Report a variable that the study does not store."""
     variable = getattr(figure, "variable", None)
     asked = ("number", "limit") if isinstance(draws, Mapping) else ()
     with_draws = any(draws.get(name, 0) not in (0, "0") for name in asked)  # type: ignore[attr-defined]
     drawn = DRAW_OUTPUTS | ERROR_OUTPUTS | ACCURACY_OUTPUTS
-    if variable is None or variable in OUTPUTS or (with_draws and variable in drawn):
+    known = {*OUTPUTS, *further}
+    if variable is None or variable in known or (with_draws and variable in drawn):
         return
-    rule, remedy = "is no stored quantity", near_miss(variable, [*OUTPUTS, *drawn])
+    rule, remedy = "is no stored quantity", near_miss(variable, [*known, *drawn])
     if variable in drawn:
         rule = "is found over draws, and this study has none"
         remedy = "set draws: {number: ...} or {limit: ...}"
+    elif variable in STRONGEST_OUTPUTS:
+        rule = "is found where segments report their strongest peak alone"
+        remedy = "set instrument.processing.peaks: strongest"
     yield Finding((*at, "variable"), rule, remedy, variable)
 
 

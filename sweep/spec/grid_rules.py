@@ -569,10 +569,10 @@ def not_in_flights(grid: Grid, draws: SceneDraws) -> Iterator[Finding]:
             instead = ": beams wander by platform.jitter" if effect.turn is not None else ""
             yield _of_mode(effect.name, rule, f"leave it out{instead}")
     yield from spectra_findings(draws, grid)
-    if grid.has_point({waveform.SHOT_DETECTION: _is(waveform.ANY_TWO)}):
-        remedy = f"leave it at {waveform.BOTH_CHIRPS}, or study a flat target"
-        rule = "is not known to flights, which pair up and down peaks"
-        yield grid.finding(waveform.SHOT_DETECTION, rule, remedy)
+    for path in (waveform.SHOT_DETECTION, waveform.PEAKS):
+        if grid.has_point({path: partial(operator.ne, waveform.DEFAULTS[path])}):
+            remedy = f"leave it at {waveform.DEFAULTS[path]}, or study a flat target"
+            yield grid.finding(path, "is not known to flights, which pair peaks", remedy)
     voted = {looks.NUMBER: _several, looks.COMBINE: _is(looks.BINARY)}
     if grid.has_point(voted | {"footprint.speckle": _is("developed")}):
         rule = "counts records, and flights draw no powers of echoes that fade in several"

@@ -270,6 +270,12 @@ class Processing(Part):
         waveform.SHOT_DETECTIONS,
         waveform.BOTH_CHIRPS,
     )
+    peaks: str = of.choice(
+        "Peaks of a segment that are reported: all that cross the threshold; or the strongest "
+        "alone, which may be another than the echo's (p_wrong_range); in grids without draws",
+        waveform.REPORTED_PEAKS,
+        waveform.ALL,
+    )
     two_beats: str = of.choice(
         "What is taken for granted where two beats of a real record tell range and velocity: far, "
         "the range beat of a chirp exceeds the Doppler shift (and where one of them is of the "

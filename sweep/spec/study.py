@@ -14,7 +14,9 @@ import numpy as np
 from pydantic import ConfigDict, Field, PrivateAttr, ValidationError
 
 import sweep.spec.declaring as of
-from sweep.model import VERSION, waveform
+from sweep.model import VERSION, looks, waveform
+from sweep.model.effects import circulator_leak
+from sweep.model.outputs import STRONGEST_OUTPUTS
 from sweep.model.threshold import WAYS
 from sweep.model.waveform import ENDS
 from sweep.spec.axes import Axis, Member, paths_on_axes, read_axes
@@ -132,7 +134,7 @@ class Study(Part):
             findings += findings_of(error, cls)
         grid = Grid.of(written, axes)
         findings += grid_findings(grid)
-        findings += [*_size_findings(axes), *_segment_findings(grid)]
+        findings += [*_size_findings(axes), *_segment_findings(grid), *_strongest_findings(grid)]
         findings += cls.further_findings(written, grid, base, axes_are_whole)
         # What is wrong with an axis or an instrument's file is told there, and there alone.
         findings = [
@@ -205,7 +207,8 @@ class Study(Part):
                 findings.append(Finding((name,), error.rule, error.suggestion, written))
             findings += self.unvaried(path, parameters[path], (name,))
         if not findings:
-            findings = grid_findings(Grid(parameters, modes=self.modes()))
+            grid = Grid(parameters, modes=self.modes())
+            findings = [*grid_findings(grid), *_strongest_findings(grid)]
         if findings:
             raise SpecError(Document({}).mistake(finding) for finding in findings)
         return parameters
@@ -322,6 +325,31 @@ def _segment_findings(grid: Grid) -> Iterator[Finding]:
         yield grid.finding(waveform.DOPPLER_SLOPE, rule, "write another, or take both_chirps")
 
 
+STRONGEST_ALONE: dict[str, Condition] = {waveform.PEAKS: lambda peaks: peaks == waveform.STRONGEST}
+"""Condition on points whose segments report their strongest peak alone."""
+
+
+def _strongest_findings(grid: Grid) -> Iterator[Finding]:
+    """Report the strongest peak alone where no law of it is known."""
+    several: dict[str, Condition] = {
+        looks.NUMBER: lambda number: number > 1,
+        looks.COMBINE: lambda way: way != looks.COHERENT,
+    }
+    refused: tuple[tuple[dict[str, Condition], str, str], ...] = (
+        (several, "is that of one record, and instrument.looks.number asks for several",
+         "combine: coherent"),
+        ({circulator_leak.PATH: lambda path: path > 0},
+         "may be the line of instrument.telescope.leak_path, whose noise has no law",
+         "leave the leak's path out"),
+        ({waveform.SHOT_DETECTION: lambda rule: rule == waveform.ANY_TWO},
+         "may be wrong in one of three segments, and shot_detection: any_two cannot tell in which",
+         "shot_detection: both_chirps"),
+    )  # fmt: skip
+    for conditions, rule, remedy in refused:
+        if grid.has_point(STRONGEST_ALONE | conditions):
+            yield grid.finding(waveform.PEAKS, rule, f"take all, or {remedy}")
+
+
 def _size_findings(axes: tuple[Axis, ...]) -> list[Finding]:
     """Report a grid too large to count."""
     points = math.prod(axis.size for axis in axes)
@@ -347,10 +375,14 @@ class Spec(Study):
         cls, written: Mapping[str, Any], grid: Grid, base: Path | None, axes_are_whole: bool
     ) -> list[Finding]:
         """Figures of what the study lacks, random effects without draws, draws without an end."""
-        findings = list(figure_findings(written, grid.axes)) if axes_are_whole else []
+        further = STRONGEST_OUTPUTS if grid.has_point(STRONGEST_ALONE) else ()
+        findings = list(figure_findings(written, grid.axes, further)) if axes_are_whole else []
         draws = read_as(Draws, written.get("draws", {}))
         if draws is not None:
             findings += spectra_findings(draws, grid)
+            if draws.any and grid.has_point(STRONGEST_ALONE):
+                rule = "has chances in closed form alone, and the study has draws"
+                findings.append(grid.finding(waveform.PEAKS, rule, "take all, or no draws"))
             findings += () if draws.any else without_draws(grid)
             findings += _number_findings(draws)
         return findings
@@ -359,6 +391,11 @@ class Spec(Study):
     def has_random_effects(self) -> bool:
         """True if anything but noise may be random at any point."""
         return any(without_draws(Grid(self.parameters(), self.axes, self.modes())))
+
+    @property
+    def reports_strongest(self) -> bool:
+        """True if segments report their strongest peak alone at any point."""
+        return Grid(self.parameters(), self.axes).has_point(STRONGEST_ALONE)
 
     def identity(self) -> dict[str, Any]:
         """Content that makes the study this one, in SI values.

@@ -23,10 +23,12 @@ from sweep.model.outputs import (
     RUNNING_OUTPUTS,
     SIMULATED,
     SPECTRA_OUTPUTS,
+    STRONGEST_OUTPUTS,
     Output,
 )
 from sweep.model.resolution import by_tolerance
 from sweep.model.unsupported import UnsupportedShot
+from sweep.model.waveform import PEAKS
 from sweep.tasks.grid import EFFECTS, ERROR, EffectSelection, Grid, Selected, Value, canonical_rows
 from sweep.tasks.study import (
     DAMAGED,
@@ -61,7 +63,7 @@ def outputs_of(spec: Spec) -> dict[str, Output]:
     found = {EFFECTS: replace(SIMULATED[EFFECTS], dims=()), ERROR: replace(error, dims=())}
     drawn = ACCURACY_OUTPUTS | DRAW_OUTPUTS
     if not spec.draws.any:
-        found |= OUTPUTS
+        found |= OUTPUTS | (STRONGEST_OUTPUTS if spec.reports_strongest else {})
     elif spec.draws.whole_spectra:
         found |= SPECTRA_OUTPUTS | drawn
     else:
@@ -221,7 +223,7 @@ SUB_BATCH_COUNTS = 1 << 19
 
 #: Parameters that change how draws are looked at, and not what is drawn.
 NOT_PHYSICAL = (
-    "accuracy.", "instrument.processing.detector.", "instrument.processing.estimator."
+    "accuracy.", "instrument.processing.detector.", "instrument.processing.estimator.", PEAKS
 )  # fmt: skip
 
 #: Domain of the keys of draws, so that no other use of the same seed meets their streams.

@@ -345,3 +345,48 @@ def test_search_bands_have_four_ends_and_count_what_they_search(band, message):
     counted = "all" if band == BAND else "half"
     with pytest.raises(SpecError, match=message):
         Spec.from_mapping(written(changes | {"instrument.processing.bins_counted": counted}))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"draws.number": 5}, "closed form alone, and the study has draws; take all, or no draws"),
+        (
+            {"instrument.looks.number": 4, "instrument.processing.detection": "peak_bin"},
+            "is that of one record, and instrument.looks.number asks for several",
+        ),
+        (
+            {
+                "instrument.telescope.leak_path": "1 m", "instrument.telescope.isolation": "60 dB",
+            },
+            "may be the line of instrument.telescope.leak_path",
+        ),
+        (
+            {
+                "instrument.processing.shot_detection": "any_two",
+                "instrument.chirp.doppler_slope": 0.5,
+            },
+            "any_two cannot tell in which; take all, or shot_detection: both_chirps",
+        ),
+    ],
+)  # fmt: skip
+def test_the_strongest_peak_alone_is_refused_where_no_law_of_it_is_known(changes, message):
+    strongest = {"instrument.processing.peaks": "strongest"}
+    with pytest.raises(SpecError, match=message):
+        Spec.from_mapping(written(changes | strongest))
+    assert not Spec.from_mapping(written(changes)).reports_strongest
+    assert Spec.from_mapping(written(strongest)).reports_strongest
+
+
+@pytest.mark.parametrize("peaks", ["all", "strongest"])
+def test_a_figure_of_wrong_ranges_needs_a_study_that_has_some(peaks):
+    figure = {"kind": "slices", "variable": "p_wrong_range_shot", "x": "range"}
+    given = written(
+        {"instrument.processing.peaks": peaks}, axes={"target.range": ["1 m", "2 m"]},
+        figures=[figure],
+    )  # fmt: skip
+    if peaks == "strongest":
+        assert Spec.from_mapping(given).reports_strongest
+        return
+    with pytest.raises(SpecError, match=r"processing\.peaks: strongest"):
+        Spec.from_mapping(given)

@@ -291,7 +291,10 @@ def roc(
             f"{number:,} points make too many curves (at most {MOST_POINTS:,}): select some"
         )
     looks = _looks_of(spec_of(dataset))
-    rule = parameter(dataset, waveform.SHOT_DETECTION, spec_of(dataset))
+    rule, peaks = (
+        parameter(dataset, path, spec_of(dataset))
+        for path in (waveform.SHOT_DETECTION, waveform.PEAKS)
+    )
     needed = [f"{kind}_{s}" for s in _SEGMENTS[segment] for kind in ("snr", "pd")]
     needed += [named("pd", segment), "log10_pfa_bin", "effects"]
     dataset = dataset[list(dict.fromkeys(needed))].compute()
@@ -299,6 +302,7 @@ def roc(
     pd, exact = _closed(dataset, segment, level, looks)
     if segment == "shot":  # else of two segments out of three
         exact = exact & (rule == waveform.BOTH_CHIRPS)
+    exact = exact & (peaks == waveform.ALL)
     tnr = level * _own_tnr(dataset) / _own_level(dataset, looks)
     result = xr.Dataset(
         {"pd": pd, CURVE_TNR: tnr, "simulated": ~exact, "half_width": xr.zeros_like(pd)},

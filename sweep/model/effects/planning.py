@@ -14,6 +14,9 @@ follow by -dQ_1/d ln b <= b^2 e^{-(a - b)^2 / 2} / sqrt(1 + 2 a b), and
 
 for the chance P^2 of a false alarm in a shot. Where pd is 1 whatever happens bins still have
 magnitudes: |X| counts by its change over itself, or over sigma where it is below that.
+
+Where segments report their strongest peak alone an echo has to exceed the largest noise too: b is
+the level at which pd is steepest, of those between the threshold and that.
 """
 
 import math
@@ -25,6 +28,8 @@ import numpy as np
 from sweep.model.effects.catalogue import EFFECTS
 from sweep.model.effects.effect import Effect, Size
 from sweep.model.effects.points import Points
+from sweep.model.preparation import PROCESSING
+from sweep.model.waveform import PEAKS, STRONGEST
 
 _LN_10 = math.log(10.0)
 _HUGE = 1e12
@@ -173,11 +178,14 @@ def changes(
     leakage's own size.
     """
     low, high = plausible(sizes, points)
-    b = points.looks.scaled(points.threshold)
+    threshold = points.threshold
+    if points.word(PEAKS) == STRONGEST:  # an echo has to be larger than any noise as well
+        threshold = np.maximum(threshold, np.minimum(high, _largest_noise(points)))
+    b = points.looks.scaled(threshold)
     steepest = 0.5 * (b + np.sqrt(b * b + 2))
     at = np.minimum(np.maximum(steepest, low), high)
     near = np.exp(-0.5 * (at - b) ** 2)
-    b = points.looks.sharper * points.threshold
+    b = points.looks.sharper * threshold
     slope, small = np.sqrt(at * b / (2 * math.pi)) * near, np.minimum(high, 1.0)
     found = {}
     for name, size in sizes.items():
@@ -202,6 +210,12 @@ def changes(
         change = np.maximum(_sum(total, points), _most(most, points))
         found[name] = np.fmin(np.maximum(change, size.chance), 1.0)
     return found
+
+
+def _largest_noise(points: Points) -> np.ndarray:
+    """Magnitude over sigma that noise exceeds in any bin with a chance of 0.001 at most."""
+    bins = np.asarray(points[PROCESSING + "fft_size"], float)
+    return np.asarray(np.sqrt(2 * np.log(1000 * bins)))
 
 
 def plausible(sizes: Mapping[str, Size], points: Points) -> tuple[np.ndarray, np.ndarray]:
