@@ -57,7 +57,8 @@ def outcomes(shots: Any, pd: np.ndarray, miss: np.ndarray) -> dict[str, np.ndarr
     lost, alarm, shared = np.zeros((3, shots.size)), np.zeros((3, shots.size)), np.zeros(shots.size)
     for runs in runs_of(shots, every_bin=True):
         lost[:, runs.part], alarm[:, runs.part], shared[runs.part] = _of_runs(shots, runs, pd)
-    wrong, right, missed = alarm * miss + lost, pd - lost, miss + lost
+    right, missed = np.maximum(pd - lost, 0.0), np.minimum(miss + lost, 1.0)
+    wrong = np.minimum(alarm * miss + lost, 1.0)
     found = {
         f"{name}_{segment}": values[s]
         for name, values in {"pd": right, "miss": missed, "p_wrong_range": wrong}.items()

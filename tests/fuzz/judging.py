@@ -10,7 +10,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sweep.model.outputs import DRAW_OUTPUTS, ERROR_OUTPUTS, NO_BIN, OUTPUTS, WITHOUT_ECHO
+from sweep.model.outputs import (
+    DRAW_OUTPUTS,
+    ERROR_OUTPUTS,
+    NO_BIN,
+    OUTPUTS,
+    STRONGEST_OUTPUTS,
+    WITHOUT_ECHO,
+)
 from sweep.model.unsupported import UnsupportedShot
 from sweep.model.waveform import ENDS
 from sweep.spec import Mistake, Spec, SpecError, from_stored, load
@@ -23,7 +30,7 @@ from sweep.tasks.summary import why_beyond
 ROUNDING = 1e-9
 """What sums of probabilities may be off: 1e-12 seen, and no effect is as small."""
 
-PROBABILITIES = ("pd_", "miss_", "pfa_", "p_leakage_")
+PROBABILITIES = ("pd_", "miss_", "pfa_", "p_leakage_", "p_wrong_range_")
 FINITE = tuple(name for name in OUTPUTS if not name.endswith("_doppler"))
 NO_BIN_LEFT = tuple(name for name, output in OUTPUTS.items() if output.comment == NO_BIN)
 
@@ -131,6 +138,9 @@ def _signal_and_noise(results: Results) -> None:
         assert not (np.abs(total - 1) > ROUNDING).any(), segment
     least = np.minimum(results["pd_up"], results["pd_down"])
     assert (results["pd_shot"] <= least + ROUNDING).all(), "a shot is likelier than its segments"
+    for name in STRONGEST_OUTPUTS.keys() & results.keys():
+        total = results[name] + results[name.replace("p_wrong_range", "pd")]
+        assert not (total > 1 + ROUNDING).any(), f"{name} and what is right are more than all"
     assert (results["noise_variance"] > 0).all(), "no noise"
     for name in ("snr_up", "snr_down", "snr_doppler"):
         assert not (results[name] < 0).any(), name

@@ -42,6 +42,8 @@ MOVING = (
 )  # fmt: skip
 MASKING = "instrument.telescope.leak_path"
 """Its line masks bins by the threshold, and grows with the light: more of either may hide more."""
+PEAKS = "instrument.processing.peaks"
+"""The strongest peak alone may be one of leaked signal, which grows with the light."""
 
 
 def steady(written, *paths):
@@ -50,7 +52,7 @@ def steady(written, *paths):
         written.pop(section, None)
     written["accuracy"] = {"tolerance": 0}
     written["storage"] = {"block_points": 1000}
-    for path in (*RANDOM, MASKING, *paths):
+    for path in (*RANDOM, MASKING, PEAKS, *paths):
         drop(written, path)
     return mended(written)
 
