@@ -24,7 +24,6 @@ from sweep.spec.scene import Interface
 from sweep.storage.atomic_replace import draft
 from sweep.storage.locations import Location
 
-REPORT = "report"
 VALUES = ("range", "radial_velocity")
 COLUMNS = {
     "time": ("s", "time stamp: that of the measurement, and the latency"),
@@ -55,6 +54,7 @@ Table = dict[str, np.ndarray]
 
 def reports(
     store: str | Location,
+    file: str | Path | None = None,
     *,
     scanner: str | None = None,
     draw: int = 0,
@@ -68,6 +68,8 @@ def reports(
     ----------
     store, scanner, draw, ranges, where
         As of :func:`sweep.export`.
+    file
+        CSV file to write the reports to as well, names and units in its first line.
     interface
         Fields of the spec's section ``interface`` to be set anew, written as in a spec:
         ``{"rate": "10 Hz"}``.
@@ -84,49 +86,31 @@ def reports(
         Where there is no store of a scene.
     SpecError
         With every mistake in what is asked for.
+    OSError
+        Where the file can't be written.
     """
-    table = _made(store, scanner, draw, ranges, where, interface)
+    study, mistakes = SceneStudy.of(store), []
+    if file is not None and Path(file).suffix.lower() != ".csv":
+        remedy = "name a .csv, or export points"
+        mistakes.append(Mistake("file", "must end in .csv to hold reports", str(file), remedy))
+    recording, _ = chosen(study, scanner, draw, ranges, where or {}, mistakes)
+    shots = _shots(recording, draw, ranges)
+    table = reported(shots, study.spec.interface_with(interface or {}))
+    if file is not None:
+        with draft(Path(file), replace=True) as made:
+            _write(table, made)
     arrays = {
-        name: (REPORT, table[name], {"units": units, "long_name": words})
+        name: ("report", table[name], {"units": units, "long_name": words})
         for name, (units, words) in COLUMNS.items()
     }
     return xr.Dataset(arrays)
 
 
-def export_reports(
-    store: str | Location,
-    file: str | Path,
-    *,
-    scanner: str | None = None,
-    draw: int = 0,
-    ranges: str = INTERPOLATED,
-    where: Mapping[str, object] | None = None,
-    interface: Mapping[str, object] | None = None,
-) -> int:
-    """Write :func:`reports` to a CSV file, names and units in its first line; return their number.
-
-    Raises as :func:`reports`; and `SpecError` for a file of another kind.
-    """
-    file, mistakes = Path(file), []
-    if file.suffix.lower() != ".csv":
-        remedy = "name a .csv, or export points"
-        mistakes.append(Mistake("file", "must end in .csv to hold reports", str(file), remedy))
-    table = _made(store, scanner, draw, ranges, where, interface, mistakes)
-    titles = [f"{n} [{units}]" if units != "1" else n for n, (units, _) in COLUMNS.items()]
-    with draft(file, replace=True) as made, made.open("w", encoding="utf-8", newline="") as text:
+def _write(table: Table, path: Path) -> None:
+    with path.open("w", encoding="utf-8", newline="") as text:
         writer = csv.writer(text)
-        writer.writerow(titles)
+        writer.writerow(f"{n} [{u}]" if u != "1" else n for n, (u, _) in COLUMNS.items())
         writer.writerows(zip(*(table[name].tolist() for name in COLUMNS), strict=True))
-    return int(table["time"].size)
-
-
-def _made(  # type: ignore[no-untyped-def]  # as of reports, and mistakes known before
-    store, scanner, draw, ranges, where, interface, mistakes=()
-) -> Table:
-    study = SceneStudy.of(store)
-    recording, _ = chosen(study, scanner, draw, ranges, where or {}, mistakes)
-    shots = _shots(recording, draw, ranges)
-    return reported(shots, study.spec.interface_with(interface or {}))
 
 
 def _shots(recording: Recording, draw: int, ranges: str) -> Table:

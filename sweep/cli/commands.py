@@ -376,10 +376,10 @@ def export(
         raise click.UsageError("--interface is of reports: add --as reports, or leave it out")
     with working(f"writing {form}"):
         if form == "reports":
-            from sweep.analysis.reports import export_reports
+            from sweep.analysis.reports import reports
 
             set_anew = assignments(interface, "--interface", "rate=10Hz")
-            number = export_reports(store, file, interface=set_anew, **how)
+            number = reports(store, file, interface=set_anew, **how).sizes["report"]
         else:
             from sweep.analysis.export import export as write
 

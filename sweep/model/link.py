@@ -152,28 +152,21 @@ def _noise(architecture: str, v: Mapping[str, np.ndarray]) -> ReceiverNoise:
     return ReceiverNoise(scale, np.asarray(per_watt * scale), sources)
 
 
-def adc_step(*, full_scale: ArrayLike, bits: ArrayLike) -> np.ndarray:
-    """Step of an ADC, lsb = 2 V / 2^bits [V].
-
-    Parameters
-    ----------
-    full_scale : array_like
-        Largest voltage V [V] that does not clip, to either side; > 0.
-    bits : array_like
-        The effective number of bits, which need not be whole, makes the noise of a real ADC.
-    """
-    return 2 * np.asarray(full_scale, float) * 2.0 ** -np.asarray(bits, float)
-
-
-def rounding_variance(*, step: ArrayLike) -> np.ndarray:
-    """Variance lsb^2/12 [V^2] that rounding adds at the ADC.
+def rounding_variance(
+    *, full_scale: ArrayLike, bits: ArrayLike, in_quadrature: bool = False
+) -> np.ndarray:
+    """Variance lsb^2/12 [V^2] that rounding adds at the ADC, lsb = 2 V / 2^bits; 0 for 0 bits.
 
     Where the noise's deviation s spans a step or so the error is white and independent of the
     signal [Widrow and Kollar, Quantization Noise, 2008, ch. 4, 9]: it departs from that by
     exp(-2 pi^2 s^2 / lsb^2), 2.7e-9 for s = lsb and 0.7 % for s = lsb/2. Neither the receiver's
-    gain nor its noise figure acts on it.
+    gain nor its noise figure acts on it. ``full_scale`` is the largest voltage V [V] to either
+    side; the effective number of bits, which need not be whole, makes the noise of a real ADC.
+    Two ADCs sample I and Q.
     """
-    return np.asarray(step, float) ** 2 / 12
+    bits = np.asarray(bits, float)
+    step = 2 * np.asarray(full_scale, float) * 2.0**-bits
+    return np.where(bits > 0, (2 if in_quadrature else 1) * (step**2 / 12), 0.0)
 
 
 def bin_deviation(*, noise_variance: np.ndarray, window_energy: np.ndarray) -> np.ndarray:
@@ -203,8 +196,13 @@ def electrical_bandwidth(values: Mapping[str, np.ndarray], prefix: str = "") -> 
     [T] states one figure for detector and amplifier and uses it as the noise bandwidth; so does
     this. An anti-alias filter counts as a further stage.
     """
-    narrower, filtered = _receiver_bandwidth(values, prefix), antialias_of(values, prefix)
-    return np.minimum(narrower, _or_none(filtered["antialias_bandwidth"]))
+    narrower, antialias = _receiver_bandwidth(values, prefix), antialias_of(values, prefix)
+    return np.minimum(narrower, antialias["antialias_bandwidth"]) if antialias else narrower
+
+
+def receiver_values(p: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
+    """Parameters by name that the receiver's noise follows from."""
+    return {name: p[prefix + name] for name in NOISY} | antialias_of(p, prefix)
 
 
 def _receiver_bandwidth(values: Mapping[str, np.ndarray], prefix: str = "") -> np.ndarray:
@@ -212,8 +210,9 @@ def _receiver_bandwidth(values: Mapping[str, np.ndarray], prefix: str = "") -> n
 
 
 def antialias_of(values: Mapping[str, np.ndarray], prefix: str = "") -> dict[str, np.ndarray]:
-    """Parameters of the anti-alias filter by name, :data:`ANTIALIAS` where points have none."""
-    return {name: np.asarray(values.get(prefix + name, v)) for name, v in ANTIALIAS.items()}
+    """Parameters of the filter before the ADC by name; empty without one."""
+    found = {name: np.asarray(values.get(prefix + name, v)) for name, v in ANTIALIAS.items()}
+    return found if np.any(found["antialias_bandwidth"]) else {}
 
 
 def antialias_power(
@@ -222,20 +221,14 @@ def antialias_power(
     """Power that passes the anti-alias filter at a signed frequency [Hz], before it folds.
 
     A Butterworth low-pass of order n, 3 dB down at its bandwidth B [Hz]: 1 / (1 + (f / B)^(2 n)).
-    1 for a bandwidth of 0, which stands for no filter.
 
     >>> given = {"antialias_bandwidth": np.array(1e8), "antialias_order": np.array(6)}
     >>> [round(10 * float(np.log10(antialias_power(f, **given))), 1) for f in (5e7, 1e8, 2e8)]
     [-0.0, -3.0, -36.1]
     """
-    with np.errstate(divide="ignore"):  # ln 0 at DC, and without a filter
-        steepness = np.log(np.abs(frequency) / _or_none(antialias_bandwidth))
+    with np.errstate(divide="ignore"):  # ln 0 at DC
+        steepness = np.log(np.abs(frequency) / antialias_bandwidth)
     return np.asarray(1 / (1 + np.exp(np.minimum(2 * antialias_order * steepness, _STOPPED))))
-
-
-def _or_none(bandwidth: np.ndarray) -> np.ndarray:
-    """Bandwidth [Hz], without an end where it is 0."""
-    return np.where(np.asarray(bandwidth) > 0, bandwidth, np.inf)
 
 
 def noise_density(
@@ -260,18 +253,18 @@ def noise_density(
     if np.any(antialias_bandwidth):
         folded = frequency - sample_rate * np.rint(frequency / sample_rate)
         total = np.zeros(())
-        bandwidths = {
-            "detector_bandwidth": detector_bandwidth, "amplifier_bandwidth": amplifier_bandwidth
-        }  # fmt: skip
         antialias = {
             "antialias_bandwidth": np.asarray(antialias_bandwidth),
             "antialias_order": np.asarray(antialias_order),
         }
+        poles = {
+            "detector_bandwidth": detector_bandwidth, "amplifier_bandwidth": amplifier_bandwidth
+        }  # fmt: skip
         for fold in range(-_FOLDS, _FOLDS + 1):
             alias = folded + fold * sample_rate
-            poles = transfer(alias, transimpedance=np.asarray(1.0), **bandwidths)
-            total = total + np.abs(poles) ** 2 * antialias_power(alias, **antialias)
-        return total * sample_rate / (2 * electrical_bandwidth(bandwidths | antialias))
+            passed = transfer(alias, transimpedance=np.asarray(1.0), **poles)
+            total = total + np.abs(passed) ** 2 * antialias_power(alias, **antialias)
+        return total * sample_rate / (2 * electrical_bandwidth(poles | antialias))
     one, other = np.asarray(detector_bandwidth, float), np.asarray(amplifier_bandwidth, float)
     cosine = np.cos(2 * np.pi * (np.asarray(frequency) / sample_rate))
     alike = np.abs(one - other) <= 1e-4 * np.minimum(one, other)

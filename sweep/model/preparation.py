@@ -47,7 +47,6 @@ SLOPES = waveform.DOPPLER_SLOPE, waveform.DOWN_SLOPE
 CATEGORIES = (PROCESSING + "fft_size", "footprint.beamlets", "record", NUMBER, VOTES, *SLOPES)
 """Numbers that points must share to be prepared together; words they must share all."""
 
-BITS = PROCESSING + "bits"
 ADC_NOISE = "quantisation"
 """Noise source that does not pass the receiver."""
 
@@ -541,9 +540,8 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
     architecture = str(p[RECEIVER + "architecture"])
     echo_scale, current_scale = link_scales(architecture, p)
     in_quadrature = str(p[RECORD]) == "complex"
-    noise = link.receiver_noise(architecture, receiver_values(p), in_quadrature)
+    noise = link.receiver_noise(architecture, link.receiver_values(p, RECEIVER), in_quadrature)
     row, offset, doppler, echo = ground.axis(size)
-    antialias = link.antialias_of(p, RECEIVER)
     everywhere, accuracy, looks = np.zeros(size), Accuracy.of(p), Looks.of(p)
     return Shots(
         architecture=architecture,
@@ -585,7 +583,7 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
         doppler=doppler,
         amplitude=relative_amplitude(architecture, echo),
         incoherent=architecture != "direct",
-        antialias=antialias if np.any(antialias["antialias_bandwidth"]) else {},
+        antialias=link.antialias_of(p, RECEIVER),
         complex_record=in_quadrature,
         looks=looks,
     )
@@ -632,19 +630,6 @@ def link_scales(architecture: str, p: Mapping[str, np.ndarray]) -> tuple[np.ndar
     return power_scale, link.beat_scale(
         architecture, echo_power_scale=power_scale, **_receiver(p, *names)
     )
-
-
-def adc_noise(p: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Variance of rounding [V^2]; two ADCs sample I and Q (:func:`.link.receiver_noise`)."""
-    bits = np.asarray(p[BITS], float)
-    lsb = link.adc_step(full_scale=p[PROCESSING + "full_scale"], bits=bits)
-    both = 2 if str(p[RECORD]) == "complex" else 1
-    return np.where(bits > 0, both * link.rounding_variance(step=lsb), 0.0)
-
-
-def receiver_values(p: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Parameters by name that the receiver's noise follows from."""
-    return _receiver(p, *link.NOISY) | link.antialias_of(p, RECEIVER)
 
 
 def _receiver(p: Mapping[str, np.ndarray], *names: str) -> dict[str, np.ndarray]:

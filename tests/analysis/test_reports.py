@@ -8,7 +8,7 @@ import xarray as xr
 from drawn_scenes import cut_short, flown
 
 import sweep
-from sweep.analysis.reports import COLUMNS, export_reports, quantised, reported
+from sweep.analysis.reports import COLUMNS, quantised, reported
 from sweep.model.pairing import TRUE, UNCONFIRMED
 from sweep.spec import SpecError
 from sweep.spec.scene import Interface
@@ -154,11 +154,10 @@ def test_reports_of_a_store_are_those_of_its_first_returns(scene_store, tmp_path
     first = arrays.radial_velocity_interpolated.values[:, 0]
     assert np.array_equal(found.radial_velocity, np.where(valid, first, np.nan), equal_nan=True)
     set_anew = {"rate": "5 Hz", "range_quantum": "0.25 m"}
-    slow = sweep.reports(scene_store, **asked, interface=set_anew)
+    file = tmp_path / "reports.csv"
+    slow = sweep.reports(scene_store, file, **asked, interface=set_anew)
     assert not (slow.range.values[slow.valid.values == 1] % 0.25).any()
     assert slow.sizes["report"] == pytest.approx(found.sizes["report"] / 2, abs=4)
-    file = tmp_path / "reports.csv"
-    assert export_reports(scene_store, file, **asked, interface=set_anew) == slow.sizes["report"]
     with file.open(newline="") as text:
         header, *rows = csv.reader(text)
     assert header[:3] == ["time [s]", "beam", "range [m]"]
@@ -179,7 +178,7 @@ def test_a_specs_interface_is_the_stores_and_no_part_of_its_id(tmp_path):
 def test_what_can_not_be_is_refused_with_field_rule_value_and_remedy(scene_store, tmp_path):
     def refused(*parts, **asked):
         with pytest.raises(SpecError) as caught:
-            export_reports(scene_store, tmp_path / "reports.ply", **asked)
+            sweep.reports(scene_store, tmp_path / "reports.ply", **asked)
         for part in parts:
             assert part in str(caught.value)
 

@@ -12,7 +12,7 @@ from sweep.model import beam, link
 from sweep.model.constants import BOLTZMANN, PLANCK, SPEED_OF_LIGHT
 from sweep.model.effects.effect import Effect, Parameter, Scene, Size, noisier
 from sweep.model.effects.points import Points
-from sweep.model.preparation import BITS, LASER, RECEIVER, TELESCOPE, Shots, adc_noise
+from sweep.model.preparation import LASER, PROCESSING, RECEIVER, TELESCOPE, Shots
 
 # The echo's own shot noise: 2 q M^2 F Re P B_e of the whole echo, which close by rivals the local
 # oscillator's, and makes the rise of false alarms below some 5 m that [T 4.2] reports.
@@ -242,16 +242,23 @@ RELATIVE_INTENSITY_NOISE = Effect(
 )
 
 
+_BITS = PROCESSING + "bits"
+
+
 def rounding_size(points: Points) -> Size | None:
     """Return the noise of rounding, without clipping; the threshold follows it."""
-    if not points.has(BITS):
+    if not points.has(_BITS):
         return None
     return Size(noise=points.rounding / points.noise_variance)
 
 
 def add_rounding(shots: Shots, scene: Scene) -> Shots:
     """White noise of lsb^2/12, where the ADC has a number of bits."""
-    return noisier(shots, quantisation=adc_noise(scene.parameters))
+    p, in_quadrature = scene.parameters, shots.complex_record
+    added = link.rounding_variance(
+        full_scale=p[PROCESSING + "full_scale"], bits=p[_BITS], in_quadrature=in_quadrature
+    )
+    return noisier(shots, quantisation=added)
 
 
 QUANTISATION = Effect(
@@ -262,7 +269,7 @@ QUANTISATION = Effect(
     act=add_rounding,
     parameters=(
         Parameter(
-            path=BITS,
+            path=_BITS,
             about="Effective number of bits of the ADC; 0 for one without steps",
             example="12",
             limits=("0", "64"),

@@ -30,10 +30,8 @@ from sweep.model.preparation import (
     PROCESSING,
     RECEIVER,
     RECORD,
-    adc_noise,
     approach,
     link_scales,
-    receiver_values,
     relative_amplitude,
 )
 from sweep.model.threshold import tnr_of
@@ -209,15 +207,15 @@ class Points:
     @cached_property
     def receiver(self) -> link.ReceiverNoise:
         """Noise at the ADC [V^2]."""
-        in_quadrature = self.word(RECORD) == "complex"
-        return link.receiver_noise(
-            self.architecture, receiver_values(self.parameters), in_quadrature
-        )
+        values = link.receiver_values(self.parameters, RECEIVER)
+        return link.receiver_noise(self.architecture, values, self.word(RECORD) == "complex")
 
     @cached_property
     def rounding(self) -> np.ndarray:
         """Noise of the ADC's steps [V^2]."""
-        return adc_noise(self.parameters)
+        full_scale, bits = (self[PROCESSING + name] for name in ("full_scale", "bits"))
+        in_quadrature = self.word(RECORD) == "complex"
+        return link.rounding_variance(full_scale=full_scale, bits=bits, in_quadrature=in_quadrature)
 
     @cached_property
     def noise_variance(self) -> np.ndarray:
@@ -366,8 +364,7 @@ class Points:
     @cached_property
     def antialias(self) -> dict[str, np.ndarray]:
         """Bandwidth [Hz] and order of the filter before the ADC; empty without one."""
-        found = link.antialias_of(self.parameters, RECEIVER)
-        return found if np.any(found["antialias_bandwidth"]) else {}
+        return link.antialias_of(self.parameters, RECEIVER)
 
     @cached_property
     def tilt(self) -> np.ndarray:
