@@ -1,7 +1,7 @@
 """Monte Carlo sweeps of FMCW Doppler lidar performance.
 
 `load` a spec, `run` it into a store, `open` the store as an xarray Dataset; the store of a scene
-as a DataTree with `open_scene`, and `export` its point clouds.
+as a DataTree with `open_scene`; `export` its point clouds, or see what the unit `reports`.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:  # as checkers of programs that use it see the names below
     from sweep.analysis.export import export
     from sweep.analysis.opening import open, open_scene
+    from sweep.analysis.reports import reports
     from sweep.spec import load
     from sweep.tasks.driver import extend, resume, run
 
@@ -32,9 +33,12 @@ _HOMES = {
     "open": "sweep.analysis.opening",
     "open_scene": "sweep.analysis.opening",
     "export": "sweep.analysis.export",
+    "reports": "sweep.analysis.reports",
 }
 
-__all__ = ["__version__", "export", "extend", "load", "open", "open_scene", "resume", "run"]
+__all__ = [
+    "__version__", "export", "extend", "load", "open", "open_scene", "reports", "resume", "run",
+]  # fmt: skip
 
 
 def _is_writable(folder: Path) -> bool:

@@ -242,25 +242,44 @@ def export(
     OSError
         Where the file can't be written.
     """
-    study, file = SceneStudy.of(store), Path(file)
-    at = place(study.spec, where or {})
-    if mistakes := _mistakes(study, file, scanner, draw, ranges, at):
-        raise SpecError(mistakes)
-    recording = at.recording(study.tree, scanner or study.scanners[0])
+    study, file, mistakes = SceneStudy.of(store), Path(file), []
+    if file.suffix.lower() not in WRITERS:
+        remedy = f"take one of {', '.join(WRITERS)}"
+        rule = "must have a suffix that says its format"
+        mistakes.append(Mistake("file", rule, str(file), remedy))
+    recording, at = chosen(study, scanner, draw, ranges, where or {}, mistakes)
     origin = np.asarray(study.tree.attrs.get("origin", np.zeros(3)), float)
     table = PointTable(recording, draw, ranges, origin)
     with draft(file, replace=True) as made:
         return WRITERS[file.suffix.lower()](table, made, _remarks(study, table, at))
 
 
+def chosen(
+    study: SceneStudy,
+    scanner: str | None,
+    draw: int,
+    ranges: str,
+    where: Mapping[str, object],
+    mistakes: Sequence[Mistake] = (),
+) -> tuple[Recording, Place]:
+    """Return the recording that is asked for, and its place along the axes.
+
+    Raises
+    ------
+    SpecError
+        With every mistake in what is asked for, and those known before.
+    """
+    at = place(study.spec, where)
+    if found := [*mistakes, *_mistakes(study, scanner, draw, ranges, at)]:
+        raise SpecError(found)
+    return at.recording(study.tree, scanner or study.scanners[0]), at
+
+
 def _mistakes(
-    study: SceneStudy, file: Path, scanner: str | None, draw: int, ranges: str, at: Place
+    study: SceneStudy, scanner: str | None, draw: int, ranges: str, at: Place
 ) -> list[Mistake]:
-    """Mistakes in the arguments of an export."""
+    """Mistakes in what is asked for of a study."""
     found = []
-    if file.suffix.lower() not in WRITERS:
-        remedy = f"take one of {', '.join(WRITERS)}"
-        found.append(Mistake("file", "must have a suffix that says its format", str(file), remedy))
     names = ", ".join(study.scanners)
     if scanner is None and len(study.scanners) > 1:
         found.append(Mistake("scanner", "must be named where there are several", "", f"{names}"))

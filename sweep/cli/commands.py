@@ -114,7 +114,7 @@ def main() -> None:
       sweep instruments                           which instruments can a spec name?
 
     A spec with a scene flies the lidar over terrain and makes point clouds; sweep export writes
-    them as PLY, LAS or CSV.
+    them as PLY, LAS or CSV, or as the unit's interface reports them.
 
     Ctrl-C once finishes what runs and stops; nothing that is written is lost.
 
@@ -339,23 +339,52 @@ def figures(store: Location, output: Path | None, form: str) -> None:
     help="Ranges and velocities: interpolated between bins [default], or quantised to them.",
 )
 @at("Value of a coordinate, where the study has axes; as often as needed.")
+@click.option(
+    "--as",
+    "form",
+    type=click.Choice(["points", "reports"]),
+    default="points",
+    help="Points as computed [default], or reports of the unit's interface, as .csv.",
+)
+@click.option(
+    "--interface",
+    multiple=True,
+    metavar="NAME=VALUE",
+    help="A field of the spec's interface set anew, for reports; as often as needed.",
+)
 def export(
-    store: Location, file: Path, scanner: str | None, draw: int, ranges: str, at: tuple[str, ...]
-) -> None:
+    store: Location, file: Path, at: tuple[str, ...], form: str, interface: tuple[str, ...],
+    **how: Any,
+) -> None:  # fmt: skip
     """Write the point cloud in STORE to FILE: .ply, .las, .laz or .csv.
+
+    Reports are what a unit's interface passes on: values in whole quanta and within limits, at its
+    own rate, with a flag of validity and a latency, as the spec's section `interface` states them.
+    Nothing is computed anew, so any interface can be tried on one store.
 
     \b
       sweep export results/forest_scan.zarr forest.las
       sweep export results/scan_pattern_comparison.zarr four.ply \\
           --scanner four --at optical_efficiency=1
+      sweep export results/descent.zarr reports.csv --as reports \\
+          --interface rate=10Hz --interface "range_quantum=2 mm"
     """  # noqa: D301
-    from sweep.analysis.export import export as write
     from sweep.tasks.progress import working
 
-    where = assignments(at)
-    with working("writing points"):
-        points = write(store, file, scanner=scanner, draw=draw, ranges=ranges, where=where)
-    click.echo(f"{shown(file.absolute())}: {points:,} points")
+    how["where"] = assignments(at)
+    if interface and form != "reports":
+        raise click.UsageError("--interface is of reports: add --as reports, or leave it out")
+    with working(f"writing {form}"):
+        if form == "reports":
+            from sweep.analysis.reports import reports
+
+            set_anew = assignments(interface, "--interface", "rate=10Hz")
+            number = reports(store, file, interface=set_anew, **how).sizes["report"]
+        else:
+            from sweep.analysis.export import export as write
+
+            number = write(store, file, **how)
+    click.echo(f"{shown(file.absolute())}: {number:,} {form}")
 
 
 @main.command()

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from sweep.model.constants import BOLTZMANN, ELEMENTARY_CHARGE
 
@@ -90,6 +91,16 @@ NOISY = (
 )  # fmt: skip
 """Parameters of the receiver that its noise follows from."""
 
+ANTIALIAS = {"antialias_bandwidth": 0.0, "antialias_order": 6.0}
+"""Parameters of the filter before the ADC, none by default, which points need not have."""
+
+_FOLDS = 32
+"""Aliases on either side that pass an anti-alias filter: of order 3 and a bandwidth of the whole
+sample rate those beyond have 1e-8 of the density."""
+
+_STOPPED = 345.0
+"""Natural logarithm of the most that such a filter takes from a power: nothing becomes 0."""
+
 
 def receiver_noise(
     architecture: str, values: Mapping[str, np.ndarray], in_quadrature: bool = False
@@ -124,7 +135,9 @@ def _noise(architecture: str, v: Mapping[str, np.ndarray]) -> ReceiverNoise:
     bandwidth = electrical_bandwidth(v)
     light = {name: v[name] for name in ("apd_gain", "excess_noise_factor", "responsivity")}
     detector = (v["apd_gain"] * v["responsivity"] * v["noise_equivalent_power"]) ** 2 * bandwidth
-    own = {"detector": detector, "amplifier": np.asarray(v["amplifier_noise_current"]) ** 2}
+    passed = bandwidth / _receiver_bandwidth(v)  # what the anti-alias filter leaves of the rms
+    amplifier = np.asarray(v["amplifier_noise_current"]) ** 2 * passed
+    own = {"detector": detector, "amplifier": amplifier}
     if architecture == "direct":
         thermal = 4 * BOLTZMANN * v["temperature"] * bandwidth / v["load_resistance"]
         own = own | {"thermal": thermal}
@@ -137,6 +150,23 @@ def _noise(architecture: str, v: Mapping[str, np.ndarray]) -> ReceiverNoise:
     per_watt = shot_noise(power=1.0, electrical_bandwidth=bandwidth, **light)
     sources = {source: np.asarray(value * scale) for source, value in own.items()}
     return ReceiverNoise(scale, np.asarray(per_watt * scale), sources)
+
+
+def rounding_variance(
+    *, full_scale: ArrayLike, bits: ArrayLike, in_quadrature: bool = False
+) -> np.ndarray:
+    """Variance lsb^2/12 [V^2] that rounding adds at the ADC, lsb = 2 V / 2^bits; 0 for 0 bits.
+
+    Where the noise's deviation s spans a step or so the error is white and independent of the
+    signal [Widrow and Kollar, Quantization Noise, 2008, ch. 4, 9]: it departs from that by
+    exp(-2 pi^2 s^2 / lsb^2), 2.7e-9 for s = lsb and 0.7 % for s = lsb/2. Neither the receiver's
+    gain nor its noise figure acts on it. ``full_scale`` is the largest voltage V [V] to either
+    side; the effective number of bits, which need not be whole, makes the noise of a real ADC.
+    Two ADCs sample I and Q.
+    """
+    bits = np.asarray(bits, float)
+    step = 2 * np.asarray(full_scale, float) * 2.0**-bits
+    return np.where(bits > 0, (2 if in_quadrature else 1) * (step**2 / 12), 0.0)
 
 
 def bin_deviation(*, noise_variance: np.ndarray, window_energy: np.ndarray) -> np.ndarray:
@@ -161,11 +191,44 @@ def transfer(
 
 
 def electrical_bandwidth(values: Mapping[str, np.ndarray], prefix: str = "") -> np.ndarray:
-    """Bandwidth B_e [Hz] over which noise is counted: the narrower of detector and amplifier.
+    """Bandwidth B_e [Hz] over which noise is counted: the narrowest of all stages.
 
-    [T] states one figure for both and uses it as the noise bandwidth; so does this.
+    [T] states one figure for detector and amplifier and uses it as the noise bandwidth; so does
+    this. An anti-alias filter counts as a further stage.
     """
+    narrower, antialias = _receiver_bandwidth(values, prefix), antialias_of(values, prefix)
+    return np.minimum(narrower, antialias["antialias_bandwidth"]) if antialias else narrower
+
+
+def receiver_values(p: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
+    """Parameters by name that the receiver's noise follows from."""
+    return {name: p[prefix + name] for name in NOISY} | antialias_of(p, prefix)
+
+
+def _receiver_bandwidth(values: Mapping[str, np.ndarray], prefix: str = "") -> np.ndarray:
     return np.minimum(values[f"{prefix}detector_bandwidth"], values[f"{prefix}amplifier_bandwidth"])
+
+
+def antialias_of(values: Mapping[str, np.ndarray], prefix: str = "") -> dict[str, np.ndarray]:
+    """Parameters of the filter before the ADC by name; empty without one."""
+    found = {name: np.asarray(values.get(prefix + name, v)) for name, v in ANTIALIAS.items()}
+    return found if np.any(found["antialias_bandwidth"]) else {}
+
+
+def antialias_power(
+    frequency: np.ndarray, *, antialias_bandwidth: np.ndarray, antialias_order: np.ndarray
+) -> np.ndarray:
+    """Power that passes the anti-alias filter at a signed frequency [Hz], before it folds.
+
+    A Butterworth low-pass of order n, 3 dB down at its bandwidth B [Hz]: 1 / (1 + (f / B)^(2 n)).
+
+    >>> given = {"antialias_bandwidth": np.array(1e8), "antialias_order": np.array(6)}
+    >>> [round(10 * float(np.log10(antialias_power(f, **given))), 1) for f in (5e7, 1e8, 2e8)]
+    [-0.0, -3.0, -36.1]
+    """
+    with np.errstate(divide="ignore"):  # ln 0 at DC
+        steepness = np.log(np.abs(frequency) / antialias_bandwidth)
+    return np.asarray(1 / (1 + np.exp(np.minimum(2 * antialias_order * steepness, _STOPPED))))
 
 
 def noise_density(
@@ -174,6 +237,8 @@ def noise_density(
     detector_bandwidth: np.ndarray,
     amplifier_bandwidth: np.ndarray,
     sample_rate: np.ndarray,
+    antialias_bandwidth: np.ndarray | float = 0.0,
+    antialias_order: np.ndarray | float = ANTIALIAS["antialias_order"],
 ) -> np.ndarray:
     """Density of the noise in a record, over that of white noise of the same sources.
 
@@ -183,7 +248,23 @@ def noise_density(
         sum_m 1 / (1 + (f + m f_s)^2 / B^2) = (a / 2) sinh a / (cosh a - cos(2 pi f / f_s))
 
     and that of two poles follows by partial fractions, or by the derivative where they are equal.
+    Behind an anti-alias filter |H|^2 has its power too, and aliases are summed one by one.
     """
+    if np.any(antialias_bandwidth):
+        folded = frequency - sample_rate * np.rint(frequency / sample_rate)
+        total = np.zeros(())
+        antialias = {
+            "antialias_bandwidth": np.asarray(antialias_bandwidth),
+            "antialias_order": np.asarray(antialias_order),
+        }
+        poles = {
+            "detector_bandwidth": detector_bandwidth, "amplifier_bandwidth": amplifier_bandwidth
+        }  # fmt: skip
+        for fold in range(-_FOLDS, _FOLDS + 1):
+            alias = folded + fold * sample_rate
+            passed = transfer(alias, transimpedance=np.asarray(1.0), **poles)
+            total = total + np.abs(passed) ** 2 * antialias_power(alias, **antialias)
+        return total * sample_rate / (2 * electrical_bandwidth(poles | antialias))
     one, other = np.asarray(detector_bandwidth, float), np.asarray(amplifier_bandwidth, float)
     cosine = np.cos(2 * np.pi * (np.asarray(frequency) / sample_rate))
     alike = np.abs(one - other) <= 1e-4 * np.minimum(one, other)

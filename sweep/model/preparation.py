@@ -182,6 +182,8 @@ class Shots:
     """Factor on the noise variance by what happens to the record after the threshold was set."""
     complex_record: bool = False
     """Whether the record is I and Q, and its spectrum has signed bins and no images."""
+    antialias: dict[str, np.ndarray] = field(default_factory=dict)
+    """Bandwidth [Hz] and order of the filter before the ADC; empty without one."""
     image_gain: np.ndarray | float = 0.0
     """Amplitude at the negative frequency that I and Q leave of a line's, 0..1, (n,)."""
     fading: "Fading | None" = None
@@ -241,20 +243,30 @@ class Shots:
         Spectra are divided by the root of the noise's density over that of white noise. It changes
         little over an echo and is taken on the beam's axis. What the ADC adds is white before.
         """
-        if self.noise_shape == "white":
-            return np.ones((len(self.waveform), self.size))
-        shape = {
-            "detector_bandwidth": self.detector_bandwidth,
-            "amplifier_bandwidth": self.amplifier_bandwidth, "sample_rate": self.sample_rate,
-        }  # fmt: skip
-        white = self.noise_sources.get(ADC_NOISE, 0.0) / self.quiet_variance
         beats = (
             s.carrier * s.beta
             - s.chirp_rate * ((2 / SPEED_OF_LIGHT) * (self.range - s.nearer) * (1 + s.beta))
             for s in self.waveform
         )
-        densities = (link.noise_density(beat, **shape) for beat in beats)
-        return in_rows([(g + (1 - g) * white) ** -0.5 for g in densities], (self.size,))
+        return in_rows([self.whitened(beat) for beat in beats], (self.size,))
+
+    def whitened(self, beat: np.ndarray) -> np.ndarray:
+        """Gain of a line at a beat [Hz], (n,), in a spectrum whose noise is white.
+
+        The anti-alias filter's is in it; the poles are none of it, as each line passes them.
+        """
+        if self.noise_shape == "white":
+            return np.ones(())
+        shape = {
+            "detector_bandwidth": self.detector_bandwidth,
+            "amplifier_bandwidth": self.amplifier_bandwidth, "sample_rate": self.sample_rate,
+        } | self.antialias  # fmt: skip
+        density = link.noise_density(beat, **shape)
+        white = self.noise_sources.get(ADC_NOISE, 0.0) / self.quiet_variance
+        gain = (density + (1 - density) * white) ** -0.5
+        if self.antialias:
+            gain = gain * np.sqrt(link.antialias_power(beat, **self.antialias))
+        return np.asarray(gain)
 
     @cached_property
     def noise_variance(self) -> np.ndarray:
@@ -540,7 +552,7 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
     architecture = str(p[RECEIVER + "architecture"])
     echo_scale, current_scale = link_scales(architecture, p)
     in_quadrature = str(p[RECORD]) == "complex"
-    noise = link.receiver_noise(architecture, _receiver(p, *link.NOISY), in_quadrature)
+    noise = link.receiver_noise(architecture, link.receiver_values(p, RECEIVER), in_quadrature)
     row, offset, doppler, echo = ground.axis(size)
     everywhere, accuracy, looks = np.zeros(size), Accuracy.of(p), Looks.of(p)
     return Shots(
@@ -584,6 +596,7 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
         doppler=doppler,
         amplitude=relative_amplitude(architecture, echo),
         incoherent=architecture != "direct",
+        antialias=link.antialias_of(p, RECEIVER),
         complex_record=in_quadrature,
         looks=looks,
     )

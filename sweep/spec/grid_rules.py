@@ -45,6 +45,7 @@ SAMPLE_RATE = "instrument.processing.sample_rate"
 FFT_SIZE = "instrument.processing.fft_size"
 WINDOW = "instrument.processing.window"
 RESPONSIVITY = "instrument.receiver.responsivity"
+ANTIALIAS = "instrument.receiver.antialias_bandwidth"
 EXTINCTION = "atmosphere.extinction"
 FULL_SCALE = "instrument.processing.full_scale"
 DETECTION = "instrument.processing.detection"
@@ -537,10 +538,16 @@ def _need_findings(grid: Grid) -> Iterator[Finding]:
 
 
 def _record_findings(grid: Grid) -> Iterator[Finding]:
-    """Complex records of direct detection, which has one detector and no phase to tell."""
+    """Complex records of direct detection; filters before the ADC that let noise fold, or stay."""
     if grid.has_point({RECORD: _is("complex"), beam.ARCHITECTURE: _is("direct")}):
         rule = "samples I and Q, of which direct detection has one"
         yield grid.finding(RECORD, rule, "take a coherent receiver, or record: real")
+    if (_spare(grid, {SAMPLE_RATE: 1.0, ANTIALIAS: -1.0}) or 0.0) < 0.0:
+        rule = "must be at most the sample rate over the whole grid: a wider filter keeps no alias"
+        yield grid.finding(ANTIALIAS, f"{rule} out", "lower it, or write 'none'")
+    if grid.has_point({ANTIALIAS: _given, "instrument.receiver.noise_shape": _is("white")}):
+        rule = "shapes the noise, which noise_shape: white leaves as it is"
+        yield grid.finding(ANTIALIAS, rule, "take noise_shape: receiver, or write 'none'")
 
 
 def without_draws(grid: Grid) -> Iterator[Finding]:

@@ -124,6 +124,15 @@ class Receiver(Part):
         "Input-referred noise current of the amplifier, rms over its bandwidth",
         "A", "25 nA", "0 A", "1 kA",
     )  # fmt: skip
+    antialias_bandwidth: float = of.quantity(
+        "Bandwidth of a Butterworth low-pass between amplifier and ADC, 3 dB down there; none: no "
+        "filter but the poles of detector and amplifier. At most the sample rate",
+        "Hz", "250 MHz", *_HERTZ, default=0.0, word="none",
+    )  # fmt: skip
+    antialias_order: int = of.count(
+        "Order of that filter, whose stop band falls by 6 dB an octave and order", "6", "3", "12",
+        default=6,
+    )  # fmt: skip
     noise_shape: str = of.choice(
         "Density of the receiver's noise: shaped by its bandwidths as signals are, or "
         "white over the record",

@@ -369,7 +369,7 @@ _PLAIN = {
 _FLIES = "it is for studies with a scene, in place of a target"
 _OTHER_STUDYS = {
     **dict.fromkeys(("scene", "target"), "a study has a scene or a target, not both"),
-    **dict.fromkeys(("platform", "scanners", "error_floor", "navigation"), _FLIES),
+    **dict.fromkeys(("platform", "scanners", "error_floor", "navigation", "interface"), _FLIES),
 }
 """Remedy for a section that only the other kind of study has."""
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
+from pydantic_core import PydanticCustomError
 
 import sweep.spec.declaring as of
 from sweep.spec.flight import Motion, Turn
@@ -21,6 +22,7 @@ from sweep.spec.grounds import (
     generator,
 )
 from sweep.spec.parts import Files, Part
+from sweep.spec.rules import BROKEN_RULE
 from sweep.spec.sections import SPECTRA, sunlight
 
 if TYPE_CHECKING:
@@ -325,6 +327,68 @@ class ErrorFloor(Part):
         "Velocity of the instrument's vibration along the beam, independent from shot to shot",
         "m/s", "1 cm/s", "0 m/s", "1 km/s", default=0.0,
     )  # fmt: skip
+
+
+def _end(about: str, unit: str, example: str, *bounds: str) -> float | None:
+    """Field of an end of what a report can hold; none by default."""
+    whole = f"{about}; what lies beyond is clipped and reported as invalid"
+    end: float | None = of.quantity(whole, unit, example, *bounds, default=None)
+    return end
+
+
+class Interface(Part):
+    """Reports of the unit as its interface control document states them; no part of the study's id.
+
+    ``sweep export --as reports`` makes them of stored points: nothing is computed anew.
+    """
+
+    range_quantum: float | None = of.length(
+        "Step in which ranges are reported", "2 mm", "1 nm", "1 km", default=None
+    )
+    radial_velocity_quantum: float | None = of.quantity(
+        "Step in which radial velocities are reported",
+        "m/s", "1 mm/s", "1e-9 m/s", "1 km/s", default=None,
+    )  # fmt: skip
+    min_range: float | None = _end("Least range that a report can hold", "m", "10 m", "0 m")
+    max_range: float | None = _end("Largest range that a report can hold", "m", "5 km", "0 m")
+    min_radial_velocity: float | None = _end(
+        "Least radial velocity that a report can hold, positive when closing", "m/s", "-60 m/s"
+    )
+    max_radial_velocity: float | None = _end(
+        "Largest radial velocity that a report can hold, positive when closing", "m/s", "220 m/s"
+    )
+    rate: float | None = of.quantity(
+        "Reports of each beam per second; without it every shot is a report",
+        "Hz", "20 Hz", "1e-6 Hz", "1e9 Hz", default=None,
+    )  # fmt: skip
+    value: str = of.choice(
+        "What a report holds of the valid shots in its period: their mean, or the last",
+        ("mean", "last"),
+        "mean",
+    )
+    valid_shots: int = of.count(
+        "Valid shots in its period that a report needs to be valid", "3", default=1
+    )
+    latency: float = of.duration(
+        "Age of the measurement at the report's time stamp", "40 ms", "0 s", "1e4 s", default=0.0
+    )
+
+    @model_validator(mode="after")
+    def _whole(self) -> Self:
+        """Refuse limits that leave nothing between them, and numbers of shots without a period."""
+        for name in ("range", "radial_velocity"):
+            low, high = getattr(self, f"min_{name}"), getattr(self, f"max_{name}")
+            if low is not None and high is not None and low >= high:
+                rule = f"has a min_{name} that is not below its max_{name}"
+                raise _broken(rule, f"write a lower min_{name}, or leave it out")
+        if self.rate is None and self.valid_shots > 1:
+            rule = f"wants {self.valid_shots} valid_shots, and without a rate a report is one shot"
+            raise _broken(rule, "add e.g. 'rate: 20 Hz', or leave valid_shots out")
+        return self
+
+
+def _broken(rule: str, remedy: str) -> PydanticCustomError:
+    return PydanticCustomError(BROKEN_RULE, "{rule}", {"rule": rule, "suggestion": remedy})
 
 
 class SceneStorage(Part):

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, ValidationError
 
 from sweep.model import VERSION, beam
 from sweep.model.accuracy import Accuracy
@@ -17,10 +18,10 @@ from sweep.spec.figures import SceneFigure, scene_figure_findings
 from sweep.spec.flight import AnyScanner, Platform, shots_a_cycle
 from sweep.spec.grid_rules import Grid, is_method, not_in_flights
 from sweep.spec.identity import digest, geometry_of, leaf_values
-from sweep.spec.mistakes import Finding, Location
-from sweep.spec.parts import Files, named_files, read_as
-from sweep.spec.reading import Document
-from sweep.spec.scene import ErrorFloor, Navigation, Scene, SceneDraws, SceneStorage
+from sweep.spec.mistakes import Finding, Location, SpecError
+from sweep.spec.parts import Files, leaves, named_files, read_as
+from sweep.spec.reading import Document, findings_of
+from sweep.spec.scene import ErrorFloor, Interface, Navigation, Scene, SceneDraws, SceneStorage
 from sweep.spec.scene_check import (
     Arrangement,
     axis_findings,
@@ -49,6 +50,7 @@ class SceneSpec(Study):
     draws: SceneDraws = SceneDraws()
     error_floor: ErrorFloor = ErrorFloor()
     navigation: Navigation = Navigation()
+    interface: Interface = Interface()
     storage: SceneStorage = SceneStorage()
     figures: tuple[SceneFigure, ...] = Field(
         default=(), description="Figures and tables of the results"
@@ -171,6 +173,22 @@ class SceneSpec(Study):
         """Angles of the beam's footprint by range; None where its divergence says all."""
         p = self.parameters()
         return None if beam.is_thesis(p) else partial(beam.angles, p)
+
+    def interface_with(self, fields: Mapping[str, object]) -> Interface:
+        """Return the unit's interface with some fields set anew, written as in a spec.
+
+        Raises
+        ------
+        SpecError
+            With every mistake in them.
+        """
+        written = {path[-1]: rule.written(v) for path, rule, v in leaves(self.interface)}
+        try:
+            return Interface.model_validate({**written, **fields})
+        except ValidationError as error:
+            findings = findings_of(error, Interface)
+        placed = [replace(each, location=("interface", *each.location)) for each in findings]
+        raise SpecError(map(Document({}).mistake, placed))
 
     def pointing_jitter(self) -> PointingJitter | None:
         """Random turns of the beams; None where there are none."""

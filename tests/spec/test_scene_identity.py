@@ -84,8 +84,9 @@ SAME_GEOMETRY = {
     "axes": {},
     "execution": {"workers": 3},
     "figures": [{"kind": "cloud"}],
+    "interface": {"range_quantum": "2 mm", "rate": "20 Hz"},
 }
-SAME_STUDY = ("title", "question", "execution", "figures")
+SAME_STUDY = ("title", "question", "execution", "figures", "interface")
 
 
 def objects_with_another_ground():

@@ -85,6 +85,10 @@ FIELDS = [
     ("draws.returns", 0, "must be at least 1"),
     ("navigation.test_level", 0.6, "must be at most 0.5"),
     ("navigation.relief", 3, "needs a unit"),
+    ("interface.latency", "40", "needs a unit"),
+    ("interface.rate", "none", "write e.g. '20 Hz'"),
+    ("interface", {"min_range": "9 m", "max_range": "9 m"}, "write a lower min_range"),
+    ("interface", {"valid_shots": 2}, "add e.g. 'rate: 20 Hz'"),
     ("storage.block_points", 3, "did you mean 'block_shots'?"),
     ("target", {"range": "1 m"}, "is no field"),
 ]  # fmt: skip

@@ -128,6 +128,7 @@ def other_value(path):
         "instrument.laser.beam_quality": 1.1,
         "instrument.receiver.local_oscillator_waist": "5 mm",
         "instrument.telescope.misalignment": "1 urad",
+        "instrument.receiver.antialias_order": 4,
         "instrument.processing.sample_rate": "601 MHz",
         "instrument.chirp.duration": "501 us",
         "instrument.receiver.mixing_efficiency": 0.3,

@@ -58,6 +58,9 @@ FIELDS = [
     ("instrument.processing.window", 3, "must be the name of a window"),
     ("instrument.processing.window", "kaiser(1000)", "has parameters that make no usable window"),
     ("instrument.processing.acquisition_delay", "-1 us", "must be at least 0 s"),
+    ("instrument.receiver.antialias_bandwidth", "601 MHz", "at most the sample rate over the"),
+    ("instrument.receiver.antialias_bandwidth", "non", "did you mean 'none'?"),
+    ("instrument.receiver.antialias_order", 2, "must be at least 3"),
     ("target.reflectance", 1.1, "must be at most 1"),
     ("target.reflectance", -0.1, "must be at least 0"),
     ("target.grazing_angle", "0 deg", "must be at least 1e-6 deg"),
@@ -114,6 +117,14 @@ def test_a_wrong_field_is_reported_once_with_path_rule_and_remedy(path, value, w
         assert foreign not in str(mistake)
     if isinstance(parameter_rules().get(path), Numeric):
         assert mistake.suggestion
+
+
+def test_a_filter_before_the_adc_shapes_noise_that_is_to_be_white():
+    receiver = "instrument.receiver."
+    changes = {f"{receiver}antialias_bandwidth": "200 MHz", f"{receiver}noise_shape": "white"}
+    (mistake,) = mistakes_of(written(changes))
+    assert mistake.path == f"{receiver}antialias_bandwidth"
+    assert "shapes the noise" in str(mistake) and "noise_shape: receiver" in str(mistake)
 
 
 AXES = [

@@ -37,6 +37,12 @@ _BY_RANGES = {
     for error in ("", "_standard_error")
 }
 
+
+def by_ranges(name: str, ranges: str) -> str:
+    """Name of the array of a quantity: between bins, where that is asked for and there is one."""
+    return _BY_RANGES.get(name, name) if ranges == INTERPOLATED else name
+
+
 CATEGORIES = ("beam", "surface", "flags")
 """Quantities whose values are names rather than amounts."""
 
@@ -189,8 +195,7 @@ class Recording:
             elif name == "returns":
                 table[name] = present.sum(axis=1)[shot]
             elif QUANTITIES[name].of_points:
-                stored = _BY_RANGES.get(name, name) if ranges == INTERPOLATED else name
-                table[name] = self.read(stored, part, draw)[present]
+                table[name] = self.read(by_ranges(name, ranges), part, draw)[present]
             else:
                 table[name] = self.of_shots(name, part)[shot]
         return {name: table[name] for name in names}

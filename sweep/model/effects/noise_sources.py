@@ -12,7 +12,7 @@ from sweep.model import beam, link
 from sweep.model.constants import BOLTZMANN, PLANCK, SPEED_OF_LIGHT
 from sweep.model.effects.effect import Effect, Parameter, Scene, Size, noisier
 from sweep.model.effects.points import Points
-from sweep.model.preparation import LASER, PROCESSING, RECEIVER, RECORD, TELESCOPE, Shots
+from sweep.model.preparation import LASER, PROCESSING, RECEIVER, TELESCOPE, Shots
 
 # The echo's own shot noise: 2 q M^2 F Re P B_e of the whole echo, which close by rivals the local
 # oscillator's, and makes the rise of false alarms below some 5 m that [T 4.2] reports.
@@ -242,51 +242,23 @@ RELATIVE_INTENSITY_NOISE = Effect(
 )
 
 
-_BITS, _FULL_SCALE = PROCESSING + "bits", PROCESSING + "full_scale"
-
-
-def step(*, full_scale: ArrayLike, bits: ArrayLike) -> np.ndarray:
-    """Step of an ADC, lsb = 2 V / 2^bits [V].
-
-    Parameters
-    ----------
-    full_scale : array_like
-        Largest voltage V [V] that does not clip, to either side; > 0.
-    bits : array_like
-        The effective number of bits, which need not be whole, makes the noise of a real ADC.
-    """
-    return 2 * np.asarray(full_scale, float) * 2.0 ** -np.asarray(bits, float)
-
-
-def variance(*, step: ArrayLike) -> np.ndarray:
-    """Variance lsb^2/12 [V^2] that rounding adds at the ADC.
-
-    Where the noise's deviation s spans a step or so the error is white and independent of the
-    signal [Widrow and Kollar, Quantization Noise, 2008, ch. 4, 9]: it departs from that by
-    exp(-2 pi^2 s^2 / lsb^2), 2.7e-9 for s = lsb and 0.7 % for s = lsb/2. Neither the receiver's
-    gain nor its noise figure acts on it.
-    """
-    return np.asarray(step, float) ** 2 / 12
-
-
-def _rounding(p: Mapping[str, np.ndarray], record: str) -> np.ndarray:
-    """Of the ADC; two of them sample I and Q (:func:`sweep.model.link.receiver_noise`)."""
-    bits = np.asarray(p[_BITS], float)
-    lsb = step(full_scale=p[_FULL_SCALE], bits=bits)
-    both = 2 if record == "complex" else 1
-    return np.where(bits > 0, both * variance(step=lsb), 0.0)
+_BITS = PROCESSING + "bits"
 
 
 def rounding_size(points: Points) -> Size | None:
     """Return the noise of rounding, without clipping; the threshold follows it."""
     if not points.has(_BITS):
         return None
-    return Size(noise=_rounding(points.parameters, points.word(RECORD)) / points.noise_variance)
+    return Size(noise=points.rounding / points.noise_variance)
 
 
 def add_rounding(shots: Shots, scene: Scene) -> Shots:
     """White noise of lsb^2/12, where the ADC has a number of bits."""
-    return noisier(shots, quantisation=_rounding(scene.parameters, str(scene.parameters[RECORD])))
+    p, in_quadrature = scene.parameters, shots.complex_record
+    added = link.rounding_variance(
+        full_scale=p[PROCESSING + "full_scale"], bits=p[_BITS], in_quadrature=in_quadrature
+    )
+    return noisier(shots, quantisation=added)
 
 
 QUANTISATION = Effect(

@@ -207,8 +207,15 @@ class Points:
     @cached_property
     def receiver(self) -> link.ReceiverNoise:
         """Noise at the ADC [V^2]."""
-        values = {name: self[RECEIVER + name] for name in link.NOISY}
+        values = link.receiver_values(self.parameters, RECEIVER)
         return link.receiver_noise(self.architecture, values, self.word(RECORD) == "complex")
+
+    @cached_property
+    def rounding(self) -> np.ndarray:
+        """Noise of the ADC's steps [V^2]."""
+        full_scale, bits = (self[PROCESSING + name] for name in ("full_scale", "bits"))
+        in_quadrature = self.word(RECORD) == "complex"
+        return link.rounding_variance(full_scale=full_scale, bits=bits, in_quadrature=in_quadrature)
 
     @cached_property
     def noise_variance(self) -> np.ndarray:
@@ -349,7 +356,15 @@ class Points:
         """|H| at the line over that at DC."""
         poles = [self[RECEIVER + f"{part}_bandwidth"] for part in ("detector", "amplifier")]
         one, other = ((self.frequency / pole) ** 2 for pole in poles)
-        return 1 / np.sqrt((1 + one) * (1 + other))
+        passed = 1 / np.sqrt((1 + one) * (1 + other))
+        if self.antialias:
+            passed = passed * np.sqrt(link.antialias_power(self.frequency, **self.antialias))
+        return np.asarray(passed)
+
+    @cached_property
+    def antialias(self) -> dict[str, np.ndarray]:
+        """Bandwidth [Hz] and order of the filter before the ADC; empty without one."""
+        return link.antialias_of(self.parameters, RECEIVER)
 
     @cached_property
     def tilt(self) -> np.ndarray:
@@ -364,8 +379,10 @@ class Points:
         if self.word(RECEIVER + "noise_shape") == "white":
             return level
         names = "detector_bandwidth", "amplifier_bandwidth"
-        poles = {name: self[RECEIVER + name] for name in names}
-        shape = link.noise_density(self.frequency, sample_rate=self.sample_rate, **poles)
+        filters = {name: self[RECEIVER + name] for name in names} | self.antialias
+        shape = link.noise_density(self.frequency, sample_rate=self.sample_rate, **filters)
+        if self.antialias:  # where next to no noise passes, that of the ADC is what there is
+            shape = shape + self.rounding / self.noise_variance
         return level / np.sqrt(shape)
 
     @cached_property

@@ -144,11 +144,14 @@ def beat_amplitude(shots: Shots) -> np.ndarray:
     }  # fmt: skip
     chirps = zip(shots.slopes, shots.carriers, strict=True)
     beats = [waveform.beat_frequency(sign, carrier=carrier, **shape) for sign, carrier in chirps]
+    lowest = np.min(np.abs(beats), axis=0)
     gain = link.transfer(
-        np.min(np.abs(beats), axis=0), transimpedance=np.ones(1),
+        lowest, transimpedance=np.ones(1),
         detector_bandwidth=shots.detector_bandwidth,
         amplifier_bandwidth=shots.amplifier_bandwidth,
     )  # fmt: skip
+    if shots.antialias:
+        gain = gain * np.sqrt(link.antialias_power(lowest, **shots.antialias))
     echo = shots.relative_echo
     echo = echo if shots.architecture == "direct" else np.sqrt(echo)
     return np.asarray(shots.beat_scale * echo * np.abs(gain))

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.special import erf
 
-from sweep.model.effects.noise_sources import step, variance
 from sweep.model.effects.saturation import clipping
+from sweep.model.link import rounding_variance
 
 
 def truth_quantise(voltage: np.ndarray, *, full_scale: float, bits: int) -> np.ndarray:
@@ -19,12 +19,12 @@ def truth_quantise(voltage: np.ndarray, *, full_scale: float, bits: int) -> np.n
 def test_rounding_a_tone_with_noise_of_a_step_adds_white_noise(bits):
     """2^17 samples; a mean over M independent bins strays by 1/sqrt(M) of itself, 5 sigma."""
     number, rng = 2**17, np.random.default_rng(bits)
-    lsb = float(step(full_scale=1.0, bits=bits))
+    lsb = 2 / 2**bits
     noise = lsb * rng.standard_normal(number)
     tone = min(0.7, 1 - 6 * lsb) * np.cos(2 * np.pi * 17321 * np.arange(number) / number + 0.3)
     record = truth_quantise(tone + noise, full_scale=1.0, bits=bits)
     error = abs(np.fft.rfft(record - tone - noise)[1:-1]) ** 2 / number
-    white = float(variance(step=lsb))
+    white = float(rounding_variance(full_scale=1.0, bits=bits))
     assert error.mean() / white == pytest.approx(1, abs=5 / np.sqrt(error.size))
     for band in np.array_split(error, 8):
         assert band.mean() / white == pytest.approx(1, abs=5 / np.sqrt(band.size))
