@@ -28,8 +28,6 @@ import numpy as np
 from sweep.model.effects.catalogue import EFFECTS
 from sweep.model.effects.effect import Effect, Size
 from sweep.model.effects.points import Points
-from sweep.model.preparation import PROCESSING
-from sweep.model.waveform import PEAKS, STRONGEST
 
 _LN_10 = math.log(10.0)
 _HUGE = 1e12
@@ -179,8 +177,8 @@ def changes(
     """
     low, high = plausible(sizes, points)
     threshold = points.threshold
-    if points.word(PEAKS) == STRONGEST:  # an echo has to be larger than any noise as well
-        threshold = np.maximum(threshold, np.minimum(high, _largest_noise(points)))
+    if points.largest_noise is not None:  # which an echo has to exceed as well
+        threshold = np.maximum(threshold, np.minimum(high, points.largest_noise))
     b = points.looks.scaled(threshold)
     steepest = 0.5 * (b + np.sqrt(b * b + 2))
     at = np.minimum(np.maximum(steepest, low), high)
@@ -210,12 +208,6 @@ def changes(
         change = np.maximum(_sum(total, points), _most(most, points))
         found[name] = np.fmin(np.maximum(change, size.chance), 1.0)
     return found
-
-
-def _largest_noise(points: Points) -> np.ndarray:
-    """Magnitude over sigma that noise exceeds in any bin with a chance of 0.001 at most."""
-    bins = np.asarray(points[PROCESSING + "fft_size"], float)
-    return np.asarray(np.sqrt(2 * np.log(1000 * bins)))
 
 
 def plausible(sizes: Mapping[str, Size], points: Points) -> tuple[np.ndarray, np.ndarray]:

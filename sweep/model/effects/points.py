@@ -236,6 +236,16 @@ class Points:
         tnr = tnr_of(self.parameters)
         return np.asarray(detection.threshold(tnr=tnr, bin_deviation=np.asarray(1.0)))
 
+    @property
+    def largest_noise(self) -> float | None:
+        """Magnitude over sigma that any bin's noise exceeds with a probability of 0.001 at most.
+
+        None where segments report all peaks that cross the threshold.
+        """
+        if self.word(waveform.PEAKS) == waveform.ALL:
+            return None
+        return float(np.sqrt(2 * np.log(1e3 * self.whole(PROCESSING + "fft_size"))))
+
     # The target
 
     @cached_property

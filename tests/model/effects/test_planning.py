@@ -21,6 +21,7 @@ class Given:
     """What criteria need of points, given outright."""
 
     ndim, signs, looks = 1, np.array([[1.0], [0.0], [-1.0]]), ONE
+    largest_noise = None
 
     def __init__(self, amplitude, threshold):
         self.amplitude = np.broadcast_to(amplitude, (3, np.shape(amplitude)[-1]))
@@ -208,3 +209,14 @@ def test_a_tighter_tolerance_keeps_all_that_a_looser_one_does(table_4_1, seed, e
     ]
     for tighter, looser in pairwise(kept):
         assert (tighter >= looser).all()
+
+
+@given(st.floats(0.5, 12), st.floats(0.1, 9), st.floats(-4, -2))
+def test_an_echo_that_has_to_be_the_strongest_counts_at_any_level_of_noise(signal, least, decades):
+    """Its pd is a mean of chances to cross levels from the threshold up to the largest noise."""
+    points, share = Given([[signal]], [least]), 10.0**decades
+    points.largest_noise = 6.0
+    (change,) = changes({"one": Size(magnitude=np.array([share]))}, points).values()
+    level = np.linspace(least, max(least, 6.0), 200)
+    apart = np.abs(marcum_q1(signal * (1 + share), level).q - marcum_q1(signal, level).q)
+    assert change[0] >= min(3 * apart.max(), 1) * (1 - 0.05)
