@@ -26,37 +26,21 @@ GROUND, PATH, THREE = "scene.objects.ground", "platform.path", "scanners.three"
 FIELDS = [
     ("scene", ..., "is missing; write 'scene:' with origin, objects"),
     ("target", {}, "is no field; a study has a scene or a target, not both"),
-    ("scene", "hilly", "must be a mapping of fields to values"),
-    ("scene.objects", ..., "is missing"),
     ("scene.objects", {}, "holds nothing; name at least one"),
     ("scene.objects", [], "must be a mapping"),
     ("scene.objcts", {}, "did you mean 'objects'?"),
     ("scene.origin", "grond", "is no object of the scene (you wrote 'grond'); did you mean"),
     ("scene.origin", "elsewhere", "the grounds are ground, or 'world'"),
-    ("scene.solar_irradiance", 3, "needs a unit"),
-    (f"{GROUND}.kind", "plan", "did you mean 'plane'?"),
     (f"{GROUND}.size", 3000, "needs a unit (you wrote 3000); write e.g. '3 km'"),
-    (f"{GROUND}.size", "0 m", "must be at least 1 um"),
     (f"{GROUND}.size", ..., "is missing; write e.g. 'size: 3 km'"),
-    (f"{GROUND}.reflectance", ..., "is missing; write e.g. 'reflectance: 0.1'"),
-    (f"{GROUND}.reflectance_law", "lambrt", "did you mean 'lambert'?"),
-    (f"{GROUND}.reflektance", 1, "did you mean 'reflectance'?"),
-    (f"{GROUND}.slope", "85 deg", "must be at most 80 deg"),
     (f"{GROUND}.spacing", "1 cm", "a side of 2000 m has 200000 steps of 0.01 m"),
     (f"{GROUND}.position", ["0 m", "1 m", "0 m"], "places the scene's origin"),
     (f"{GROUND}.position", ["0 m", "0 m"], "must be a list of 3 values; write e.g. [10 m, 10 m"),
     (f"{GROUND}.position", ["0 m", "0 m", 0], "holds 0 as value 2, which needs a unit"),
-    (f"{GROUND}.position", "0 m", "must be a list of 3 values"),
-    (f"{GROUND}.relief", {"hurst": 1, "rms_slope": 0, "baseline": "1 m"}, "at most 0.999"),
     ("platform", ..., "is missing; write 'platform:' with path, attitude"),
     (PATH, ..., "is missing; write 'path:' with kind: and one of straight, acceleration"),
     (f"{PATH}.kind", ..., "lacks its kind; write kind: and one of straight"),
-    (f"{PATH}.kind", "streight", "did you mean 'straight'?"),
-    (f"{PATH}.from", ..., "is missing; write e.g. 'from: [10 m, 10 m, 10 m]'"),
     (f"{PATH}.begin", ["0 m"] * 3, "is no field; the fields here are kind, from, to"),
-    (f"{PATH}.initial_speed", "-1 m/s", "must be at least 0 m/s"),
-    (f"{PATH}.speed", "1 m/s", "did you mean"),
-    ("platform.attitude", {"kind": "nadir", "heading": "trac"}, "did you mean 'track'?"),
     ("platform.attitude", {"kind": "nadir", "heading": "track"}, "has no heading to follow"),
     ("platform.attitude", {"kind": "along_track"}, "has no heading to follow"),
     ("platform.attitude", {"kind": "track"}, "needs a table"),
@@ -64,10 +48,6 @@ FIELDS = [
      "has both angles and a quaternion"),
     ("platform.attitude", {"kind": "fixed", "quaternion": [0, 0, 0, 0]}, "other than zero"),
     ("platform.mounting", {"quaternion": [0, 0, 0, 0]}, "other than zero"),
-    ("platform.jitter", "-1 urad", "must be at least 0 rad"),
-    ("scanners", ..., "is missing"),
-    ("scanners", {}, "holds nothing; name at least one"),
-    (f"{THREE}.beams", 0, "must be at least 1"),
     (f"{THREE}.half_angle", "95 deg", "must be at most 89 deg"),
     (f"{THREE}.rate", "0.2 Hz", None),
     (f"{THREE}.interval", "0.3 s", "do not fit in"),
@@ -77,16 +57,9 @@ FIELDS = [
     ("scanners.s", {"kind": "squares", "elements": ["5 deg", "5 deg"], "rate": "1 Hz"},
      "as many different angles"),
     ("scanners.s", {"kind": "corners", "angle": "1 deg", "rate": "10 s"}, "unit like Hz"),
-    ("footprint.beamlets", 0, "must be at least 1"),
     ("footprint.pattern", "line", "stands for a plane alone"),
-    ("draws.number", 0, "must be at least 1"),
     ("draws.batch", 3, "is no field; the fields here are number, method, returns"),
-    ("scene.objects.ground.roughness", "1 mm", "is no field"),
-    ("draws.returns", 0, "must be at least 1"),
-    ("navigation.test_level", 0.6, "must be at most 0.5"),
-    ("navigation.relief", 3, "needs a unit"),
     ("storage.block_points", 3, "did you mean 'block_shots'?"),
-    ("target", {"range": "1 m"}, "is no field"),
 ]  # fmt: skip
 
 
@@ -104,24 +77,15 @@ def test_a_wrong_field_is_reported_once_with_path_rule_and_remedy(path, value, w
 OBJECTS = [
     (TREES, {"on": "grund"}, "on", "is no object of the scene (you wrote 'grund'); did you mean"),
     (TREES, {"on": "thing"}, "on", "is no ground (you wrote 'thing'); the grounds are ground"),
-    (TREES, {"leaf": {}}, "leaf.reflectance", "is missing"),
     (TREES, {"trunk": ...}, "trunk", "is missing; write 'trunk:' with reflectance"),
     (TREES, {"tree": {"crown_base": "12 m"}}, "tree.crown_base", "must lie below the top, 12 m"),
-    (TREES, {"number": 2.5}, "number", "must be a whole number"),
-    (BOULDERS, {"law": {"kind": "martian"}}, "law.kind", "did you mean 'martian_rocks'?"),
-    (BOULDERS, {"law": {"kind": "power", "exponent": 2}}, "law.density", "is missing"),
-    (BOULDERS, {"law": {"kind": "martian_rocks", "abundance": "99 %"}}, "law.abundance",
-     "must be at most 0.9"),
     (BOULDERS, {"largest": "0.5 m"}, "largest", "must exceed the smallest diameter, 0.5 m"),
-    (SPHERE, {"position": ...}, "position", "is missing; write e.g. 'position: [0 m, 0 m, 10 m]'"),
     (SPHERE, {"motion": MOVING}, "position", "stands beside a motion"),
     (BOX, {"motion": SHORT}, "motion.path", "lasts from 0 to 9 s, and the flight from 0 to 10 s"),
     (BOX, {"motion": MOVING | {"attitude": {"kind": "along_track"}}}, "motion.attitude",
      "has no heading"),
-    (BOX, {"motion": {}}, "motion.path", "is missing"),
     (BOX, {"position": ["0 m"] * 3, "rotation": {"heading": "1 deg", "quaternion": [1, 0, 0, 0]}},
      "rotation", "leave one of them out"),
-    (BOX, {"position": ["0 m"] * 3, "size": ["1 m", "1 m"]}, "size", "must be a list of 3 values"),
     (HILLS, {"correlation_length": "6 m"}, "spacing", "over three grid steps"),
     (RELIEF, {"spacing": "1 km"}, None, None),
     (RELIEF, {"craters": {"smallest": "5 m", "largest": "9 m"}}, "craters.smallest",
@@ -129,7 +93,6 @@ OBJECTS = [
     (RELIEF, {"factor": 2, "craters": {"smallest": "5 m", "largest": "9 m"}}, None, None),
     (RELIEF, {"craters": {"smallest": "9 m", "largest": "8 m"}}, "craters.largest",
      "must exceed the smallest diameter, 9 m"),
-    ({"kind": "jacksboro", "reflectance": 1}, {"size": "500 m"}, "size", "must be at least 1 km"),
     ({"kind": "jacksboro", "reflectance": 1}, {"size": "1 km", "middle": ["90 km", "0 km"]},
      "middle", "there is no ground within 500 m of (90000, 0) m"),
     ({"kind": "jacksboro", "reflectance": 1}, {"craters": {"smallest": "50 m", "largest": "1 km"}},
@@ -140,8 +103,6 @@ OBJECTS = [
      "names a file that is a folder"),
     ({"kind": "array", "reflectance": 1, "file": 3}, {"spacing": ["1 m", "1 m"]}, "file",
      "must be the path of a file"),
-    ({"kind": "image", "reflectance": 1, "file": "no.png"}, {"pixel": "1 m"}, "white",
-     "is missing; write e.g. 'white: 49 m'"),
 ]  # fmt: skip
 
 
@@ -211,10 +172,6 @@ AXES = [
     ({"instrument.laser.beam_divergence": ["50 urad"]}, "instrument.laser.beam_divergence",
      "moves the beamlets, and a study casts its rays once; make another study of it"),
     ({"instrument.laser.focus": ["30 m"]}, "instrument.laser.focus", "moves the beamlets"),
-    ({"instrument.telescope.coupling": ["aperture"]}, "instrument.telescope.coupling",
-     "moves the beamlets"),
-    ({"footprint.beamlets": [1, 7]}, "footprint.beamlets", "moves the beamlets"),
-    ({"footprint.phases": ["coherent"]}, "footprint.phases", "moves the beamlets"),
     ({"accuracy.leakage_floor": [0.1]}, "accuracy.leakage_floor", "make another study"),
     ({"target.range": ["1 m"]}, "target.range", "is given by the scene, shot by shot"),
     ({"instrument.receiver.architecture": ["homodyne", "direct"]},
@@ -224,7 +181,6 @@ AXES = [
     ({"snr": {"zip": {"instrument.laser.power": ["1 W", "2 W"]}}}, "snr",
      "bears the name of something stored"),
     ({"draw": {"zip": {"instrument.laser.power": ["1 W", "2 W"]}}}, "draw", "is no name for an"),
-    ({"instrument.laser.powr": ["1 W"]}, "instrument.laser.powr", "did you mean"),
 ]  # fmt: skip
 
 
@@ -258,36 +214,20 @@ PAIR = {"kind": "fixed", "beams": [["0 deg", "0 deg"], ["1 deg", "0 deg"]], "rat
 CLOUD, NAVIGATION = {"kind": "cloud"}, {"kind": "navigation"}
 FIGURES = [
     ({}, "figures[0]", "lacks its kind; write kind: and one of cloud, scatter"),
-    ({"kind": "clod"}, "figures[0].kind", "did you mean 'cloud'?"),
     ({"kind": "surface"}, "figures[0].kind", "surface is for studies of a target"),
     (CLOUD | {"scanner": "thre"}, "figures[0].scanner", "did you mean 'three'?"),
-    (CLOUD | {"colour": "rnge"}, "figures[0].colour", "did you mean 'range'?"),
     (CLOUD | {"colour": "platform_position"}, "figures[0].colour", "is no quantity of shots"),
-    (CLOUD | {"ranges": "exact"}, "figures[0].ranges", "must be one of quantised, interpolated"),
-    (CLOUD | {"view": "abve"}, "figures[0].view", "did you mean 'above'?"),
     (CLOUD | {"view": {"azimuth": "3 deg"}}, "figures[0].view", "an azimuth and an elevation"),
     (CLOUD | {"view": {"azimuth": 3, "elevation": "3 deg"}}, "figures[0].view", "needs a unit"),
     (CLOUD | {"x": ["5 m", "5 m"]}, "figures[0].x", "must begin below its end"),
-    (CLOUD | {"x": ["5 m"]}, "figures[0].x", "must be a list of 2 values"),
-    (CLOUD | {"time": ["0 m", "1 m"]}, "figures[0].time", "unit like s"),
-    (CLOUD | {"terrain": "yes"}, "figures[0].terrain", "must be true or false"),
     (CLOUD | {"draw": 1}, "figures[0].draw", "is beyond the study's draws, 0 to 0"),
-    (CLOUD | {"where": {"pwer": "1 W"}}, "figures[0].where.pwer", "did you mean 'power'?"),
     (CLOUD | {"where": {"power": "1 m"}}, "figures[0].where.power", "unit like W"),
     (CLOUD | {"where": {"power": ["1 W", "2 W"]}}, "figures[0].where.power", "must be one value"),
-    (CLOUD | {"colr": "range"}, "figures[0].colr", "did you mean 'colour'?"),
     ({"kind": "scatter"}, "figures[0].y", "is missing"),
-    ({"kind": "scatter", "y": "rnge"}, "figures[0].y", "did you mean 'range'?"),
     ({"kind": "shot_spectra", "shot": "several"}, "figures[0].shot", "several_surfaces"),
-    ({"kind": "shot_spectra", "shot": -1}, "figures[0].shot", "must be at least 0"),
-    (NAVIGATION | {"scanners": "three"}, "figures[0].scanners", "must be a list of names"),
     (NAVIGATION | {"scanners": ["four"]}, "figures[0].scanners[0]", "is no scanner"),
     (NAVIGATION | {"scanners": ["three", "pair"]}, "figures[0].scanners[1]",
      "has fewer than 3 shots a cycle"),
-    (NAVIGATION | {"quantity": "speed"}, "figures[0].quantity", "velocity, altitude"),
-    (NAVIGATION | {"show": "error"}, "figures[0].show", "must be one of all, availability"),
-    (NAVIGATION | {"bins": 0}, "figures[0].bins", "must be at least 1"),
-    (NAVIGATION | {"name": "../x"}, "figures[0].name", "take letters"),
 ]  # fmt: skip
 
 
@@ -394,7 +334,7 @@ EVERYTHING = written(
 )
 
 
-@pytest.mark.parametrize("junk", [None, True, -1, "x", [], {}, [[]], {"kind": "x"}, 1e300])
+@pytest.mark.parametrize("junk", [None, "x", {}, [[]], 1e300])
 def test_no_junk_anywhere_gets_past_as_a_traceback(junk):
     for path in places(EVERYTHING):
         if not path or path[0] == "instrument":
