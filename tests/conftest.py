@@ -7,7 +7,7 @@ from dask.system import CPU_COUNT
 from hypothesis import settings
 
 # The first call of a compiled kernel may compile it, which no deadline should count.
-settings.register_profile("sweep", deadline=None, derandomize=True)
+settings.register_profile("sweep", deadline=None, derandomize=True, max_examples=40)
 settings.register_profile("anew", deadline=None, print_blob=True)  # other draws: `make test-all`
 settings.load_profile("sweep")
 
