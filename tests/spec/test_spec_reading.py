@@ -21,6 +21,7 @@ def refusal(path):
     ("content", "words"),
     [
         (b"title: [", "bad.yaml:1: is no valid YAML"),
+        (b"title: [a\nb: }", "look at the brackets"),
         (b"title: a\n\tb: c", "is no valid YAML"),
         (b"", "must hold a mapping"),
         (b"just words", "must hold a mapping"),
