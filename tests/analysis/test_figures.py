@@ -108,10 +108,7 @@ def test_a_study_that_asks_for_nothing_has_the_figures_that_suit_its_axes(axes, 
         (POWERS, 3),
         ({"instrument.processing.window": ["hann", "hamming"]}, 4),
         ({}, 2),
-        (
-            {"along": {"zip": TOGETHER}},
-            2,
-        ),
+        ({"along": {"zip": TOGETHER}}, 2),
     ],
 )
 def test_the_usual_figures_of_a_study_are_drawn(axes, number, tmp_path):

@@ -12,15 +12,7 @@ from sweep.analysis.opening import NotAStoreError, merged, open_scene, stretches
 from sweep.analysis.opening import open as open_store
 from sweep.analysis.scenes.recording import eyepoints_of, read_eyepoints
 from sweep.model.eyepoints import observe
-from sweep.model.outputs import (
-    CYCLES,
-    NAVIGATION,
-    OUTPUTS,
-    POINTS,
-    SHOTS,
-    SIMULATED,
-    STATISTICS,
-)
+from sweep.model.outputs import CYCLES, NAVIGATION, OUTPUTS, POINTS, SHOTS, SIMULATED, STATISTICS
 
 
 @pytest.fixture(scope="module")

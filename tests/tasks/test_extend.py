@@ -117,11 +117,7 @@ FIXED = {POWER: 1.0, RANGE: 2.0, "target.radial_velocity": 3.0, REFLECTANCE: 0.5
 
 def of(axes, block_points, **changes):
     """The small study with its fixed values, other axes and blocks."""
-    target = STUDY["target"] | {
-        "range": "2.0 km",
-        "radial_velocity": "3.0 m/s",
-        "reflectance": 0.5,
-    }
+    target = STUDY["target"] | {"range": "2.0 km", "radial_velocity": "3.0 m/s", "reflectance": 0.5}
     return small(axes=axes, target=target, storage={"block_points": block_points}, **changes)
 
 
@@ -218,11 +214,7 @@ MORE_DRAWS = {
 @pytest.mark.parametrize("before, after, accuracy, tighter", MORE_DRAWS.values(), ids=MORE_DRAWS)
 @pytest.mark.parametrize(
     "method, scene",
-    [
-        ("probabilities", ROUGH),
-        pytest.param("noise", {}, marks=pytest.mark.slow),
-        ("noise", ROUGH),
-    ],
+    [("probabilities", ROUGH), pytest.param("noise", {}, marks=pytest.mark.slow), ("noise", ROUGH)],
     ids=["probabilities, speckle", "noise alone", "noise, speckle"],
 )
 def test_more_draws_go_on_from_those_that_are_there(
