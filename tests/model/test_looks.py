@@ -271,7 +271,7 @@ def test_a_lasers_line_width_costs_coherent_looks_their_share(scene):
     """exp(-2 pi dnu tau) of the power adds up; what walks is noise, and new in each record."""
     laser = {"instrument.laser.line_width": 1e5, "instrument.laser.line_shape": "lorentzian"}
     effects = ("image", "line_width")
-    given = scene(**{NUMBER: 16, COMBINE: "coherent"}, **laser)
+    given = scene(**{NUMBER: 4, COMBINE: "coherent"}, **laser)
     ((_, pure),) = prepare(given, ("image",))
     ((_, shots),) = prepare(given, effects)
     delay = 2 * ON_A_BIN / SPEED_OF_LIGHT

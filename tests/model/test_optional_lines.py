@@ -203,7 +203,8 @@ def smeared():
     """All of effects, cases, windows and phases; the fast suite has every two of them together."""
     every = product(enumerate(SMEARING), enumerate(CASES), enumerate(WINDOWS), PHASES)
     for (i, effects), (j, case), (k, window), phases in every:
-        marks = [pytest.mark.slow] if (i + j + k) % len(WINDOWS) else []
+        other = (i + j + k) % len(WINDOWS) or phases != PHASES[(i + j) % 2]
+        marks = [pytest.mark.slow] if other else []
         yield pytest.param(effects, case, window, phases, marks=marks)
 
 
