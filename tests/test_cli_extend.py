@@ -1,14 +1,10 @@
 """`sweep extend` as it is typed."""
 
-import sys
 from pathlib import Path
 
 import pytest
-from test_cli import sweep
-
-sys.path.insert(0, str(Path(__file__).parent / "tasks"))
-
 from small import quiet, small, tree
+from test_cli import sweep
 
 POWER = "axes.instrument.laser.power"
 

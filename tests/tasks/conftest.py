@@ -1,14 +1,6 @@
 import pytest
-from small import quiet, small
+from small import quiet
 from small_flights import small_scene
-
-
-@pytest.fixture(scope="session")
-def undisturbed(tmp_path_factory):
-    """The store of the small study, run as a plain loop; not to be changed."""
-    outcome = quiet(small(), tmp_path_factory.mktemp("undisturbed") / "small.zarr")
-    assert outcome.complete
-    return outcome.store
 
 
 @pytest.fixture(scope="session")
