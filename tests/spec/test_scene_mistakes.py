@@ -225,6 +225,7 @@ FIGURES = [
     (CLOUD | {"where": {"power": ["1 W", "2 W"]}}, "figures[0].where.power", "must be one value"),
     ({"kind": "scatter"}, "figures[0].y", "is missing"),
     ({"kind": "shot_spectra", "shot": "several"}, "figures[0].shot", "several_surfaces"),
+    (NAVIGATION | {"scanners": "three"}, "figures[0].scanners", "must be a list of names"),
     (NAVIGATION | {"scanners": ["four"]}, "figures[0].scanners[0]", "is no scanner"),
     (NAVIGATION | {"scanners": ["three", "pair"]}, "figures[0].scanners[1]",
      "has fewer than 3 shots a cycle"),
