@@ -44,7 +44,7 @@ def seen(sizes, power, places, weights, first, count, shape):
     return room[F_RE, :count] + (0 if power else 1j * room[F_IM, :count])
 
 
-@pytest.mark.parametrize(("name", "sizes", "power"), every(5, WINDOWS, SIZES, [False, True]))
+@pytest.mark.parametrize(("name", "sizes", "power"), every(7, WINDOWS, SIZES, [False, True]))
 def test_lines_show_what_direct_sums_over_the_record_show(name, sizes, power):
     """Near the lines and far from them, on either side; no line exceeds its envelope."""
     fft_size = sizes[0]
