@@ -1,13 +1,17 @@
 """What all tests share: the thesis's Table 4.1, and hypothesis without deadlines."""
 
+import sys
 from math import pi
+from pathlib import Path
 
 import pytest
 from dask.system import CPU_COUNT
 from hypothesis import settings
 
+sys.path.insert(0, str(Path(__file__).parent / "tasks"))  # small studies, for other tests too
+
 # The first call of a compiled kernel may compile it, which no deadline should count.
-settings.register_profile("sweep", deadline=None, derandomize=True)
+settings.register_profile("sweep", deadline=None, derandomize=True, max_examples=40)
 settings.register_profile("anew", deadline=None, print_blob=True)  # other draws: `make test-all`
 settings.load_profile("sweep")
 
@@ -78,3 +82,13 @@ def table_4_1():
         return TABLE_4_1 | {_PATHS[name]: value for name, value in changes.items()}
 
     return parameters
+
+
+@pytest.fixture(scope="session")
+def undisturbed(tmp_path_factory):
+    """The store of the small study, run as a plain loop; not to be changed."""
+    from small import quiet, small
+
+    outcome = quiet(small(), tmp_path_factory.mktemp("undisturbed") / "small.zarr")
+    assert outcome.complete
+    return outcome.store

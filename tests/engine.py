@@ -1,6 +1,9 @@
 """Shots of one category, keys of points, and bins and lines as detection and leakage see them."""
 
+from itertools import product
+
 import numpy as np
+import pytest
 
 from sweep.model import line_shape, philox
 from sweep.model.effects.catalogue import CORE
@@ -9,11 +12,22 @@ from sweep.model.segments import runs_of
 from sweep.model.shot import prepare
 from sweep.model.spectrum import IMAGED
 
-DRAWS = 20_000
-"""5 sigma of a proportion are at most 5 sqrt(1/4 / 20,000) = 0.018: an error of 4 % of pd shows.
+DRAWS = 10_000
+"""5 sigma of a proportion are at most 5 sqrt(1/4 / 10,000) = 0.025: an error of 5 % of pd shows.
 
-A sample variance of as many is known to sqrt(2/20,000) = 1 %: at 5 sigma 5 % in a variance show.
+A sample variance of as many is known to sqrt(2/10,000) = 1.4 %: at 5 sigma 7 % in a variance show.
 """
+
+
+def every(step, *choices):
+    """All combinations of some choices; all but every `step`-th of them are slow.
+
+    With a step that has no divisor in common with their numbers, each choice is taken.
+    """
+    return [
+        pytest.param(*case, marks=[pytest.mark.slow] * (k % step > 0))
+        for k, case in enumerate(product(*choices))
+    ]
 
 
 def prepared(parameters, effects=CORE):

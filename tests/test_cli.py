@@ -460,14 +460,6 @@ def test_schema_prints_a_json_schema_that_names_the_sections():
     assert {"instrument", "scene", "platform", "scanners"} <= scene.keys()
 
 
-def test_help_teaches_with_examples():
-    text = sweep("--help").stdout
-    for command in ("run", "plan", "status", "resume", "shot", "figures", "export", "schema"):
-        assert command in text
-    assert "3 incomplete" in text
-    assert "sweep run experiments/quickstart.yaml\n" in sweep("run", "--help").stdout
-
-
 def test_importing_the_package_and_asking_for_help_stay_cheap():
     code = (
         "import sys, sweep, sweep.cli; sweep.__version__;"

@@ -86,9 +86,3 @@ def test_a_study_that_was_run_into_its_place_meanwhile_is_left_alone(here, monke
     monkeypatch.setattr(measure.Measurement, "run", beside_another)
     refused(sweep("accuracy", "small.yaml", "--points", "3", "--overwrite"), "a study's results")
     assert "complete" in sweep("status", store).stdout
-
-
-def test_help_says_what_is_measured_and_how():
-    told = sweep("accuracy", "--help").stdout
-    for word in ("tolerances", "thesis", "Ctrl-C", "--time-limit", "--points", "xarray"):
-        assert word in told

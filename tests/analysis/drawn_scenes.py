@@ -26,11 +26,7 @@ MAPPING = {
     "scene": {
         "origin": "ground",
         "objects": {
-            "ground": {
-                "kind": "raster",
-                "file": "slope.tif",
-                "reflectance": 0.1,
-            },
+            "ground": {"kind": "raster", "file": "slope.tif", "reflectance": 0.1},
             "block": {
                 "kind": "box",
                 "size": ["40 m", "30 m", "40 m"],

@@ -38,10 +38,7 @@ CUTS = {
     "zip": [
         {"target.range": RANGES, "target.grazing_angle": "15 deg"},
         {"target.range": RANGES, "target.grazing_angle": "85 deg"},
-        {
-            "target.range": "3500 m",
-            "target.grazing_angle": {"step": ["5 deg", "90 deg", "5 deg"]},
-        },
+        {"target.range": "3500 m", "target.grazing_angle": {"step": ["5 deg", "90 deg", "5 deg"]}},
     ]
 }
 POWERS = {"instrument.laser.power": ["1 W", "3 W", "5 W"], "cut": CUTS}

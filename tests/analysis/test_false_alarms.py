@@ -132,12 +132,7 @@ def test_points_not_computed_have_no_leakage_to_tell():
 
 
 def test_a_grid_is_cut_where_the_thesis_cuts_it_and_left_whole_without_range_and_angle():
-    grid = study(
-        {
-            "target.range": ["1 km", "3.5 km"],
-            "target.grazing_angle": ["15 deg", "30 deg"],
-        }
-    )
+    grid = study({"target.range": ["1 km", "3.5 km"], "target.grazing_angle": ["15 deg", "30 deg"]})
     assert [(c.name, c.along) for c in cuts(grid)] == [
         ("15 deg", "range"),
         ("3.5 km", "grazing_angle"),
@@ -185,10 +180,7 @@ def test_other_axes_than_range_and_angle_make_rows_of_their_own(tmp_path):
     }
     found = Points.of(open_store(stored(tmp_path, axes)))
     result = tables.entries(found, study(axes), by="power")
-    assert [e.row for e in result][:2] == [
-        "power 1 W, FFT size 2^16",
-        "power 1 W, FFT size 2^17",
-    ]
+    assert [e.row for e in result][:2] == ["power 1 W, FFT size 2^16", "power 1 W, FFT size 2^17"]
     assert [e.reference.bins for e in result] == [2**16, 2**17] * 2
 
 

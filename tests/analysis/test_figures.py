@@ -6,7 +6,6 @@ from matplotlib.text import Text
 
 from sweep.analysis import canvas
 from sweep.analysis.figures import default_figures, draw
-from sweep.analysis.opening import NotAStoreError
 
 ASKED = [
     {"kind": "surface", "variable": "pd_shot", "x": "range", "y": "grazing_angle"},
@@ -40,10 +39,6 @@ def test_every_figure_and_table_of_the_spec_is_made_beside_the_store(asked):
     names = ["pd_shot_surface.png", "along_range.png", "means.txt", "means.csv"]
     assert files == [directory / name for name in names]
     assert all(map(shows, files))
-
-
-def test_figures_go_where_they_are_sent(asked, tmp_path):
-    assert {file.parent for file in draw(asked, tmp_path / "here")} == {tmp_path / "here"}
 
 
 def test_a_table_averages_over_ranges_from_the_least_on(asked, tmp_path):
@@ -82,11 +77,6 @@ def test_a_figure_of_values_that_are_not_in_the_grid_says_so(tmp_path, monkeypat
     assert words.get_text().endswith("no point of the study has grazing angle 17 deg")
 
 
-def test_a_path_without_a_store_is_refused(tmp_path):
-    with pytest.raises(NotAStoreError):
-        draw(tmp_path / "nothing.zarr")
-
-
 @pytest.mark.parametrize(
     "axes,kinds",
     [
@@ -105,13 +95,8 @@ def test_a_study_that_asks_for_nothing_has_the_figures_that_suit_its_axes(axes, 
     "axes,number",
     [
         (SURFACE, 2),
-        (POWERS, 3),
-        ({"instrument.processing.window": ["hann", "hamming"]}, 4),
         ({}, 2),
-        (
-            {"along": {"zip": TOGETHER}},
-            2,
-        ),
+        ({"along": {"zip": TOGETHER}}, 2),
     ],
 )
 def test_the_usual_figures_of_a_study_are_drawn(axes, number, tmp_path):

@@ -4,7 +4,6 @@ import shutil
 import numpy as np
 import pytest
 import xarray as xr
-from drawn_scenes import scene
 from drawn_studies import POWERS, SURFACE, stored, study
 
 import sweep
@@ -12,20 +11,7 @@ from sweep.analysis.opening import NotAStoreError, merged, open_scene, stretches
 from sweep.analysis.opening import open as open_store
 from sweep.analysis.scenes.recording import eyepoints_of, read_eyepoints
 from sweep.model.eyepoints import observe
-from sweep.model.outputs import (
-    CYCLES,
-    NAVIGATION,
-    OUTPUTS,
-    POINTS,
-    SHOTS,
-    SIMULATED,
-    STATISTICS,
-)
-
-
-@pytest.fixture(scope="module")
-def spec(tmp_path_factory):
-    return scene(tmp_path_factory.mktemp("spec"))
+from sweep.model.outputs import CYCLES, NAVIGATION, OUTPUTS, POINTS, SHOTS, SIMULATED, STATISTICS
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import xarray as xr
-from drawn_scenes import SLOPE, cut_short, scene
+from drawn_scenes import SLOPE, cut_short
 from mpl_toolkits.mplot3d import proj3d
 
 from sweep.analysis import canvas
@@ -17,11 +17,6 @@ from sweep.model.pairing import TRUE
 @pytest.fixture(scope="module")
 def tree(scene_store):
     return opened(scene_store)
-
-
-@pytest.fixture(scope="module")
-def spec(tmp_path_factory):
-    return scene(tmp_path_factory.mktemp("spec"))
 
 
 @pytest.fixture(scope="module")

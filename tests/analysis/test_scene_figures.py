@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import xarray as xr
-from drawn_scenes import cut_short, flown, scene
+from drawn_scenes import cut_short, flown
 
 from sweep.analysis import figures
 from sweep.analysis.figures import SceneStudy, default_scene_figures, draw
@@ -11,11 +11,6 @@ from sweep.analysis.opening import NotAStoreError, opened
 from sweep.analysis.scenes import pictures
 from sweep.analysis.scenes.recording import Interval, place
 from sweep.model.pairing import TRUE
-
-
-@pytest.fixture(scope="module")
-def spec(tmp_path_factory):
-    return scene(tmp_path_factory.mktemp("spec"))
 
 
 def test_a_study_that_asks_for_none_gets_clouds_by_range_and_velocity_and_navigation(scene_store):

@@ -5,18 +5,13 @@ import csv
 import numpy as np
 import pytest
 import xarray as xr
-from drawn_scenes import MAPPING, cut_short, flown, scene
+from drawn_scenes import MAPPING, cut_short, flown
 
 from sweep.analysis.canvas import sheet_of
 from sweep.analysis.opening import opened
 from sweep.analysis.scenes import navigation
 from sweep.analysis.scenes.navigation import curves, navigation_chart, navigation_page
 from sweep.analysis.scenes.recording import place
-
-
-@pytest.fixture(scope="module")
-def spec(tmp_path_factory):
-    return scene(tmp_path_factory.mktemp("spec"))
 
 
 def recordings(store, spec, power):

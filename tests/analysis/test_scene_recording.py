@@ -5,7 +5,7 @@ import shutil
 import numpy as np
 import pytest
 import xarray as xr
-from drawn_scenes import SLOPE, cut_short, scene
+from drawn_scenes import SLOPE, cut_short
 
 from sweep.analysis.opening import opened
 from sweep.analysis.scenes.recording import (
@@ -22,11 +22,6 @@ from sweep.analysis.selection import parameters_at
 from sweep.model.pairing import FLAGS, TRUE
 from sweep.spec import SpecError
 from sweep.spec.figures import QUANTITIES as OF_SPECS
-
-
-@pytest.fixture(scope="module")
-def spec(tmp_path_factory):
-    return scene(tmp_path_factory.mktemp("spec"))
 
 
 @pytest.fixture

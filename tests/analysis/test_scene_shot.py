@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import xarray as xr
-from drawn_scenes import scene
 
 from sweep.analysis import shot_figure
 from sweep.analysis.opening import opened
@@ -14,11 +13,6 @@ from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.catalogue import names_of
 from sweep.model.eyepoints import prepare_eyepoints
 from sweep.model.pairing import TRUE
-
-
-@pytest.fixture(scope="module")
-def spec(tmp_path_factory):
-    return scene(tmp_path_factory.mktemp("spec"))
 
 
 @pytest.fixture(scope="module")

@@ -73,12 +73,6 @@ def test_peaks_stand_where_the_beats_are_and_as_high_as_the_statistics_say(one):
     assert up.snr == pytest.approx(one.outputs["snr_up"], rel=1e-12)
 
 
-def test_a_tone_has_the_level_of_its_amplitude(one):
-    amplitude = 0.003
-    in_its_bin = amplitude / 2 * one.prepared.window.sum
-    assert one.dbv(in_its_bin) == pytest.approx(20 * np.log10(amplitude), abs=1e-12)
-
-
 def test_drawn_noise_has_the_noise_level_and_crosses_the_threshold_as_rarely_as_it_should():
     parameters = study({}).parameters() | {
         "instrument.processing.tnr": 4.0,

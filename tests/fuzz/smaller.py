@@ -1,14 +1,10 @@
-"""Specs made small, and plans made quick."""
+"""Plans made quick."""
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
 from unittest import mock
-
-from spoilt_specs import NOTHING, places, put
 
 from sweep.tasks import eyepoint_study, plan
 
@@ -25,19 +21,3 @@ def swiftly() -> Iterator[None]:
         mock.patch.object(plan, "ROUNDS", 1),
     ):
         yield
-
-
-def shrunk(written: dict[str, Any], fails: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
-    """The spec without all that can be left out of it while it still fails alike."""
-    smallest = copy.deepcopy(written)
-    again = True
-    while again:
-        again = False
-        for path in sorted(places(smallest), key=len):
-            try:
-                without = put(smallest, path, NOTHING)
-            except (KeyError, IndexError, TypeError):
-                continue  # what it stood in is gone
-            if fails(without):
-                smallest, again = without, True
-    return smallest

@@ -53,12 +53,6 @@ def test_direct_detection_with_draws_is_planned_though_it_knows_no_speckle(tmp_p
     assert "averages over an unknown number" in refused(direct | {"effects": {"speckle": "on"}})
 
 
-@pytest.mark.parametrize("effect", ["pointing_jitter", "speckle", "scintillation"])
-def test_a_random_effect_that_is_on_needs_draws(effect):
-    assert f"effects.{effect}: is simulated by draws" in refused(plain(effects={effect: True}))
-    Spec.from_mapping(plain({"draws.number": 2}, effects={effect: True}))
-
-
 BEYOND = {
     "line": {"instrument.laser.line_width": "1 THz"},
     "clipped": {"instrument.processing.full_scale": "1e-15 V"},
@@ -116,14 +110,6 @@ def test_a_pure_number_with_a_unit_is_refused_however_large(written):
 def test_an_operator_without_a_unit_to_it_is_no_unit(unit):
     field = "target.solar_irradiance" if "W" in unit else "target.range"
     assert f"{field}: " in refused(plain({field: f"5 {unit}"}))
-
-
-def test_a_generator_of_no_use_is_told_what_to_do():
-    for path, axis in (
-        ("target.range", {"step": ["1 m", "9 m", "0 m"]}),
-        ("instrument.processing.fft_size", {"linear": [2, 5], "number": 3}),
-    ):
-        assert "list" in refused(plain(axes={path: axis}))
 
 
 def test_a_window_that_scipy_warns_of_or_can_not_make_is_refused():
@@ -212,12 +198,6 @@ def test_a_ground_is_not_blurred_by_more_than_its_own_size():
     for width in (31.0, 1e9):
         with pytest.raises(ValueError, match="the ground's 30 m"):
             smooth(ground, width=width)
-
-
-def test_a_file_that_is_no_yaml_is_told_with_a_remedy(tmp_path):
-    (tmp_path / "found.yaml").write_text("title: [a\nb: }")
-    told = CliRunner().invoke(main, ["plan", str(tmp_path / "found.yaml")])
-    assert told.exit_code == 2 and "look at the brackets" in told.stderr
 
 
 def test_a_plan_measures_once_however_late_it_is(monkeypatch):

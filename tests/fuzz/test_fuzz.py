@@ -1,5 +1,8 @@
 """A hundred or two of random specs, valid and spoilt; `make fuzz` looks at thousands."""
 
+import os
+import resource
+
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
@@ -18,14 +21,20 @@ from sweep.spec.parts import all_parts, rule_of
 from sweep.spec.rules import File, Numeric, Rule, Special
 from sweep.units import QuantityError
 
+MANY = int(os.environ.get("FUZZ", 0))
+"""Specs of each kind that `make fuzz` asks for, by the seed of the command line."""
+MOST_MEMORY = 8 << 30
+"""Address space of `make fuzz` [bytes]: what asks for more has failed."""
 FEW = settings(
-    derandomize=True, deadline=None, database=None, suppress_health_check=list(HealthCheck),
-    phases=[Phase.generate],
+    derandomize=not MANY, deadline=None, database=None, suppress_health_check=list(HealthCheck),
+    phases=[Phase.generate, *[Phase.shrink] * bool(MANY)], print_blob=bool(MANY),
 )  # fmt: skip
 
 
 @pytest.fixture(autouse=True)
 def quick():
+    if MANY:
+        resource.setrlimit(resource.RLIMIT_AS, (MOST_MEMORY, MOST_MEMORY))
     with swiftly():
         yield
 
@@ -35,16 +44,15 @@ def file(folder):
     return folder / "now.yaml"
 
 
-@settings(FEW, max_examples=50)
+@settings(FEW, max_examples=MANY * 2 // 3 or 50)
 @given(written=studies())
 def test_a_study_is_computed_to_sane_numbers_or_refused_in_words(file, written):
     file.write_text(dumped(written), encoding="utf-8")
     judge(file)
 
 
-@pytest.mark.parametrize("number", [8, pytest.param(40, marks=pytest.mark.slow)])
-def test_a_flight_is_computed_to_sane_points_or_refused_in_words(folder, number):
-    @settings(FEW, max_examples=number)
+def test_a_flight_is_computed_to_sane_points_or_refused_in_words(folder):
+    @settings(FEW, max_examples=MANY // 3 or 8)
     @given(written=flights(folder))
     def holds(written):
         (folder / "now.yaml").write_text(dumped(written), encoding="utf-8")
@@ -54,7 +62,7 @@ def test_a_flight_is_computed_to_sane_points_or_refused_in_words(folder, number)
 
 
 def test_a_spoilt_spec_ends_with_exit_code_2_and_plain_words(folder):
-    @settings(FEW, max_examples=100)
+    @settings(FEW, max_examples=MANY or 100)
     @given(wrong=spoilt(st.one_of(studies(), flights(folder))))
     def holds(wrong):
         judge_command(folder / "spoilt.yaml", wrong)

@@ -31,7 +31,7 @@ def noise(name, length, fft_size, draws, seed):
 @pytest.mark.parametrize(
     "name, length",
     [
-        *((w, 1024) for w in ("rectangular", "hamming", "hann", "blackman", "flattop")),
+        *((w, 1024) for w in ("rectangular", "hamming", "hann", "flattop")),
         ("hann", 256),
     ],
 )
@@ -116,11 +116,11 @@ def test_an_echo_on_dc_is_detected_as_often_as_in_drawn_records(table_4_1, name)
     for i in range(6):
         record = truth.analytic_record(shots, i, 0, 0, range_walk=False).real
         rng = np.random.default_rng(3)
-        noisy = record + rng.normal(size=(40_000, 256)) * np.sqrt(shots.noise_variance[i])
+        noisy = record + rng.normal(size=(10_000, 256)) * np.sqrt(shots.noise_variance[i])
         dc = np.abs(noisy @ samples(name, 256))
         drawn.append((dc >= shots.threshold[i]).mean())
-    assert (np.abs(pd - drawn) < 5 * np.sqrt(0.25 / 40_000)).all()
+    assert (np.abs(pd - drawn) < 5 * np.sqrt(0.25 / 10_000)).all()
     assert np.abs(pd - q1).max() > 0.08
     keys = philox.point_keys(np.arange(6.0)[:, None], domain="tests", seed=7)
-    counts = simulate(scene, shot.CORE, keys=keys, batch_sizes=[40_000], method="noise")
-    assert (np.abs(pd - counts["n_detected_up"][:, 0] / 40_000) < 5 * np.sqrt(0.25 / 40_000)).all()
+    counts = simulate(scene, shot.CORE, keys=keys, batch_sizes=[10_000], method="noise")
+    assert (np.abs(pd - counts["n_detected_up"][:, 0] / 10_000) < 5 * np.sqrt(0.25 / 10_000)).all()

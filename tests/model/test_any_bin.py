@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from engine import every
 
 from sweep.model import link, philox, shot, truth
 from sweep.model.alarms import first_circular, neighbour_correlation
@@ -157,9 +158,10 @@ def test_drawn_records_detect_and_alarm_as_often_as_the_closed_forms(table_4_1, 
         assert expected == pytest.approx(drawn, abs=0.04 * drawn + spread(drawn)), name
 
 
-@pytest.mark.parametrize("snr", [40, 143, 1000])
-@pytest.mark.parametrize("place", [100.0, 100.25, 100.475])
-@pytest.mark.parametrize("name", ["rectangular", "hann", "hamming"])
+@pytest.mark.parametrize(
+    ("name", "place", "snr"),
+    every(4, ["rectangular", "hann", "hamming"], [100.0, 100.25, 100.475], [40, 143, 1000]),
+)
 def test_sidelobes_of_a_fading_line_fade_with_it(name, place, snr):
     """One line in speckle: sidelobes that cross raise pd no further. Drawn, bin by bin."""
     size, draws, level = 256, 20_000, 3.9

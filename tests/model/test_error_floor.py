@@ -16,7 +16,7 @@ from sweep.model.navigation import solve
 from sweep.model.pairing import TRUE
 from sweep.spec import SceneSpec
 
-DRAWS = 100_000
+DRAWS = 20_000
 MOVING = np.array([60.0, -25.0, -90.0])
 BEAMS = np.array([
     [-0.2998, -0.3996, -0.8663], [0.0810, -0.4900, -0.8680],

@@ -4,7 +4,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from engine import shape_of
+from engine import every, shape_of
 
 from sweep.model.lines import IM, LEAST_WIDTH, PLACE, RE
 from sweep.model.segments import tangents
@@ -44,9 +44,7 @@ def seen(sizes, power, places, weights, first, count, shape):
     return room[F_RE, :count] + (0 if power else 1j * room[F_IM, :count])
 
 
-@pytest.mark.parametrize("power", [False, True], ids=["amplitudes", "powers"])
-@pytest.mark.parametrize("sizes", SIZES)
-@pytest.mark.parametrize("name", WINDOWS)
+@pytest.mark.parametrize(("name", "sizes", "power"), every(7, WINDOWS, SIZES, [False, True]))
 def test_lines_show_what_direct_sums_over_the_record_show(name, sizes, power):
     """Near the lines and far from them, on either side; no line exceeds its envelope."""
     fft_size = sizes[0]

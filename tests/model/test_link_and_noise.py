@@ -10,11 +10,7 @@ from scipy.constants import c as speed_of_light
 from sweep.model import constants, link, shot
 from sweep.model.footprint import beamlets
 from sweep.model.ground import backscatter
-from sweep.model.link import (
-    bin_deviation,
-    electrical_bandwidth,
-    transfer,
-)
+from sweep.model.link import bin_deviation, electrical_bandwidth, transfer
 
 ELECTRON, BOLTZMANN = 1.602176634e-19, 1.380649e-23
 GAIN = 7e3

@@ -140,7 +140,7 @@ def test_true_beams_are_suspect_at_the_stated_level(beams):
     assert suspect == 0 if len(beams) == 3 else within_5_sigma(suspect, LEVEL)
 
 
-@pytest.mark.parametrize("beam", [0, 6, 13])
+@pytest.mark.parametrize("beam", [0, 13])
 def test_a_false_alarm_among_sixteen_beams_is_found_and_left_out(beam):
     """Far out, it is found whenever the fit without it passes: in 1 - level of the draws."""
     found = _drawn_with_alarm(SIXTEEN, alarm=50.0, beam=beam, seed=7)

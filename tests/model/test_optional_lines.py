@@ -5,7 +5,7 @@ from itertools import product
 
 import numpy as np
 import pytest
-from engine import difference, lines_of
+from engine import difference, every, lines_of
 from test_leakage import EVERY_FORM, EXEMPTED, FREQUENCY, LEAKAGE, MAGNITUDE, MISS, PD
 from test_leakage import drawn_bundles as bundles
 
@@ -65,9 +65,7 @@ def plain_sum(shots, i, segment, bins):
     return np.sqrt(total.real) if shots.incoherent else abs(total)
 
 
-@pytest.mark.parametrize("phases", PHASES)
-@pytest.mark.parametrize("window", WINDOWS)
-@pytest.mark.parametrize("fft_size", [512, 801])
+@pytest.mark.parametrize(("fft_size", "window", "phases"), every(3, [512, 801], WINDOWS, PHASES))
 def test_without_images_only_the_folded_lines_themselves_are_summed(
     window, phases, fft_size, table_4_1
 ):
@@ -205,7 +203,8 @@ def smeared():
     """All of effects, cases, windows and phases; the fast suite has every two of them together."""
     every = product(enumerate(SMEARING), enumerate(CASES), enumerate(WINDOWS), PHASES)
     for (i, effects), (j, case), (k, window), phases in every:
-        marks = [pytest.mark.slow] if (i + j + k) % len(WINDOWS) else []
+        other = (i + j + k) % len(WINDOWS) or phases != PHASES[(i + j) % 2]
+        marks = [pytest.mark.slow] if other else []
         yield pytest.param(effects, case, window, phases, marks=marks)
 
 
@@ -221,9 +220,10 @@ def test_phase_errors_and_widths_are_those_of_the_record(effects, case, window, 
         assert difference(shots, fast, slow, peak) < AGREEMENT
 
 
-@pytest.mark.parametrize("phases", PHASES)
-@pytest.mark.parametrize("leakage", [True, pytest.param(False, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("effects", [DRIFTING, ("line_width",), (*DRIFTING, "line_width")])
+@pytest.mark.parametrize(
+    ("effects", "leakage", "phases"),
+    every(5, [DRIFTING, ("line_width",), (*DRIFTING, "line_width")], [True, False], PHASES),
+)
 def test_what_is_found_is_found_in_the_whole_spectrum(effects, leakage, phases, table_4_1):
     """Peak, exempt bins and groups of 40 points against all bins of their spectra."""
     rng = np.random.default_rng(6)
@@ -286,8 +286,8 @@ def test_draws_and_returns_see_what_the_spectrum_shows(effects, table_4_1):
 # What is not there, and company
 
 
-@pytest.mark.parametrize("phases", PHASES)
-def test_the_company_of_points_changes_no_bit(phases, table_4_1):
+@pytest.mark.parametrize(("phases", "left_out"), every(3, PHASES, [(), ("image", "leakage")]))
+def test_the_company_of_points_changes_no_bit(phases, left_out, table_4_1):
     """Of points in several stretches; of their order; of one alone. All kinds of drift at once."""
     number = 2 * POINTS + 40
     rng = np.random.default_rng(7)
@@ -299,16 +299,15 @@ def test_the_company_of_points_changes_no_bit(phases, table_4_1):
         "instrument.chirp.sinusoidal_error": rng.choice([0.0, 1e5], number),
         "instrument.laser.line_width": rng.choice([0.0, 1e3, 3e5], number),
     }
-    for left_out in ((), ("image", "leakage")):
-        chosen = [n for n in (*CORE, *DRIFTING, "line_width") if n not in left_out]
+    chosen = [n for n in (*CORE, *DRIFTING, "line_width") if n not in left_out]
 
-        def found(index, chosen=chosen):
-            part = {k: v[index] if np.ndim(v) else v for k, v in parameters.items()}
-            ((_, shots),) = prepare(part, chosen)
-            return find(shots)
+    def found(index):
+        part = {k: v[index] if np.ndim(v) else v for k, v in parameters.items()}
+        ((_, shots),) = prepare(part, chosen)
+        return find(shots)
 
-        whole = found(np.arange(number))
-        some = rng.permutation(number)[: number // 2]
-        for index in (some, some[:1], np.array([number - 1])):
-            there = np.ascontiguousarray(whole[..., index])
-            assert there.tobytes() == np.ascontiguousarray(found(index)).tobytes()
+    whole = found(np.arange(number))
+    some = rng.permutation(number)[: number // 2]
+    for index in (some, some[:1], np.array([number - 1])):
+        there = np.ascontiguousarray(whole[..., index])
+        assert there.tobytes() == np.ascontiguousarray(found(index)).tobytes()

@@ -6,14 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sweep.model import philox
-from sweep.model.philox import (
-    normal_pair,
-    normals,
-    point_keys,
-    uniform,
-    uniforms,
-    words4,
-)
+from sweep.model.philox import normal_pair, normals, point_keys, uniform, uniforms, words4
 
 without_deadline = settings(deadline=None)  # the first call may compile
 words = st.integers(0, 2**64 - 1).map(np.uint64)

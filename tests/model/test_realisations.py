@@ -192,7 +192,7 @@ def test_twinkling_keeps_the_mean_echo_and_has_its_index(law, architecture, tabl
 
 def test_the_mean_over_a_log_normal_echo_is_gauss_and_hermites(table_4_1):
     parameters = table_4_1(range=4000.0, beamlets=1, tnr=8.0, power=0.1) | AIR
-    means = evaluate(parameters, (*CORE, "scintillation"), keys=keys(1), draws=100_000)
+    means = evaluate(parameters, (*CORE, "scintillation"), keys=keys(1), draws=50_000)
     even = scintillation.Turbulence(uniform=1e-14)
     legs = scintillation.both_ways(even, DEFAULTS | parameters, np.array(4000.0))
     variance = np.log1p(index(legs))

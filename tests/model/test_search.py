@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from engine import DRAWS, keys, prepared, within_5_sigma
+from engine import DRAWS, every, keys, prepared, within_5_sigma
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -76,8 +76,7 @@ def noisy_spectra(shots, segment, rng):
     return np.abs(np.fft.rfft(taper * (signal.real + sigma * rng.normal(size=shape)), SIZE))
 
 
-@pytest.mark.parametrize("record", ["real", "complex"])
-@pytest.mark.parametrize("offset", [-40, -1, 0, 1, 40])
+@pytest.mark.parametrize(("record", "offset"), every(2, ["real", "complex"], [-40, -1, 0, 1, 40]))
 def test_drawn_records_that_are_searched_in_the_band_alone(record, offset, table_4_1):
     """The strongest bin of the up beat lies some bins within the band's far end, or beyond it."""
     whole = prepared(scene_of(table_4_1, record=record))
@@ -142,7 +141,7 @@ def test_draws_and_points_keep_to_the_band(method, record, table_4_1):
     """Two bands: the echo is in one. False peaks of noise lie in the bands, and evenly."""
     band = (np.array([150.0, 60.0]), np.array([260.0, 140.0]), 0.0, 5.0)
     scene = scene_of(table_4_1, band, record, range=np.full(2, 220.0), tnr=4.5)
-    found, draws = evaluate(scene), 2000
+    found, draws = evaluate(scene), 1000
     counts = simulate(scene, CORE, keys=keys(2), method=method, batch_sizes=[draws], first_draw=0)
     spread = 5 * np.sqrt(draws * 0.25)
     assert counts["n_detected_up"][:, 0] == pytest.approx(draws * found["pd_up"], abs=spread)

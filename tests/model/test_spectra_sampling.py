@@ -141,8 +141,7 @@ def test_range_is_that_at_the_beginning_though_the_ground_walks(table_4_1):
 
 
 @pytest.mark.parametrize(
-    ("effects", "record"),
-    [(EFFECTS, "real"), ((*EFFECTS, "speckle"), "real"), (EFFECTS, "complex")],
+    ("effects", "record"), [((*EFFECTS, "speckle"), "real"), (EFFECTS, "complex")]
 )
 def test_batches_points_and_their_order_change_no_bit(table_4_1, effects, record):
     parameters = _points(table_4_1, **{"target.roughness": 1e-6, "footprint.beamlets": 4})
@@ -297,13 +296,13 @@ WANDERING = {"instrument.laser.line_width": 1e5, "instrument.laser.line_shape": 
 
 def test_ranges_err_by_the_walk_of_the_lasers_phase(table_4_1):
     """100 kHz, 500 MHz in 2 us: known errors of 4.3 to 30.7 mm, and bounds to 38.8 mm."""
-    place = {"target.range": np.array([10.0, 20.0, 50.0, 75.0, 100.0])}
+    place = {"target.range": np.array([10.0, 75.0, 100.0])}
     parameters = _points(table_4_1, **CHIRP_2_US) | WANDERING | place
     found = _drawn(parameters, number=600, effects=("doppler", "line_width", "image"))
-    known = np.array([4.3e-3, 8.6e-3, 20.8e-3, 30.7e-3])
+    known = np.array([4.3e-3, 30.7e-3])
     spread = 5 / np.sqrt(2 * 600)
-    np.testing.assert_allclose(found["range_rmse"][:4], known, rtol=0.05 + spread)
-    bounds = [4.3e-3, 8.5e-3, 20.3e-3, 29.8e-3, 38.8e-3]
+    np.testing.assert_allclose(found["range_rmse"][:2], known, rtol=0.05 + spread)
+    bounds = [4.3e-3, 29.8e-3, 38.8e-3]
     np.testing.assert_allclose(found["range_bound"], bounds, rtol=0.1)
 
 

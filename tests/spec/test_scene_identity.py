@@ -197,12 +197,7 @@ def study_with_files(tmp_path):
     folder.mkdir()
     trimesh.creation.box(extents=[2.0, 2, 2]).export(folder / "box.stl")
     (folder / "path.csv").write_text("time [s], x [m], y [m], z [m]\n0, 0, 0, 500\n10, 0, 0, 100\n")
-    mesh = {
-        "kind": "mesh",
-        "file": "box.stl",
-        "reflectance": 1,
-        "position": ["0 m", "0 m", "1 m"],
-    }
+    mesh = {"kind": "mesh", "file": "box.stl", "reflectance": 1, "position": ["0 m", "0 m", "1 m"]}
     mapping = with_object(mesh)
     mapping["platform"]["path"] = {"kind": "waypoints", "file": "path.csv"}
     return folder, mapping

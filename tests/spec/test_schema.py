@@ -6,7 +6,7 @@ from pathlib import Path
 import jsonschema
 import pytest
 import yaml
-from written_scenes import BOX, RICH, SPHERE, TREES, with_object
+from written_scenes import BOX, RICH, SPHERE, with_object
 from written_scenes import written as flight
 from written_specs import written
 
@@ -116,8 +116,6 @@ def test_a_shipped_grid_has_its_points_and_comes_back_from_a_store(name, validat
 @pytest.mark.parametrize("name", sorted(set(POINTS) - set(NEW)))
 def test_a_reproduction_makes_the_thesiss_choices(name):
     parameters = loaded(name).parameters()
-    efficiency = parameters["instrument.telescope.optical_efficiency"]
-    assert efficiency * parameters["target.reflectance"] == pytest.approx(0.1)
     assert parameters["target.reflectance_law"] == "thesis"
     assert parameters["footprint.phases"] == "coherent"
     assert parameters["footprint.beamlets"] == 109
@@ -180,20 +178,15 @@ def test_a_study_that_is_read_agrees_with_the_schema(name, validator):
     "changes",
     [
         {"instrument.laser.power": 1},
-        {"instrument.laser.power": "1"},
         {"instrument.laser.watts": "1 W"},
-        {"instrument.processing.fft_size": "two"},
         {"instrument.receiver.architecture": "homodine"},
         {"target.reflectance": 2},
         {"target.range": 5},
         {"axes": {"target.rnge": ["1 m"]}},
         {"axes": {"target.range": [5]}},
-        {"axes": {"target.range": []}},
         {"axes": {"target.range": {"step": ["1 m", "2 m"]}}},
-        {"axes": {"target.range": {"linear": ["1 m", "2 m"]}}},
         {"axes": {"cut": {"zip": [{"range": "1 m"}]}}},
         {"figures": [{"kind": "surfce", "variable": "pd_shot"}]},
-        {"title": ...},
         {"foorprint": {}},
         {"scanners": {}},
     ],
@@ -207,26 +200,15 @@ def test_an_editor_sees_the_mistake_in_a_grid_by_the_schema(changes, validator):
     [
         {"scene.origin": 3},
         {"scene.objects.ground.kind": "plan"},
-        {"scene.objects.ground.size": 3},
-        {"scene.objects.ground.reflectanc": 3},
-        {"scene.objects.ground.reflectance": ...},
         {"scene.objects.ground.reflectance_law": "lambrt"},
-        {"platform.path.from": ...},
         {"platform.path.from": ["0 m", "0 m"]},
-        {"platform.path.from": [0, 0, 0]},
         {"platform.attitude": {"kind": "nadir", "heading": "trk"}},
-        {"scanners.three.beams": "many"},
         {"scanners": 3},
-        {"scanners": ...},
         {"axes": {"instrument.laser.beam_divergence": ["1 urad"]}},
         {"axes": {"target.range": ["1 m"]}},
-        {"draws.number": 0},
         {"figures": [FIGURE | {"kind": "surface"}]},
-        {"figures": [FIGURE | {"colour": "rnge"}]},
-        {"figures": [FIGURE | {"x": ["1 m"]}]},
         {"figures": [FIGURE | {"view": {"azimuth": "1 deg"}}]},
         {"target": {"range": "1 m"}},
-        {"scene.objects.forest": TREES | {"leaf": {"reflectance": 3}}},
         {"scene.objects.crate": BOX | {"size": ["1 m"]}},
     ],
 )

@@ -16,10 +16,7 @@ from sweep.spec.fields import SECTIONS, default_of, parameter_rules
 from sweep.spec.grid_rules import is_method
 from sweep.spec.rules import Choice
 
-AXES = {
-    "target.range": {"step": ["1 m", "100 m", "1 m"]},
-    "instrument.laser.power": ["1 W", "3 W"],
-}
+AXES = {"target.range": {"step": ["1 m", "100 m", "1 m"]}, "instrument.laser.power": ["1 W", "3 W"]}
 
 OTHER_WAYS = set(WAYS) - {TNR} | set(ENDS)
 """Of setting the threshold, of which a spec has one; and a search band, which none need have."""

@@ -28,10 +28,7 @@ FAMILY = Family(
 )
 SIZES = (2**12, 2**14, 2**17, 2**20, 2**24)
 OFFSETS = (0.4061, -0.49999, 0.5)
-PEAK = {
-    "measure": "abs(X), of the peak",
-    "reference": "sum over all samples, exactly rounded",
-}
+PEAK = {"measure": "abs(X), of the peak", "reference": "sum over all samples, exactly rounded"}
 
 
 def kernel(name: str, size: int, delta: float, bins: Iterable[int]) -> Iterator[float]:
@@ -205,10 +202,7 @@ LEAKAGE = {
 }
 
 
-@FAMILY.case(
-    "leakage of 600 bins, from 1e-12 to 1, many of each far below it",
-    **LEAKAGE,
-)
+@FAMILY.case("leakage of 600 bins, from 1e-12 to 1, many of each far below it", **LEAKAGE)
 def leakage() -> float:
     return max(leakage_error("hann", 1280, 100.0), leakage_error("hamming", 1280, 1500.0))
 

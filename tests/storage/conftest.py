@@ -4,12 +4,8 @@ import subprocess
 import sys
 import time
 import urllib.request
-from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tasks"))
-
 from faulty import Faulty
 from six_blocks import six
 from small import quiet

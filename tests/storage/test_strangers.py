@@ -84,8 +84,7 @@ SPOILT = {
         "pd_up", chunk_key_encoding={"name": "v2", "configuration": {"separator": "/"}}
     ),
     "a chunk of a petabyte": put(
-        "pd_up",
-        chunk_grid={"name": "regular", "configuration": {"chunk_shape": [2, 2**47]}},
+        "pd_up", chunk_grid={"name": "regular", "configuration": {"chunk_shape": [2, 2**47]}}
     ),
     "chunks without number": put("pd_up", shape=[2, 2**60]),
     "a length that is none": put("pd_up", shape=[2, True]),

@@ -127,8 +127,7 @@ def test_pieces_of_a_block_come_to_the_same_bytes_and_are_told(kind, place, whol
 
 @pytest.mark.parametrize(
     "kind",
-    ["fixed", "adaptive spectra"]
-    + [pytest.param(k, marks=pytest.mark.slow) for k in ("noise alone", "adaptive", "spectra")],
+    ["fixed", *(pytest.param(k, marks=pytest.mark.slow) for k in KINDS if k != "fixed")],
 )
 def test_a_block_of_several_points_is_stopped_at_any_of_them(
     kind, whole, saved, tmp_path, monkeypatch

@@ -30,10 +30,7 @@ def test_a_plain_loop_computes_every_point_and_receipts_every_block_once(undistu
 
 @pytest.mark.parametrize(
     "place",
-    [
-        pytest.param({"workers": 3}, marks=pytest.mark.slow),
-        {"workers": 2, "processes": False},
-    ],
+    [pytest.param({"workers": 3}, marks=pytest.mark.slow), {"workers": 2, "processes": False}],
     ids=["3 processes", "2 threads"],
 )
 def test_the_bytes_are_the_plain_loops_wherever_the_blocks_are_computed(

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import zarr
 from click.testing import CliRunner
+from engine import every
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from small import STUDY, copied, everything, failing, quiet, small, tree
@@ -75,10 +76,11 @@ MORE = {
 APPENDED, NEW_AXIS = ({**AXES, POWER: ["1 W", "3 W", "5 W"]}, {**AXES, REFLECTANCE: [0.01, 0.02]})
 
 
-@pytest.mark.parametrize("axes, new", MORE.values(), ids=MORE)
+@pytest.mark.parametrize("name", every(2, MORE))
 def test_more_values_and_axes_end_as_the_larger_study_run_at_once(
-    undisturbed, tmp_path, computed, axes, new
+    undisturbed, tmp_path, computed, name
 ):
+    axes, new = MORE[name]
     store, spec = copied(undisturbed, tmp_path), small(axes=axes)
     outcome = larger(store, spec)
     assert outcome.complete and outcome.store == store and sum(computed) == new
@@ -117,11 +119,7 @@ FIXED = {POWER: 1.0, RANGE: 2.0, "target.radial_velocity": 3.0, REFLECTANCE: 0.5
 
 def of(axes, block_points, **changes):
     """The small study with its fixed values, other axes and blocks."""
-    target = STUDY["target"] | {
-        "range": "2.0 km",
-        "radial_velocity": "3.0 m/s",
-        "reflectance": 0.5,
-    }
+    target = STUDY["target"] | {"range": "2.0 km", "radial_velocity": "3.0 m/s", "reflectance": 0.5}
     return small(axes=axes, target=target, storage={"block_points": block_points}, **changes)
 
 
@@ -215,19 +213,13 @@ MORE_DRAWS = {
 }
 
 
-@pytest.mark.parametrize("before, after, accuracy, tighter", MORE_DRAWS.values(), ids=MORE_DRAWS)
 @pytest.mark.parametrize(
-    "method, scene",
-    [
-        ("probabilities", ROUGH),
-        pytest.param("noise", {}, marks=pytest.mark.slow),
-        ("noise", ROUGH),
-    ],
-    ids=["probabilities, speckle", "noise alone", "noise, speckle"],
+    "drawn_as, more",
+    every(4, [("probabilities", ROUGH), ("noise", {}), ("noise", ROUGH)], MORE_DRAWS),
 )
-def test_more_draws_go_on_from_those_that_are_there(
-    tmp_path, drawn, scene, method, before, after, accuracy, tighter
-):
+def test_more_draws_go_on_from_those_that_are_there(tmp_path, drawn, drawn_as, more):
+    method, scene = drawn_as
+    before, after, accuracy, tighter = MORE_DRAWS[more]
     older = small(axes=COARSE, draws=before | {"method": method}, accuracy=accuracy, **scene)
     spec = small(
         axes=COARSE, draws=after | {"method": method}, accuracy=accuracy | tighter, **scene

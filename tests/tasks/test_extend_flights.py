@@ -119,7 +119,11 @@ MORE = {
 @pytest.mark.parametrize(
     "changes, new",
     [
-        pytest.param(*case, id=name, marks=[pytest.mark.slow] * (name in ("draws", "large blocks")))
+        pytest.param(
+            *case,
+            id=name,
+            marks=[pytest.mark.slow] * (name in ("an axis before", "draws", "large blocks")),
+        )
         for name, case in MORE.items()
     ],
 )
@@ -214,7 +218,8 @@ def chunk(store, name, part, scanner="three"):
 
 
 @pytest.mark.parametrize(
-    "name, stretch, lost", [("flags", 1, 1), ("effects", 0, 3), ("pd_shot", 0, 3)]
+    "name, stretch, lost",
+    [("flags", 1, 1), ("effects", 0, 3), pytest.param("pd_shot", 0, 3, marks=pytest.mark.slow)],
 )
 def test_a_damaged_block_is_computed_anew(here, computed, drawn_more, name, stretch, lost):
     """In place of its own a block has another's chunk, which any reader takes for sound.

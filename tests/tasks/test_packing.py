@@ -1,3 +1,4 @@
+import shutil
 import warnings
 
 import numpy as np
@@ -108,8 +109,8 @@ def test_the_copy_goes_to_an_object_store_too(undisturbed, tmp_path):
     assert all(report.sound for report in verify(there, progress=False))
 
 
-def test_a_scene_is_packed_with_all_that_is_told_of_it(tmp_path):
-    made = quiet(small_scene(), tmp_path / "scene.zarr").store
+def test_a_scene_is_packed_with_all_that_is_told_of_it(flight, tmp_path):
+    made = shutil.copytree(flight.parent, tmp_path, dirs_exist_ok=True) / flight.name
     told = CliRunner().invoke(main, ["finalize", str(made)])
     assert told.exit_code == 0, told.output
     copy = tmp_path / "scene_final.zarr"

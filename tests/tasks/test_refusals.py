@@ -127,11 +127,6 @@ def refusing_on_workers(path, attributes, *, where):
 def test_a_scheduler_that_does_not_answer_leaves_no_store_behind(tmp_path, monkeypatch):
     monkeypatch.setattr(cluster, "CONNECT_TIMEOUT", 0.5)
     with pytest.raises(ClusterError, match=r"answers at tcp://127\.0\.0\.1:9"):
-        run(
-            small(),
-            store=tmp_path / "small.zarr",
-            scheduler="tcp://127.0.0.1:9",
-            progress=False,
-        )
+        run(small(), store=tmp_path / "small.zarr", scheduler="tcp://127.0.0.1:9", progress=False)
     assert list(tmp_path.iterdir()) == []
     assert dask.config.get("scheduler", None) is None  # what is read later is read without it

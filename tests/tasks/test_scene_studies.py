@@ -84,7 +84,7 @@ def test_rays_are_counted_as_they_are_cast(undisturbed):
 
 @pytest.mark.parametrize(
     "place",
-    [pytest.param({"workers": 2, "processes": False}, marks=pytest.mark.slow), {"workers": 2}],
+    [{"workers": 2, "processes": False}, pytest.param({"workers": 2}, marks=pytest.mark.slow)],
 )
 def test_workers_make_the_same_bytes_as_a_plain_loop(undisturbed, tmp_path, monkeypatch, place):
     if place.get("processes", True):  # worker processes cut eyepoints as they are installed

@@ -33,13 +33,6 @@ def tiny(tmp_path_factory):
     return path
 
 
-@pytest.fixture(scope="module")
-def flight(tmp_path_factory):
-    path = tmp_path_factory.mktemp("flight") / "scene.zarr"
-    assert quiet(small_scene(), path).complete
-    return path
-
-
 def damages(store: Path, **options) -> list[str]:
     """Objects that are found damaged; a number of a line and a count of chunks are left out."""
     reports = verify(store, progress=False, **options)

@@ -32,8 +32,7 @@ def error_of(sign, *, quadratic=0.0, cubic=0.0, sinusoidal=0.0, periods=1.0, **s
 
 @pytest.mark.parametrize("sign", [-1, 1])
 @pytest.mark.parametrize(
-    "peaks",
-    [{"quadratic": 2e5}, {"cubic": -3e5}, {"sinusoidal": 1e5, "periods": 3.3}],
+    "peaks", [{"quadratic": 2e5}, {"cubic": -3e5}, {"sinusoidal": 1e5, "periods": 3.3}]
 )
 @pytest.mark.parametrize(("range_", "velocity"), [(1.0, 0.0), (9000.0, 3000.0), (50.0, -200.0)])
 def test_the_phase_is_the_frequency_error_integrated_over_the_delay(sign, peaks, range_, velocity):

@@ -120,7 +120,7 @@ def test_skirts_raise_alarms_as_often_as_in_simulated_records(leaking, monkeypat
     shots = shots_of(p, WITH)
     scale, line = leak.line_of(shots, 0, 0)
     level, sigma = float(shots.threshold[0]), float(shots.bin_deviation[0])
-    rng, number, size = np.random.default_rng(8), 20_000, 2**12
+    rng, number, size = np.random.default_rng(8), 5_000, 2**12
     (runs,) = runs_of(shots)
     masked = scale * line.most >= 0.8 * level
     looked = ~masked

@@ -61,7 +61,7 @@ def magnitudes_moved(on, off, sigma):
 @pytest.mark.parametrize("kind", range(len(KINDS)))
 def test_no_effect_changes_more_than_its_size_whatever_else_there_is(table_4_1, kind):
     noticed = 0
-    for seed in range(6):
+    for seed in range(3):
         rng = np.random.default_rng((seed, kind))
         parameters = scene(
             table_4_1, POINTS, seed, fft_size=2**13, bins_counted="all",
@@ -88,7 +88,7 @@ def test_no_effect_changes_more_than_its_size_whatever_else_there_is(table_4_1, 
                     moved = abs(seen[0][alarm] - seen[1][alarm])
                     assert (np.minimum(moved, 1) <= most[name] + ROUNDING).all()
             noticed += (most[name] < 1).sum()
-    assert noticed > 500
+    assert noticed > 250
 
 
 def sizes_of_many(rng, low, high):
@@ -154,7 +154,7 @@ def test_no_further_effect_changes_more_than_its_size(table_4_1, kind, name):
 @pytest.mark.parametrize("tolerance", [1e-4, 1e-2, 0.3])
 def test_pd_of_what_is_kept_is_within_the_tolerance(table_4_1, kind, tolerance):
     kept = dropped = 0
-    for seed in range(6):
+    for seed in range(2):
         parameters = scene(
             table_4_1, POINTS, seed, fft_size=2**13, **{"beamlets": 19} | KINDS[kind]
         )
@@ -175,7 +175,7 @@ def test_pd_of_what_is_kept_is_within_the_tolerance(table_4_1, kind, tolerance):
                 extra = truth["p_leakage_up"] + truth["p_leakage_down"]
                 assert (extra[here] <= tolerance).all()
         kept, dropped = kept + made.kept.sum(), dropped + (~made.kept).sum()
-    assert kept > 100 and dropped > 100
+    assert kept > 30 and dropped > 30
 
 
 def cast_scene(rng, shots, beamlets, beside_chance):
@@ -197,7 +197,7 @@ def cast_scene(rng, shots, beamlets, beside_chance):
 @pytest.mark.parametrize("stretch", [1, 5])
 def test_sizes_and_plans_hold_for_footprints_that_rays_find(table_4_1, phases, stretch):
     kept = dropped = 0
-    for seed in range(10):
+    for seed in range(4):
         rng = np.random.default_rng((seed, stretch))
         chance = [0.0, 0.3][seed % 2]
         footprints, beside = cast_scene(rng, POINTS, 7, chance)
@@ -227,7 +227,7 @@ def test_sizes_and_plans_hold_for_footprints_that_rays_find(table_4_1, phases, s
         has_beside = made.change[CORE.index("several_returns")].any()
         assert has_beside == (beside is not None)
         kept, dropped = kept + made.kept.sum(), dropped + (~made.kept).sum()
-    assert kept > 100 and dropped > 100
+    assert kept > 30 and dropped > 30
 
 
 def test_a_scene_calls_for_rotation_where_bodies_turn(table_4_1):

@@ -139,7 +139,7 @@ def in_one_bin(parameters, steady=0.0, diffuse=1.0):
 
 
 def test_speckled_beamlets_in_a_bin_are_a_swerling_1_target(table_4_1):
-    parameters, draws = at_snrs(table_4_1, SNRS), 40_000
+    parameters, draws = at_snrs(table_4_1, SNRS), 10_000
     means = evaluate(parameters, SPECKLED, keys=keys(3), draws=draws)
     shots = prepared(parameters)
     swerling = np.exp(-0.5 * (shots.threshold / shots.bin_deviation) ** 2 / (1 + SNRS))
@@ -178,18 +178,18 @@ def test_one_beamlet_fades_alike_in_up_and_down(table_4_1):
     exact = joint_detection(
         powers, np.sqrt(powers[0] * powers[1]), shots.threshold / shots.bin_deviation
     )
-    means = evaluate(parameters, SPECKLED, keys=keys(3), draws=40_000)
+    means = evaluate(parameters, SPECKLED, keys=keys(3), draws=10_000)
     assert (abs(means["pd_shot"] - exact) <= 5 * means["pd_shot_error"] + 1e-6).all()
     alone = means["pd_up"] * means["pd_down"]
     assert (means["pd_shot"] > alone + 10 * means["pd_shot_error"]).all()
 
 
-@pytest.mark.parametrize(("share", "beamlets"), [(0.05, 7), (0.5, 1), (0.99, 1), (0.5, 7)])
+@pytest.mark.parametrize(("share", "beamlets"), [(0.05, 7), (0.99, 1), (0.5, 7)])
 def test_partly_rough_surfaces_are_ricean(share, beamlets, table_4_1):
     parameters = at_snrs(
         table_4_1, [15.0, 60.0], phases="coherent", beam_divergence=5e-6, beamlets=beamlets
     )
-    means = evaluate(with_share(parameters, share), SPECKLED, keys=keys(2), draws=25_000)
+    means = evaluate(with_share(parameters, share), SPECKLED, keys=keys(2), draws=10_000)
     for segment, exact in in_one_bin(parameters, share, 1 - share).items():
         error = means[f"pd_{segment}_error"]
         assert (abs(means[f"pd_{segment}"] - exact) <= 5 * error + 1e-6).all(), segment
@@ -239,7 +239,7 @@ def test_up_and_down_speckles_part_as_depth_and_frequency_make_them(table_4_1):
         between = 1e9 - 2e12 * (2048 / 600e6 - 2 * 2 * 2000.0 / 299792458.0)
         depth = 2000.0 * 50e-6 / 4 / np.tan(grazing_angle)
         exact = joint(parameters, 4 * np.pi * between * depth / 299792458.0)
-        means = evaluate(parameters, SPECKLED, keys=keys(1), draws=12_500)
+        means = evaluate(parameters, SPECKLED, keys=keys(1), draws=5_000)
         assert abs(means["pd_shot"] - exact) <= 5 * means["pd_shot_error"] + 1.5e-3
         gains.append((means["pd_shot"] / (means["pd_up"] * means["pd_down"]))[0])
     assert gains[0] > 1.5 > 1.02 > gains[-1] > 0.98
@@ -262,13 +262,13 @@ def test_what_moves_across_the_beam_turns_speckles_apart_between_segments(table_
     gains = []
     for speed in (0.0, 6.0, 15.0, 100.0):
         moving = parameters | {"target.transverse_velocity": speed}
-        means = evaluate(moving, SPECKLED, keys=keys(1), draws=10_000)
+        means = evaluate(moving, SPECKLED, keys=keys(1), draws=5_000)
         exact = joint(moving, 2 * np.pi * 2 * 500e-6 * 2 * speed * 12.5e-6 / 1550e-9)
         assert abs(means["pd_shot"] - exact) <= 5 * means["pd_shot_error"] + 2e-3
         gains.append((means["pd_shot"] / (means["pd_up"] * means["pd_down"]))[0])
     assert gains[0] > 1.5 > 1.05 > gains[-1]
-    still = evaluate(moving, STILL, keys=keys(1), draws=10_000)
-    at_rest = evaluate(parameters, STILL, keys=keys(1), draws=10_000)
+    still = evaluate(moving, STILL, keys=keys(1), draws=100)
+    at_rest = evaluate(parameters, STILL, keys=keys(1), draws=100)
     np.testing.assert_allclose(still["pd_shot"], at_rest["pd_shot"], rtol=1e-9)
 
 
@@ -288,7 +288,7 @@ def test_turning_adds_to_what_depth_does_or_takes_it_back(radial_velocity, table
     gains = {}
     for sense in (-1, 1):
         moving = parameters | {"target.transverse_velocity": sense * speed}
-        means = evaluate(moving, SPECKLED, keys=keys(1), draws=10_000)
+        means = evaluate(moving, SPECKLED, keys=keys(1), draws=5_000)
         gains[sense] = (means["pd_shot"] / (means["pd_up"] * means["pd_down"]))[0]
     assert gains[-1] > 1.5 > 1.1 > gains[1]
 
