@@ -20,7 +20,7 @@ from sweep.spec import Spec
 REPOSITORY = Path(__file__).parents[2]
 DOCS = REPOSITORY / "docs"
 RUN = [REPOSITORY / "README.md", DOCS / "tutorial.md", *sorted((DOCS / "howto").glob("*.md"))]
-IN_SECONDS = ("README", "read_results", "use_your_own_detector")
+IN_SECONDS = ("README", "read_results", "search_a_band", "use_your_own_detector")
 """Pages that the fast suite runs."""
 
 NEEDED = {"keep_stores_in_a_bucket": "moto.server"}
