@@ -14,7 +14,7 @@ from click.testing import CliRunner
 from drawn_files import shows
 
 from sweep.cli import main
-from sweep.spec import Spec
+from sweep.spec import Spec, load
 from sweep.tasks import driver, progress
 from sweep.tasks.cluster import LITTLE, RunOptions, about_seconds
 from sweep.tasks.lock import Lock
@@ -260,6 +260,24 @@ def test_plan_counts_points_blocks_and_bytes_and_writes_nothing(here):
     assert [path.name for path in here.iterdir()] == ["small.yaml"]
 
 
+HILLS = (
+    STUDY.split("target:")[0]
+    + """\
+scene:
+  origin: ground
+  objects:
+    ground: {kind: hills, size: 1 km, spacing: 20 m, rms_height: 5 m, correlation_length: 100 m,
+             seed: 1, reflectance: 0.1}
+platform:
+  path: {kind: straight, from: [0 m, 0 m, 300 m], to: [0 m, 0 m, 100 m],
+         initial_speed: 80 m/s, final_speed: 20 m/s}
+scanners:
+  corners: {kind: corners, angle: 22.5 deg, rate: 5 Hz}
+  ahead: {kind: cone, beams: 3, half_angle: 10 deg, rate: 5 Hz}
+"""
+)
+
+
 def words_of(text):
     """Words that were printed, without colours."""
     return re.sub(r"\x1b\[[0-9;]*m", "", text).split()
@@ -345,13 +363,14 @@ def test_a_very_large_study_begins_only_after_a_question(here, monkeypatch):
     refused(sweep("run", "small.yaml"), "of one core: say --yes to begin it")
 
 
-def test_no_effect_costs_more_than_its_points(here):
-    from sweep.tasks.grid_study import GridStudy
+@pytest.mark.parametrize("study", ["small.yaml", "hills.yaml"])
+def test_what_is_simulated_has_a_cost_and_costs_no_more_than_its_points(here, study):
     from sweep.tasks.plan import effects_table
+    from sweep.tasks.studies import study_of
 
-    study = GridStudy(Spec.from_mapping(yaml.safe_load(STUDY)))
-    costs = [row.cost for row in effects_table(study).rows]
-    assert max(cost for cost in costs if cost == cost) <= 1
+    (here / "hills.yaml").write_text(HILLS)
+    rows = effects_table(study_of(load(here / study), here / "none.zarr")).rows
+    assert [row.name for row in rows if (0 <= row.cost <= 1) != (row.share > 0)] == []
 
 
 def test_a_plan_prints_nothing_where_the_last_that_it_looks_at_is_beyond_the_model(

@@ -333,7 +333,10 @@ def reached(found: Chart | Table | None) -> list[str]:
     told = []
     if there.size:
         ends = " to ".join(dict.fromkeys(f"{end:.3g}" for end in (there.min(), there.max())))
-        told = [f"{words.capitalize()} with a probability of {PD:g} or more all the way: {ends}."]
+        part = ", of the parts shown here" if any("not shown" in c for c in found.caption) else ""
+        told = [
+            f"{words.capitalize()} with a probability of {PD:g} or more all the way{part}: {ends}."
+        ]
     if lacking := values.size - there.size:
         told.append(
             f"There is no such range at {lacking:,} of {values.size:,} places: detection is less "

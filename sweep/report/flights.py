@@ -363,11 +363,21 @@ def returns(found: Sequence[Seen]) -> Table:
     return Table("What came back", caption, pandas.DataFrame(rows), "returns")
 
 
-def came_back(returned: pandas.DataFrame, groups: Sequence[xr.Dataset]) -> list[str]:
-    """Points and solved velocities in sentences; `returned` as :func:`returns` has it."""
+def came_back(
+    returned: pandas.DataFrame, groups: Sequence[xr.Dataset], fewer: int = 0
+) -> list[str]:
+    """Points and solved velocities in sentences; `returned` as :func:`returns` has it.
+
+    `fewer` is the number of parts of the study that the page leaves out, and `returned` with it.
+    """
     shots, true = (int(returned[name].sum()) for name in ("shots", "true"))
     false = int(returned.iloc[:, 2:].sum(axis=None)) - true
-    told = [f"{shots:,} shots brought back {true:,} true points and {false:,} false ones."]
+    number = len(returned)
+    parts = f"In the {number} of {number + fewer} parts of the study shown here, " if fewer else ""
+    told = [
+        f"{parts}{shots:,} shots brought back {true:,} true points and {false:,} false ones; "
+        "a shot counts once a draw."
+    ]
     status = [group["velocity_status"] for group in groups if "velocity_status" in group]
     if known := sum(int((own >= 0).sum()) for own in status):
         solved = sum(int(((own >= 0) & (own <= EXCLUDED)).sum()) for own in status)

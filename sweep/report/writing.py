@@ -240,7 +240,7 @@ def _scene_page(store: Location, say: Say) -> Page:
              ("scanners", ", ".join(map(labels.coordinate, study.scanners)))]  # fmt: skip
     came_back = flights.returns(seen)
     sections = [
-        _answer(spec, groups, "shots", flights.came_back(came_back.frame, groups)),
+        _answer(spec, groups, "shots", flights.came_back(came_back.frame, groups, fewer)),
         _section("cloud", "Point cloud", [cloud],
                  [] if cloud else ["No shot has brought back a point."]),
         _section("flight", "Along the flight", flight),

@@ -294,8 +294,7 @@ def _instrument_of(reference: object, location: Location, base: Path) -> tuple[i
         return 1, read_document(known[reference])
     is_word = reference.isidentifier() and not os.path.exists(file)
     if "like" in location or (is_word and "file" not in location):
-        remedy = f"the library has {', '.join(known)}"
-        remedy = "; ".join(filter(None, (near_miss(reference, known), remedy)))
+        remedy = near_miss(reference, known, otherwise=f"the library has {', '.join(known)}")
         raise rejected(location, "is no instrument of the library", remedy, reference)
     try:
         return 0, read_document(file)

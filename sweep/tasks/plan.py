@@ -4,27 +4,30 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import compress
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import psutil
 
 from sweep.model.effects.catalogue import EFFECTS, NAMES
+from sweep.model.outputs import SHOTS
 from sweep.storage.atomic_replace import eyepoints_path
 from sweep.storage.locations import Location
 from sweep.tasks import cluster
 from sweep.tasks.eyepoint_study import EyepointStudy
-from sweep.tasks.flight_study import FlightStudy
-from sweep.tasks.grid import TILE_SHOTS, EffectSelection, Value
+from sweep.tasks.flight_study import FlightStudy, Part
+from sweep.tasks.grid import TILE_SHOTS, EffectSelection, Selected, Value
 from sweep.tasks.grid_study import GridStudy, evaluate_points, select, with_few_draws
 from sweep.tasks.studies import study_of
 
 if TYPE_CHECKING:
+    from sweep.model.eyepoints import Eyepoints
     from sweep.spec import SceneSpec, Spec
+    from sweep.tasks.study import Results
 
 #: Time that measuring may take [s], and places of the grid that it looks at.
 MEASURING = 1.0
@@ -117,7 +120,7 @@ def plan(
 
 
 def measured(study: GridStudy) -> float:
-    """Time a point takes on one core [s], measured on points spread over the grid.
+    """Processor time of a point [s], measured on points spread over the grid.
 
     Whole sets of points that share a geometry are taken, so that sharing shows as it will.
     Points that miss an accuracy after few draws are taken to reach their limit.
@@ -126,9 +129,9 @@ def measured(study: GridStudy) -> float:
     blocks = np.unique(np.linspace(0, grid.n_blocks - 1, PLACES).astype(np.int64))
 
     def look(rows: int) -> Round:
-        begun = time.perf_counter()
+        begun = time.process_time()
         found = [_evaluate_some(study, int(block), rows) for block in blocks]
-        taken = time.perf_counter() - begun
+        taken = time.process_time() - begun
         points, left_out = (sum(each) for each in zip(*found, strict=True))
         return Round(points, taken, (taken + left_out,))
 
@@ -149,6 +152,7 @@ def _enough(look: Callable[[int], Round], points: int, seconds: float) -> Round:
     """Compute so much of a study that the time can be measured, or all of it."""
     from numba.core.event import install_recorder
 
+    look(1)  # loads what is compiled, which takes longer than many points
     amount, begun = 1, time.perf_counter()
     while True:  # once at the least, however long this process has been held up
         with install_recorder("numba:compile") as compiled:
@@ -198,16 +202,16 @@ def timed(
     fewer = with_few_draws(spec, most_draws)
     if spec.draws.whole_spectra:
         evaluate_points(with_few_draws(spec, 1), parameters, count, effects)  # makes tables once
-    begun = time.perf_counter()
+    begun = time.process_time()
     found = evaluate_points(fewer, parameters, count, effects)
-    taken = time.perf_counter() - begun
+    taken = time.process_time() - begun
     most, drawn = (max(s.draws.number, s.draws.limit) for s in (spec, fewer))
     if most == drawn:
         return Seconds(taken, 0.0)
     if spec.draws.whole_spectra:  # a point's spectrum without noise costs as much as many draws
-        begun = time.perf_counter()
+        begun = time.process_time()
         evaluate_points(with_few_draws(spec, 1), parameters, count, effects)
-        alone = time.perf_counter() - begun
+        alone = time.process_time() - begun
         each = max(taken - alone, 0.0) / (drawn - 1)
         return Seconds(taken, each * (most - drawn))
     unsettled = float(np.mean(found["accuracy_missed"] > 0)) if spec.draws.adaptive else 1.0
@@ -221,13 +225,13 @@ def _scanner(study: FlightStudy, eyepoints: EyepointStudy) -> ScannerPlan:
     part = blocks.part(0)
 
     def look(tiles: int) -> Round:
-        begun = time.perf_counter()
+        begun = time.process_time()
         numbers = eyepoints.spread(tiles)
         seen = eyepoints.see(numbers)
-        cast = time.perf_counter()
+        cast = time.process_time()
         shots = from_arrays(seen, eyepoints.weight)
         study.look(part, seen, shots, study.select(part, shots, numbers), numbers)
-        looked = time.perf_counter()
+        looked = time.process_time()
         return Round(len(numbers), looked - begun, (cast - begun, looked - cast))
 
     found = _enough(look, eyepoints.points, MEASURING_SCANNER)
@@ -250,8 +254,8 @@ MOST_TILES = 1024
 FLIGHT_TILES, FLIGHT_PLACES = 16, 12
 
 #: Tiles on which an effect's cost is measured, points of each, draws of a point, and rounds, of
-#: which the best counts.
-COST_TILES, COST_POINTS, COST_DRAWS, ROUNDS = 4, 24, 20, 3
+#: which the best counts; in flights scanners and places along the axes, and shots of each.
+COST_TILES, COST_POINTS, COST_DRAWS, ROUNDS, COST_LOOKS = 4, 24, 20, 3, 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -289,10 +293,10 @@ class EffectsTable:
 
 
 def effects_table(study: GridStudy | FlightStudy, *, costs: bool = True) -> EffectsTable:
-    """Effects of a study, by the plans of its tiles, and what they cost, if asked and on a grid."""
+    """Effects of a study, by the plans of its tiles, and what they cost, if asked."""
     if isinstance(study, GridStudy):
         return _of_grid(study, costs)
-    return _of_flight(study)
+    return _of_flight(study, costs)
 
 
 def _of_grid(study: GridStudy, costs: bool) -> EffectsTable:
@@ -320,7 +324,7 @@ def _of_grid(study: GridStudy, costs: bool) -> EffectsTable:
     )
 
 
-def _of_flight(study: FlightStudy) -> EffectsTable:
+def _of_flight(study: FlightStudy, costs: bool) -> EffectsTable:
     from sweep.scenes.eyepoint_arrays import from_arrays
 
     found, times, shots = [], [], 0
@@ -341,13 +345,13 @@ def _of_flight(study: FlightStudy) -> EffectsTable:
     if not found:
         tolerance = float(study.spec.accuracy.tolerance)
         return EffectsTable(rows=(), tolerance=tolerance, error=0.0, looked_at=1.0)
-    time = np.concatenate(times)
+    time, looks = np.concatenate(times), _looks(study) if costs else []
     return _table(
         study.spec,
         _Planned(*(np.concatenate(each, axis=-1) for each in zip(*found, strict=True))),
         points=shots,
         where=lambda some: _times(time[some]),
-        cost=lambda name, some: math.nan,
+        cost=lambda name, some: _flight_cost(study, looks, name),
         looked_at=shots * study.spec.draws.number / study.points,
     )
 
@@ -435,6 +439,71 @@ def _cost(spec: Spec, selection: EffectSelection, tiles: np.ndarray, name: str) 
         spent += max(with_it - without, 0.0)
         total += with_it
     return spent / total
+
+
+class _Look(NamedTuple):
+    """Arguments of :meth:`FlightStudy.look`, of whole cycles of a scanner."""
+
+    part: Part
+    shots: Results
+    eyepoints: Eyepoints
+    selected: Selected
+    numbers: np.ndarray
+
+    def some(self, rows: np.ndarray, *, less: np.uint32) -> _Look:
+        """Select shots, without the effects of some flags."""
+        shots = {name: self.shots[name][rows] for name in SHOTS}
+        flags = self.selected.flags[rows] & ~less
+        selected = Selected(flags, self.selected.error[rows])
+        return _Look(self.part, shots, self.eyepoints.some(rows), selected, self.numbers[rows])
+
+
+def _looks(study: FlightStudy) -> list[_Look]:
+    """Cycles spread over each scanner's flight, at the ends of its axes, with few draws."""
+    from sweep.scenes.eyepoint_arrays import from_arrays
+
+    ends = {tuple(k * (int(axis.size) - 1) for axis in study.spec.axes) for k in (0, 1)}
+    found = []
+    for eyepoints in study.eyepoint_studies():
+        numbers = eyepoints.spread(FLIGHT_TILES)
+        seen = eyepoints.see(numbers)
+        shots = from_arrays(seen, eyepoints.weight)
+        for place in sorted(ends):
+            part = study.scanners[eyepoints.scanner].first_part(place)
+            part = part._replace(draws=range(min(len(part.draws), COST_DRAWS)))
+            selected = study.select(part, shots, numbers)
+            found.append(_Look(part, seen, shots, selected, numbers))
+    return found
+
+
+def _flight_cost(study: FlightStudy, looks: Sequence[_Look], name: str) -> float:
+    """Share of the time of shots that an effect takes, from cycles with it and without."""
+    flag, spent, total = np.uint32(1 << NAMES.index(name)), 0.0, 0.0
+    there = [look for look in looks if (look.selected.flags & flag).any()]
+    for look in _spread(there, COST_LOOKS):
+        each = study.scanners[look.part.scanner].shots_a_cycle
+        having = np.flatnonzero((look.selected.flags & flag).reshape(-1, each).any(axis=1))
+        cycles = np.array(_spread(having, -(-COST_POINTS // each)))
+        rows = (cycles[:, None] * each + np.arange(each)).ravel()
+        with_it, without = (
+            min(_seconds(study, look.some(rows, less=less)) for _ in range(ROUNDS))
+            for less in (np.uint32(0), flag)
+        )
+        spent += max(with_it - without, 0.0)
+        total += with_it
+    return spent / total if total else math.nan
+
+
+def _spread(items: Sequence[Any] | np.ndarray, most: int) -> list[Any]:
+    """Select some items, from the first to the last."""
+    few = np.linspace(0, len(items) - 1, min(most, len(items))).astype(int)
+    return [items[k] for k in few]
+
+
+def _seconds(study: FlightStudy, look: _Look) -> float:
+    begun = time.process_time()
+    study.look(*look)
+    return time.process_time() - begun
 
 
 def _numbers(selection: EffectSelection, tile: int, most: int | None = None) -> np.ndarray:

@@ -143,7 +143,9 @@ def _name(axis: Axis, start: int, stop: int) -> str:
 
 
 def _shown(value: object) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+    if not isinstance(value, float):
+        return str(value)
+    return f"{value:.0f}" if 1e4 <= abs(value) < 1e6 else f"{value:.4g}"
 
 
 def done_blocks(store: Location, study: Study) -> np.ndarray:

@@ -131,7 +131,11 @@ def _imported(name: str) -> Callable[..., Any]:
     except ImportError as error:
         raise CodeError(f"{name}: its module can't be imported: {error}") from error
     except AttributeError:
-        raise CodeError(f"{name}: the module has nothing called {attribute}") from None
+        where = getattr(sys.modules[module], "__file__", None) or module
+        raise CodeError(
+            f"{name}: the module has nothing called {attribute}; define it in {where}, or name "
+            "another function in the spec"
+        ) from None
     if not callable(function):
         raise CodeError(f"{name} is a {type(function).__name__}, and no function")
     found: Callable[..., Any] = function

@@ -20,7 +20,7 @@ from sweep.spec import Spec
 REPOSITORY = Path(__file__).parents[2]
 DOCS = REPOSITORY / "docs"
 RUN = [REPOSITORY / "README.md", DOCS / "tutorial.md", *sorted((DOCS / "howto").glob("*.md"))]
-IN_SECONDS = ("README", "read_results")
+IN_SECONDS = ("README", "read_results", "search_a_band")
 """Pages that the fast suite runs."""
 
 NEEDED = {"keep_stores_in_a_bucket": "moto.server"}
@@ -28,6 +28,9 @@ NEEDED = {"keep_stores_in_a_bucket": "moto.server"}
 
 SETS_UP = "make "
 """Beginning of a block that sets up a copy of the repository: not run by a test in that copy."""
+
+MAKES_A_FILE = ("import trimesh\n", "import numpy as np\n\ntime")
+"""Beginnings of blocks that make what a spec reads."""
 
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.S | re.M)
 
@@ -65,7 +68,7 @@ def test_blocks_are_of_kinds_that_can_be_run_and_specs_are_right(page, here):
     assert {language for language, _ in found} <= {"yaml", "sh", "python", "text"}
     assert {"sh", "python"} & {language for language, _ in found}
     for language, text in found:
-        if language == "python" and text.startswith("import trimesh"):  # makes a file
+        if language == "python" and text.startswith(MAKES_A_FILE):
             exec(compile(text, page.name, "exec"), {})
         elif language == "yaml":
             assert sweep.load(save(text)).title
@@ -130,9 +133,22 @@ def test_the_axes_that_the_page_on_specs_shows_can_be_written():
 
 def test_every_question_on_the_first_page_leads_to_one_page():
     page = (DOCS / "index.md").read_text(encoding="utf-8").partition("## Ten questions")[2]
-    rows = re.findall(r"^\| (.*\?.*) \| \[[^]]+\]\(([^)#]+\.md)(?:#[-\w]+)?\) \|$", page, re.M)
+    rows = re.findall(r"^\| .*\?.* \| \[[^]]+\]\(([^)#]+\.md)(?:#([-\w]+))?\) \|$", page, re.M)
     assert len(rows) == 10
-    assert [link for _, link in rows if not (DOCS / link).exists()] == []
+    for link, part in rows:
+        headings = re.findall(r"^#+ (.*)$", (DOCS / link).read_text(encoding="utf-8"), re.M)
+        assert not part or part in {h.lower().replace(" ", "-") for h in headings}, part
+
+
+def test_every_page_is_two_clicks_or_fewer_from_the_first():
+    def links(name):
+        found = re.findall(r"\]\(([^)#\s:]+\.md)", (DOCS / name).read_text(encoding="utf-8"))
+        return {os.path.normpath(Path(name).parent / link) for link in found}
+
+    first = links("index.md")
+    second = first.union(*(links(name) for name in first if (DOCS / name).exists()))
+    pages = {str(page.relative_to(DOCS)) for page in DOCS.rglob("*.md")} - {"index.md"}
+    assert pages - second == set()
 
 
 @pytest.mark.parametrize(

@@ -50,14 +50,15 @@ def _grid(parameters, methods=None):
 
 
 @pytest.mark.parametrize(
-    ("kind", "record"),
+    "way",
     every(2, [
         ("peak_bin", "real"), ("jacobsen", "real"), ("jacobsen", "complex"), ("centroid", "real"),
         ("maximum_likelihood", "real"),
     ]),
 )  # fmt: skip
-def test_an_estimators_bias_and_scatter_are_those_of_a_grid(table_4_1, kind, record):
+def test_an_estimators_bias_and_scatter_are_those_of_a_grid(table_4_1, way):
     """The same shot, seen in other draws: 5 sigma of means and of root mean squares."""
+    kind, record = way
     changes = {ESTIMATOR + "kind": kind, RECORD: record}
     parameters = _given(table_4_1, power=1.0, **changes)
     got, grid = _flown(parameters), _grid(parameters)
@@ -73,13 +74,14 @@ def test_an_estimators_bias_and_scatter_are_those_of_a_grid(table_4_1, kind, rec
 
 
 @pytest.mark.parametrize(
-    ("kind", "record"),
+    "way",
     every(2, [
         ("fixed", "real"), ("ca_cfar", "real"), ("ca_cfar", "complex"), ("os_cfar", "real"),
         ("goca_cfar", "real"), ("fixed", "complex"),
     ]),
 )  # fmt: skip
-def test_a_detector_detects_as_often_as_in_a_grid(table_4_1, kind, record):
+def test_a_detector_detects_as_often_as_in_a_grid(table_4_1, way):
+    kind, record = way
     chosen = {DETECTOR + "kind": kind, DETECTOR + "pfa": 1e-4, RECORD: record}
     parameters = _given(table_4_1, tnr=6.0, power=1e-2, **chosen)
     got, grid = _flown(parameters), _grid(parameters)

@@ -8,6 +8,7 @@ import subprocess
 import sys
 
 import numpy as np
+import pandas
 import pytest
 import yaml
 from click.testing import CliRunner
@@ -171,9 +172,17 @@ def test_a_flight_s_page_opens_with_its_points_and_velocities(scene_page, scene_
     told = _answer(scene_page)
     assert told[1] == (
         f"{shots:,} shots brought back {true:,} true points and {int((flags > 0).sum()) - true:,} "
-        "false ones."
+        "false ones; a shot counts once a draw."
     )
     assert told[2].startswith(f"Velocity was solved in {int((status <= 1).sum())} of {status.size}")
+
+
+def test_an_answer_from_the_parts_that_a_page_shows_says_so():
+    counts = pandas.DataFrame([{"what": "four", "shots": 20, "true": 18, "false alarm": 1}] * 2)
+    assert flights.came_back(counts, [], 3) == [
+        "In the 2 of 5 parts of the study shown here, 40 shots brought back 36 true points and 2 "
+        "false ones; a shot counts once a draw."
+    ]
 
 
 def test_errors_of_a_flight_are_measured_less_true(scene_store):
