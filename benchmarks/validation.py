@@ -121,7 +121,7 @@ def alarms(name, number):
     rows = [
         [e.row, e.column, f"{e.reference.closed_form:.3e}", f"{e.mean:.3e}", f"{e.printed:.3e}",
          f"{100 * (e.printed / e.mean - 1):+.1f} %", f"{100 * e.excess(e.printed):.2f} %",
-         f"{e.leakage.shot_median:.1e}, {e.leakage.shot_mean:.1e}"]
+         f"{e.leakage.shot[1]:.1e}, {e.leakage.shot[0]:.1e}"]
         for e in found
     ]  # fmt: skip
     columns = ("setting", "cut", "closed form", "ours", "printed", "printed over ours",

@@ -7,10 +7,10 @@ Arrays of any size are reduced to as many cells as a picture or a page can hold,
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from fractions import Fraction
 from itertools import pairwise, product
+from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any
 
 import dask
@@ -354,21 +354,6 @@ def beyond(found: Points, spec: Spec, distance: str, *, included: bool = False) 
     return found.at(found.dim_of(member.name), ranges >= least if included else ranges > least)
 
 
-def bands(spec: Spec, along: str, values: np.ndarray) -> list[tuple[str, np.ndarray]]:
-    """Decades of range, or bands of angle, that hold any of the values: name and mask of each."""
-    member = spec.member(along)
-    angle = member.path == GRAZING_ANGLE
-    si = np.asarray(member.values, float)[_position(member, values)]
-    si = np.rad2deg(si) if angle else si
-    unit = "deg" if angle else "m"
-    limits = [0.0, 15.0, 30.0, 60.0, 90.0] if angle else [10.0**k for k in range(-1, 8)]
-    masks = [
-        (f"{a:g}-{b:g} {unit}", (si > a * (1 + 1e-12)) & (si <= b * (1 + 1e-12)))
-        for a, b in pairwise(limits)
-    ]
-    return [(name, mask) for name, mask in masks if mask.any()]
-
-
 def _position(member: Member, values: np.ndarray) -> np.ndarray:
     """Index along an axis of each value of its coordinate."""
     order = np.argsort(member.display, kind="stable")
@@ -382,17 +367,7 @@ def si_value(member: Member, value: object) -> float | int | str:
     return member.values[_position(member, np.array([value]))[0]].item()
 
 
-# Means, extremes and medians of any number of values, which are read piece by piece. All are exact,
-# rounded once: a mean comes from integer sums, a median from its digits, the leading ones first.
-
-DIGIT = 13
-"""Bits of a value that a reading finds."""
-
-_WORD = 64
-_LEAST_EXPONENT = -1073
-"""Of the smallest float, as `numpy.frexp` gives it."""
-
-_MANTISSA, _LOW = 53, 26
+# Means, extremes and medians of any number of values, which are read piece by piece.
 
 
 def pieces(
@@ -420,41 +395,28 @@ def pieces(
             yield number, part, dict(values)
 
 
+@dataclass
 class Tally:
-    """Number, exact mean and extremes of the finite values that were added."""
+    """Number, sum and extremes of the finite values that were added."""
 
-    def __init__(self) -> None:
-        self.number = 0
-        self.least, self.largest = math.inf, -math.inf
-        self._sum = 0  # in units of 2^(_LEAST_EXPONENT - _MANTISSA)
+    number: int = 0
+    total: float = 0.0
+    least: float = math.inf
+    largest: float = -math.inf
 
     def add(self, values: np.ndarray) -> None:
         """Add values (n,), which numbers of nan and infinity are none of."""
         values = values[np.isfinite(values)]
-        if not values.size:
-            return
-        self.number += values.size
-        self.least = min(self.least, float(values.min()))
-        self.largest = max(self.largest, float(values.max()))
-        mantissa, exponent = np.frexp(values)
-        high = np.floor(np.ldexp(mantissa, _MANTISSA - _LOW))
-        low = np.ldexp(mantissa, _MANTISSA) - np.ldexp(high, _LOW)
-        bins = exponent - _LEAST_EXPONENT
-        # of 2^26 values or fewer these are integers below 2^53, exact as floats
-        sums = np.bincount(bins, weights=high), np.bincount(bins, weights=low)
-        for shift in np.flatnonzero(np.bincount(bins)).tolist():
-            whole = (int(sums[0][shift]) << _LOW) + int(sums[1][shift])
-            self._sum += whole << shift
-
-    @property
-    def total(self) -> Fraction:
-        """Their sum."""
-        return Fraction(self._sum, 1 << (_MANTISSA - _LEAST_EXPONENT))
+        if values.size:
+            self.number += values.size
+            self.total += float(values.sum())
+            self.least = min(self.least, float(values.min()))
+            self.largest = max(self.largest, float(values.max()))
 
     @property
     def mean(self) -> float:
         """Their mean; nan where there is none."""
-        return float(self.total / self.number) if self.number else math.nan
+        return self.total / self.number if self.number else math.nan
 
 
 def tallied(groups: Sequence[Points], variable: str) -> list[Tally]:
@@ -465,99 +427,14 @@ def tallied(groups: Sequence[Points], variable: str) -> list[Tally]:
     return tallies
 
 
-class Search:
-    """The values at which those up to them come to some cumulated weights.
-
-    Floats are in the order of their bits. A reading adds up the weights of those values that
-    begin with the bits that are known, by their next bits.
-    """
-
-    def __init__(self, weights: Sequence[float]) -> None:
-        self._found = [(0, float(weight)) for weight in weights]
-        self._left = _WORD
-        self._sums: dict[int, np.ndarray] = {}
-
-    @property
-    def ended(self) -> bool:
-        """Tell whether all bits are known."""
-        return not self._left or not self._found
-
-    def add(self, values: np.ndarray, weights: np.ndarray | None = None) -> None:
-        """Add values (n,) of a reading, each of weight one where none are given."""
-        keys = _ordered(values)
-        step = min(DIGIT, self._left)
-        for prefix in {prefix for prefix, _ in self._found}:
-            begin = slice(None) if self._left == _WORD else keys >> self._left == prefix
-            digits = (keys[begin] >> (self._left - step)) & ((1 << step) - 1)
-            own = None if weights is None else weights[begin]
-            sums = np.bincount(digits.astype(np.int64), own, minlength=1 << step)
-            self._sums[prefix] = self._sums.get(prefix, 0) + sums
-
-    def end_reading(self) -> None:
-        """All values have been added: know the next bits."""
-        step = min(DIGIT, self._left)
-        found = []
-        for prefix, weight in self._found:
-            sums = self._sums[prefix]
-            cumulated = np.cumsum(sums)
-            # the last bin with any weight where rounding leaves the sum a little short
-            digit = min(int(np.searchsorted(cumulated, weight)), int(np.flatnonzero(sums)[-1]))
-            found.append(((prefix << step) + digit, weight - float(cumulated[digit] - sums[digit])))
-        self._found, self._sums, self._left = found, {}, self._left - step
-
-    @property
-    def values(self) -> list[float]:
-        """The values."""
-        return [_value(key) for key, _ in self._found]
-
-
-def _ordered(values: np.ndarray) -> np.ndarray:
-    """Unsigned integers in the order of floats; -0 as 0."""
-    bits = (np.asarray(values, float) + 0.0).view(np.uint64)
-    negative = bits >> np.uint64(_WORD - 1) == 1
-    return np.where(negative, ~bits, bits | np.uint64(1 << (_WORD - 1)))
-
-
-def _value(key: int) -> float:
-    """Return the float of a key."""
-    top = 1 << (_WORD - 1)
-    bits = key ^ top if key & top else ~key & ((1 << _WORD) - 1)
-    return float(np.uint64(bits).view(np.float64))
-
-
-def search(
-    searches: Sequence[Search],
-    read: Callable[[], Iterable[tuple[Search, np.ndarray, np.ndarray | None]]],
-) -> None:
-    """Go through all values as often as it takes; `read` tells of each piece whose it is."""
-    while not all(one.ended for one in searches):
-        for one, values, weights in read():
-            if not one.ended:
-                one.add(values, weights)
-        for one in searches:
-            if not one.ended:
-                one.end_reading()
-
-
-def for_median(number: int) -> Search:
-    """Return the search for the median of so many values."""
-    return Search([(number + 1) // 2, number // 2 + 1] if number else [])
-
-
-def median(found: Search) -> float:
-    """Return the median that a search for it has found; nan where there are no values."""
-    low, high = found.values or (math.nan, math.nan)
-    return (low + high) / 2
-
-
 def medians(groups: Sequence[Points], variable: str, numbers: Sequence[int]) -> list[float]:
-    """Median of a variable over the points of each group, of which so many are finite."""
-    searches = [for_median(number) for number in numbers]
-
-    def read() -> Iterator[tuple[Search, np.ndarray, None]]:
+    """Median of a variable over the points of each group, of which so many are finite; else nan."""
+    with TemporaryFile() as file:  # which holds the values, as memory may not
+        room = np.memmap(file, float, "w+", shape=(sum(numbers) + 1,)).view(np.ndarray)
+        found = np.split(room, np.cumsum(numbers))[:-1]
+        filled = [0] * len(found)
         for number, _, values in pieces(groups, [variable]):
-            own = values[variable]
-            yield searches[number], own[np.isfinite(own)], None
-
-    search(searches, read)
-    return [median(found) for found in searches]
+            own = values[variable][np.isfinite(values[variable])]
+            found[number][filled[number] : filled[number] + own.size] = own
+            filled[number] += own.size
+        return [float(np.median(v, overwrite_input=True)) if v.size else math.nan for v in found]

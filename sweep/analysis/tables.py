@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from fractions import Fraction
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,21 +13,16 @@ import numpy as np
 import xarray as xr
 
 from sweep.analysis import labels, noise_only
+from sweep.analysis.answers.probability import of_a_shot
 from sweep.analysis.selection import (
     NEAREST,
     Points,
-    Search,
     Tally,
-    bands,
     beyond,
     confined,
     cuts,
-    for_median,
-    median,
     medians,
     parameters_at,
-    pieces,
-    search,
     si_value,
     split,
     tallied,
@@ -202,122 +196,29 @@ def outputs_page(dataset: xr.Dataset) -> Page:
     return Page(str(dataset.attrs.get("title", "")), [block], [], records)
 
 
-VARIABLES = ["pfa_segment", "pfa_both_chirps", "p_leakage_up", "p_leakage_down"]
-
-HELD = 0.9
-"""Share of all leakage whose points are told."""
-
 MOST_ROWS = 100
 
 
 @dataclass(frozen=True)
 class Leakage:
-    """Origin of the leakage in a cut."""
+    """Mean and median of the leakage in a cut: of each chirp, and of a shot's alarms with it."""
 
-    mean: tuple[float, float]
-    median: tuple[float, float]
-    shot_mean: float
-    shot_median: float
-    holders: int
-    holders_from: float
-    holders_to: float
-    shares: dict[str, float]
+    up: tuple[float, float]
+    down: tuple[float, float]
+    shot: tuple[float, float]
 
 
-Values = dict[str, np.ndarray]
-"""Leakage of points, (n,) each: up, down, both together (total), of the shot; place along."""
-
-
-class _Account:
-    """Tallies of a group, made reading by reading."""
-
-    def __init__(self) -> None:
-        self.of = {name: Tally() for name in ("up", "down", "shot", "total")}
-        self.bands: dict[str, Tally] = {}
-        self.above, self.span = Tally(), Tally()
-
-    def add(self, values: Values, spec: Spec, along: str) -> None:
-        """Tally a piece, in all and by bands of the coordinate."""
-        for name, tally in self.of.items():
-            tally.add(values[name])
-        for name, mask in bands(spec, along, values["along"]) if along else []:
-            self.bands.setdefault(name, Tally()).add(values["total"][mask])
-
-    def begin_search(self) -> None:
-        """Look for medians, and for the least of the values that hold most of the sum."""
-        number, sum_of_all = self.of["total"].number, float(self.of["total"].total)
-        self.medians = {name: for_median(number) for name in ("up", "down", "shot")}
-        self.least = Search([HELD * sum_of_all] if sum_of_all > 0 else [])
-
-    def searched(self, values: Values) -> Iterator[tuple[Search, np.ndarray, np.ndarray | None]]:
-        """Values for the searches."""
-        for name, one in self.medians.items():
-            yield one, values[name], None
-        yield self.least, -values["total"], values["total"]  # the largest first
-
-    def hold(self, values: Values) -> None:
-        """Tally the points that hold most."""
-        for least in self.least.values:
-            self.above.add(values["total"][values["total"] > -least])
-            self.span.add(values["along"][values["total"] >= -least])
-
-    def result(self, names: Sequence[str]) -> Leakage:
-        """All of it; bands in the order of their names."""
-        middle = {name: median(one) for name, one in self.medians.items()}
-        total, holders = self.of["total"].total, self.above.number
-        for least in self.least.values:
-            lacking = Fraction(HELD).limit_denominator(100) * total - self.above.total
-            holders += max(1, math.ceil(lacking / -Fraction(least)))
-        known = self.span.number > 0
-        return Leakage(
-            mean=(self.of["up"].mean, self.of["down"].mean),
-            median=(middle["up"], middle["down"]),
-            shot_mean=self.of["shot"].mean,
-            shot_median=middle["shot"],
-            holders=holders,
-            holders_from=self.span.least if known else math.nan,
-            holders_to=self.span.largest if known else math.nan,
-            shares={
-                name: float(self.bands[name].total / total)
-                for name in names
-                if name in self.bands and total > 0
-            },
-        )
-
-
-def leakage(groups: Sequence[tuple[Points, str]], spec: Spec) -> list[Leakage]:
-    """Mean, median and origin of the leakage of points, and of noise or leakage in both chirps."""
-    accounts = [_Account() for _ in groups]
-    for number, values in _read(groups):
-        accounts[number].add(values, spec, groups[number][1])
-    for account in accounts:
-        account.begin_search()
-    search(
-        [one for account in accounts for one in (*account.medians.values(), account.least)],
-        lambda: (own for number, values in _read(groups)
-                 for own in accounts[number].searched(values)),
-    )  # fmt: skip
-    for number, values in _read(groups):
-        accounts[number].hold(values)
-    names = [
-        [name for name, _ in bands(spec, along, found.values(along))] if along else []
-        for found, along in groups
-    ]
-    return [account.result(own) for account, own in zip(accounts, names, strict=True)]
-
-
-def _read(groups: Sequence[tuple[Points, str]]) -> Iterator[tuple[int, Values]]:
-    """Points of each group whose leakage is known, piece by piece."""
-    for number, part, values in pieces([found for found, _ in groups], VARIABLES):
-        along = groups[number][1]
-        up, down = values["p_leakage_up"], values["p_leakage_down"]
-        shot = noise_only.shot_with_leakage(
-            values["pfa_segment"], values["pfa_both_chirps"], up, down
-        )
-        where = part.spread(along) if along else np.zeros(part.size)
-        every = {"up": up, "down": down, "shot": shot, "total": up + down, "along": where}
-        known = np.isfinite(every["total"])
-        yield number, {name: own[known] for name, own in every.items()}
+def leakage(groups: Sequence[Points]) -> list[Leakage]:
+    """Mean and median of the leakage of points, and of noise or leakage in both chirps."""
+    dataset = groups[0].dataset
+    with_shot = dataset.assign(shot=of_a_shot(dataset, leakage=True))
+    groups = [replace(group, dataset=with_shot) for group in groups]
+    found = []
+    for name in ("p_leakage_up", "p_leakage_down", "shot"):
+        tallies = tallied(groups, name)
+        middles = medians(groups, name, [tally.number for tally in tallies])
+        found.append([(t.mean, m) for t, m in zip(tallies, middles, strict=True)])
+    return [Leakage(*each) for each in zip(*found, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -337,8 +238,6 @@ class Entry:
 
     row: str
     column: str
-    along: str
-    units: str
     points: int
     reference: Reference
     mean: float
@@ -392,11 +291,10 @@ def entries(
         (beyond(cut.of(part), spec, NEAREST), cut) for _, _, part in settled for cut in cuts(spec)
     ]
     means = [tally.mean for tally in tallied([points for points, _ in groups], "pfa_both_chirps")]
-    leaked = leakage([(points, cut.along) for points, cut in groups], spec)
+    leaked = leakage([points for points, _ in groups])
     return [
         Entry(
-            settled[i][0], cut.name, cut.along, points.units(cut.along) if cut.along else "",
-            points.size, alone[i], mean,
+            settled[i][0], cut.name, points.size, alone[i], mean,
             float(printed[i][j]) if i < len(printed) and j < len(printed[i]) else math.nan, leak,
         )
         for (i, j), (points, cut), mean, leak in zip(places, groups, means, leaked, strict=True)
@@ -441,7 +339,6 @@ def false_alarm_page(found: Points, spec: Spec, *, by: str, printed: Any = (), t
         _block(
             "Leakage: extra groups raised by the signal's own sidelobes", _LEAKAGE, records
         ),
-        *_origin_blocks(every),
     ]  # fmt: skip
     bins = ", ".join(labels.number(n) for n in sorted({entry.reference.bins for entry in every}))
     notes = [
@@ -503,28 +400,6 @@ def _written(value: Cell, form: str) -> Cell:
     return format(value, form) if value == value else "-"
 
 
-def _origin_blocks(found: list[Entry]) -> list[Block]:
-    """Origin of leakage: a table for each set of bands."""
-    blocks = []
-    for names in dict.fromkeys(tuple(e.leakage.shares) for e in found if e.leakage.shares):
-        own = [e for e in found if tuple(e.leakage.shares) == names]
-        rows = [
-            (
-                e.row, e.column, f"{e.leakage.holders:,} of {e.points:,}",
-                f"{e.leakage.holders_from:g}..{e.leakage.holders_to:g} {e.units}",
-                *(percent(share, ".1f") for share in e.leakage.shares.values()),
-            )
-            for e in own
-        ]  # fmt: skip
-        heading = (
-            f"Where leakage comes from: points that hold {HELD:.0%} of it, and its share in bands "
-            f"of {labels.coordinate(own[0].along)}"
-        )
-        columns = ("setting", "cut", "points", "between", *names)
-        blocks.append(Block(heading, columns, rows))
-    return blocks
-
-
 def _record(e: Entry) -> dict[str, Cell]:
     """One line of the CSV file."""
     return {
@@ -540,15 +415,10 @@ def _record(e: Entry) -> dict[str, Cell]:
         "printed": e.printed,
         "printed_over_closed_form": e.printed / e.reference.closed_form,
         "printed_variance_excess": e.excess(e.printed),
-        "p_leakage_up_mean": e.leakage.mean[0],
-        "p_leakage_up_median": e.leakage.median[0],
-        "p_leakage_down_mean": e.leakage.mean[1],
-        "p_leakage_down_median": e.leakage.median[1],
-        "shot_with_leakage_mean": e.leakage.shot_mean,
-        "shot_with_leakage_median": e.leakage.shot_median,
-        "leakage_holders": e.leakage.holders,
-        "leakage_along": e.along,
-        "leakage_from": e.leakage.holders_from,
-        "leakage_to": e.leakage.holders_to,
-        "leakage_shares": "; ".join(f"{k}: {v:.4f}" for k, v in e.leakage.shares.items()),
+        "p_leakage_up_mean": e.leakage.up[0],
+        "p_leakage_up_median": e.leakage.up[1],
+        "p_leakage_down_mean": e.leakage.down[0],
+        "p_leakage_down_median": e.leakage.down[1],
+        "shot_with_leakage_mean": e.leakage.shot[0],
+        "shot_with_leakage_median": e.leakage.shot[1],
     }
