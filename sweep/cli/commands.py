@@ -389,17 +389,16 @@ def export(
 
 @main.command()
 @click.argument("directory", type=LocalPath(file_okay=False))
-@click.option("--days", type=click.IntRange(min=1), default=365, help="How long they hold [365].")
-def certificates(directory: Path, days: int) -> None:
+def certificates(directory: Path) -> None:
     """Make certificates for a cluster in DIRECTORY: ca.pem, certificate.pem and key.pem.
 
     Put the output into the cluster's file: scheduler, workers and client then talk TLS, and refuse
     whoever has no such certificate. Keep the directory to yourself, where all machines of the
-    cluster see it.
+    cluster see it. They hold for a year.
     """
     from sweep.tasks.clusters.machines import make_certificates
 
-    files = make_certificates(directory.absolute(), days)
+    files = make_certificates(directory.absolute())
     click.echo("security:")
     for name, file in files._asdict().items():
         click.echo(f"  {name}: {file}")

@@ -161,7 +161,7 @@ def free_port() -> int:
 
 
 def test_a_study_in_pods_with_tls_leaves_nothing_behind(tmp_path, undisturbed, monkeypatch):
-    files = machines.make_certificates(tmp_path / "tls", 1)
+    files = machines.make_certificates(tmp_path / "tls")
     monkeypatch.setattr(kubernetes, "PORT", free_port())
     monkeypatch.setattr(kubernetes, "host", lambda _: "127.0.0.1")
     mapping = {

@@ -95,7 +95,7 @@ def server(directory: Path):
 
 
 def test_a_study_over_ssh_with_tls(tmp_path, undisturbed):
-    files = machines.make_certificates(tmp_path / "tls", 1)
+    files = machines.make_certificates(tmp_path / "tls")
     with server(tmp_path) as (port, commands):
         cluster = {
             **SSH, "port": port, "user": "lidar", "identity": str(tmp_path / "user"),
