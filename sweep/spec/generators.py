@@ -42,43 +42,10 @@ class Progression:
         return Progression(self.start * factor + offset, self.increment * factor, self.number)
 
     def values(self) -> np.ndarray:
-        """Floats (number,), each the nearest to its exact value.
-
-        Both terms are whole multiples of their greatest common divisor, so that the values are
-        whole numbers times one exact ratio, which a two-part product rounds once.
-        """
-        common = _common_divisor(self.start, self.increment)
-        first, step = int(self.start / common), int(self.increment / common)
-        if max(abs(first), abs(first + step * (self.number - 1))) < 2**53:
-            multiples = np.arange(self.number, dtype=np.int64) * step + first
-            return _times(multiples.astype(np.float64), common)
-        start, increment = float(self.start), float(self.increment)
-        return start + increment * np.arange(self.number, dtype=np.float64)
-
-
-def _common_divisor(a: Fraction, b: Fraction) -> Fraction:
-    """Largest fraction of which both are whole multiples; 1 for two zeros."""
-    divisor = math.gcd(a.numerator * b.denominator, b.numerator * a.denominator)
-    return Fraction(divisor, a.denominator * b.denominator) if divisor else Fraction(1)
-
-
-def _times(values: np.ndarray, ratio: Fraction) -> np.ndarray:
-    """Product of floats (n,) with an exact ratio, rounded once (Dekker's two-part product)."""
-    if ratio.numerator == 1 and ratio.denominator < 2**53:
-        return values / ratio.denominator
-    high = float(ratio)
-    low = float(ratio - Fraction(high))
-    product = values * high
-    if low == 0.0 or abs(high) > 1e200 or not np.all(np.abs(values) < 1e100):
-        return product
-    splitter = 134217729.0  # 2**27 + 1 halves a 53-bit significand
-    a = values * splitter
-    a_high = a - (a - values)
-    a_low = values - a_high
-    b_high = high * splitter - (high * splitter - high)
-    b_low = high - b_high
-    error = ((a_high * b_high - product) + a_high * b_low + a_low * b_high) + a_low * b_low
-    return product + (error + values * low)
+        """Floats (number,), each the nearest to its exact value: quotients of whole numbers."""
+        common = math.lcm(self.start.denominator, self.increment.denominator)
+        first, step = int(self.start * common), int(self.increment * common)
+        return np.array([(first + step * i) / common for i in range(self.number)])
 
 
 def _rounded(values: np.ndarray) -> np.ndarray:
@@ -100,7 +67,11 @@ def values_in(unit: Unit, si: np.ndarray) -> np.ndarray:
     """SI values (n,) in the given unit, to 15 significant digits."""
     if unit.decibel:
         return _rounded(10.0 * np.log10(si))
-    return _rounded(_times(si - float(unit.offset) if unit.offset else si, 1 / unit.factor))
+    if (unit.factor, unit.offset) == (1, 0):
+        return _rounded(si)
+    (p, q), (a, b) = unit.offset.as_integer_ratio(), unit.factor.as_integer_ratio()
+    ratios = (value.as_integer_ratio() for value in si.tolist())
+    return _rounded(np.array([(n * q - p * d) * b / (d * q * a) for n, d in ratios]))
 
 
 # Written values
