@@ -549,9 +549,8 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
     p, size, ground : mapping, int, Ground
         Of :func:`categories`; points n; what their beams meet.
     """
-    architecture = str(p[RECEIVER + "architecture"])
+    architecture, in_quadrature = str(p[RECEIVER + "architecture"]), str(p[RECORD]) == "complex"
     echo_scale, current_scale = link_scales(architecture, p)
-    in_quadrature = str(p[RECORD]) == "complex"
     noise = link.receiver_noise(architecture, link.receiver_values(p, RECEIVER), in_quadrature)
     row, offset, doppler, echo = ground.axis(size)
     everywhere, accuracy, looks = np.zeros(size), Accuracy.of(p), Looks.of(p)
