@@ -68,7 +68,7 @@ def values_in(unit: Unit, si: np.ndarray) -> np.ndarray:
     if unit.decibel:
         return _rounded(10.0 * np.log10(si))
     if (unit.factor, unit.offset) == (1, 0):
-        return _rounded(si)
+        return _rounded(si.astype(float))
     (p, q), (a, b) = unit.offset.as_integer_ratio(), unit.factor.as_integer_ratio()
     ratios = (value.as_integer_ratio() for value in si.tolist())
     return _rounded(np.array([(n * q - p * d) * b / (d * q * a) for n, d in ratios]))
