@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 import sys
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
@@ -36,14 +37,20 @@ def instrument_lines(own: Mapping[str, Any]) -> Iterator[str]:
     """Yield what the file of an instrument of the library says."""
     import yaml
 
-    yield own["title"]
-    yield own["source"] + (f", https://doi.org/{own['doi']}" if own["doi"] else "")
+    def folded(text: str) -> str:
+        width = shutil.get_terminal_size().columns if sys.stdout.isatty() else 1 << 16
+        return click.wrap_text(text, width, subsequent_indent="  ")
+
+    yield folded(own["title"])
+    yield folded(own["source"] + (f", https://doi.org/{own['doi']}" if own["doi"] else ""))
     for what in ("published", "assumed"):
         yield f"\n{what}:"
-        yield from (f"- {each}" for each in own[what] or ["nothing"])
+        yield from (folded(f"- {each}") for each in own[what] or ["nothing"])
     yield "\nmust reproduce (docs/instruments.md has what is simulated):"
     for number in own["numbers"].values():
-        yield f"- {number['about']}: {number['published']} {number['unit']}".rstrip()
+        words = isinstance(number["published"], str)  # which have their unit
+        unit = "" if words else f" {number['unit']}"
+        yield folded(f"- {number['about']}: {number['published']}{unit}".rstrip())
     yield "\n" + yaml.safe_dump({"instrument": own["instrument"]}, sort_keys=False).rstrip()
 
 
