@@ -233,7 +233,7 @@ def test_a_plan_measures_what_draws_take(monkeypatch):
         ticks[0] += count * (10 + spec.draws.number)
         return {}
 
-    clock = SimpleNamespace(perf_counter=lambda: ticks[0])
+    clock = SimpleNamespace(perf_counter=lambda: ticks[0], process_time=lambda: ticks[0])
     monkeypatch.setattr(planned, "evaluate_points", evaluated)
     monkeypatch.setattr(planned, "time", clock)
     few, many = (study() for _ in range(2))
