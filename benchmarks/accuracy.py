@@ -87,7 +87,8 @@ slows all of them alike. A very short study has up to 27 rounds. The cost of a p
 neighbours, because they share intermediate results. Times are therefore measured on some thousands
 of points of a block, around points of the sample. They are processor times. The best round counts
 for them. Ratios are medians of those within each round, or of the best if there are but two.
-Planning counts with the points planned. Storing does not count, as all settings share it.
+Planning counts with the points planned. Storing does not count, as all settings share it; the page
+gives the processor time for making the store and writing its blocks separately.
 
 The **error** of a setting is the quantity that a tolerance bounds: the largest difference from the
 reference over all points. It covers the probabilities of detection of the segments and the shot,
@@ -104,13 +105,16 @@ the error in pd that 90 % and half of the points stay below.
 
 **The thesis's way** ([T] 3.3.1) puts each beamlet's line into the nearest cell of a grid with 16
 cells a bin. It convolves the grid with the window's transform by a complex FFT of 2^11 or 2^12, and
-samples the result at the bins.
+samples the result at the bins. Three improvements are measured as well:
 
-Both sizes are compiled and transform many spectra at once (`sweep/tasks/accuracy/bench.py`). They
-compute neither leakage nor range walk, and share preparation and detection with the rest. The
-closed form with the same beamlets and effects is measured too. With real transforms and a smaller
-inverse FFT the thesis's way would take about half its time; this was measured once, and is no part
-of the ladder.
+- `real`: half the transform, where powers add and the grid is real ([T] adds amplitudes, which are
+  complex);
+- `folded`: a way back to the bins alone, by an FFT of a sixteenth of the size, also with `real`;
+- `degree 9`: lines shared out among ten cells, which puts them at their exact place.
+
+All are compiled and transform many spectra at once (`sweep/tasks/accuracy/bench.py`). They compute
+neither leakage nor range walk, and share preparation and detection with the rest. The closed form
+with the same beamlets and effects is measured too.
 
 Adaptive settings have to meet two requirements, which the numbers below test:
 
@@ -119,9 +123,9 @@ Adaptive settings have to meet two requirements, which the numbers below test:
 
 Planning counts for adaptive settings alone. A block takes some 1 ms to be planned. This is
 negligible for a thousand points, and most of the time of a study of one or two points. If adaptive
-settings are slower by more than 10 %, `sweep accuracy` prints the loss. A real run
-plans fixed settings too, because its store holds the error of skipped effects, and its blocks draw
-points and solve for velocities as well.
+settings are slower by more than 10 %, `sweep accuracy` prints the loss, and the loss including the
+making of the store. A real run plans fixed settings too, because its store holds the error of
+skipped effects, and its blocks draw points and solve for velocities as well.
 """
 
 TAIL = """

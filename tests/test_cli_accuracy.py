@@ -22,7 +22,7 @@ def test_the_command_prints_tables_and_statements_and_writes_store_figure_and_te
     result = sweep("accuracy", "small.yaml", "--points", "6")
     assert result.exit_code == 0
     for shown in (
-        "auto at 1e-06", "all effects on", "thesis 2^12", "Cheapest setting",
+        "auto at 1e-06", "all effects on", "thesis 2^12, folded, degree 9", "Cheapest setting",
         "As written:", "Against the thesis's way", "best single fixed setting", "time domain",
         "small_accuracy.zarr", "small_accuracy.png",
     ):  # fmt: skip

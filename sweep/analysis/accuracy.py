@@ -11,7 +11,10 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Sheet
+from matplotlib.patheffects import withStroke
+from matplotlib.text import Annotation
 from matplotlib.ticker import FuncFormatter, LogLocator
+from matplotlib.transforms import Bbox
 
 from sweep.analysis import canvas, labels
 from sweep.analysis.opening import ACCURACY, read_attributes
@@ -25,7 +28,7 @@ EXACT = 1e-9
 """Error below which settings are alike: that of the reference itself."""
 
 WRITTEN, ADAPTIVE, THESIS, REFERENCE = "as written", "adaptive", "thesis", "reference"
-CLOSED_FORM = "closed form"
+CLOSED_FORM, IMPROVED = "closed form", "thesis improved"
 BEAMLETS, IN_A_LINE = "beamlets", "in a line"
 MEANS, COUNTED, IN_NOISE = "means of draws", "draws counted", "draws in noise"
 FIXED = ("fixed effects", BEAMLETS, IN_A_LINE, CLOSED_FORM, "all on", MEANS, COUNTED, IN_NOISE)
@@ -81,11 +84,14 @@ class Setting:
         """Error of pd that this share of the points stays below."""
         return float(np.nanquantile(self.pd_error, share))
 
-    def times_faster(self, other: Setting) -> float:
-        """Time of another over this one's: median of the rounds, of few rounds that of the best."""
+    def times_faster(self, other: Setting, besides: float = 0.0) -> float:
+        """Time of another over that of this, round by round, in the median; of few rounds, at best.
+
+        Both with what a point takes besides [s].
+        """
         if self.rounds.size < FEW_ROUNDS:
-            return other.seconds / self.seconds
-        return float(np.median(other.rounds / self.rounds))
+            return (other.seconds + besides) / (self.seconds + besides)
+        return float(np.median((other.rounds + besides) / (self.rounds + besides)))
 
 
 def settings_in(dataset: xr.Dataset) -> list[Setting]:
@@ -150,7 +156,11 @@ class Duel:
     @property
     def times_faster(self) -> float:
         """Time of the other over that of the adaptive one; inf against nothing."""
-        return self.adaptive.times_faster(self.other) if self.other else float("inf")
+        return self.with_besides(0.0)
+
+    def with_besides(self, seconds: float) -> float:
+        """Compare both with a time added to each [s], a point."""
+        return self.adaptive.times_faster(self.other, seconds) if self.other else float("inf")
 
 
 def against_fixed(settings: Sequence[Setting]) -> list[Duel]:
@@ -162,10 +172,10 @@ def against_fixed(settings: Sequence[Setting]) -> list[Duel]:
     return [Duel(own, cheapest(fixed, error)) for own, error in best if own is not None]
 
 
-def against_thesis(settings: Sequence[Setting]) -> list[Duel]:
-    """Return the fastest adaptive setting as accurate as each size of the thesis's way."""
+def against_thesis(settings: Sequence[Setting], kind: str = THESIS) -> list[Duel]:
+    """Return the fastest adaptive setting as accurate as each form of the thesis's way."""
     adaptive = of_kinds(settings, ADAPTIVE)
-    best = ((cheapest(adaptive, each.error), each) for each in of_kinds(settings, THESIS))
+    best = ((cheapest(adaptive, each.error), each) for each in of_kinds(settings, kind))
     return [Duel(own, thesis) for own, thesis in best if own is not None]
 
 
@@ -178,6 +188,9 @@ SHORT = ("setting", "time", "90 %", "largest", "log pfa", "peak", "leakage")
 """The same in few columns."""
 
 CHEAPEST = ("error allowed", "cheapest setting", "us a point", "its error")
+
+STORING = "storing_seconds"
+"""Attribute that stores of earlier versions lack."""
 
 
 def rows(settings: Sequence[Setting]) -> list[list[str]]:
@@ -218,7 +231,7 @@ def sentences(dataset: xr.Dataset, settings: Sequence[Setting]) -> list[str]:
     """Conclusions in words."""
     attributes = dataset.attrs
     found = [_written(dataset, settings)]
-    found += _fixed(against_fixed(settings), attributes["study_points"])
+    found += _fixed(against_fixed(settings), attributes)
     found += _thesis(settings, attributes["thesis_beamlets"]) + _like_for_like(settings)
     found.append(_reference(attributes))
     found += [note[0].upper() + note[1:] + "." for note in attributes["notes"]]
@@ -246,19 +259,21 @@ def _written(dataset: xr.Dataset, settings: Sequence[Setting]) -> str:
         f"As written: {microseconds(written.seconds)} us a point, error {error(written.error)}; "
         f"{whole} {_time(number * written.seconds)} on one core"
     )
+    if (stored := dataset.attrs.get(STORING)) is not None:
+        text += f", and at least {_time(stored)} to be stored, whatever the setting"
     if best is None or best is written or best.times_faster(written) < 1.05:
         return text + ". Nothing tried is faster and as accurate."
     return text + f". As accurate and {best.times_faster(written):.2g} times faster: {best.name}."
 
 
-def _fixed(duels: Sequence[Duel], points: int) -> list[str]:
+def _fixed(duels: Sequence[Duel], attributes: dict) -> list[str]:
     """Statement on adaptive against fixed settings."""
     if not duels:
         return []
     worst = min(duels, key=lambda duel: duel.times_faster)
     if worst.other is None:
         return ["At equal error: no fixed setting is as accurate as any adaptive one."]
-    kept = "kept" if worst.times_faster >= AS_FAST else _lost(worst, points)
+    kept = "kept" if worst.times_faster >= AS_FAST else _lost(worst, duels, attributes)
     several = [duel.times_faster for duel in duels if duel.other]
     return [
         f"At equal error, adaptive against the best single fixed setting: {_span(several)} times "
@@ -267,15 +282,20 @@ def _fixed(duels: Sequence[Duel], points: int) -> list[str]:
     ]
 
 
-def _lost(worst: Duel, points: int) -> str:
-    """By how much an adaptive setting is slower, and what planning takes, of all points."""
+def _lost(worst: Duel, duels: Sequence[Duel], attributes: dict) -> str:
+    """By how much an adaptive setting is slower, and what that is of all that the study takes."""
+    points = attributes["study_points"]
     slower = worst.adaptive.seconds * (1 - worst.times_faster)
     lost, planning = (_time(points * each) for each in (slower, worst.adaptive.planning))
-    return f"NOT kept, by {lost} in all; planning takes {planning}"
+    told = f"NOT kept, by {lost} in all; planning takes {planning}"
+    if (stored := attributes.get(STORING)) is None:
+        return told
+    whole = min(duel.with_besides(stored / points) for duel in duels)
+    return f"{told}; with the study's store it is {whole:.2g} times as fast"
 
 
 def _thesis(settings: Sequence[Setting], beamlets: int) -> list[str]:
-    """Statement on adaptive settings against the thesis's way."""
+    """Statement on adaptive settings against the thesis's way, as described and improved."""
     duels = against_thesis(settings)
     if not duels:
         return []
@@ -286,7 +306,10 @@ def _thesis(settings: Sequence[Setting], beamlets: int) -> list[str]:
     least = f"At least {TIMES_FASTER:g} times as fast: {kept}."
     if beamlets != OF_THESIS:
         least = f"With this scene's {beamlets} beamlets, that is, where the thesis has {OF_THESIS}."
-    return [f"Against the thesis's way at the error that it has: {_told(duels)}. {least}"]
+    told = [f"Against the thesis's way at the error that it has: {_told(duels)}. {least}"]
+    if improved := against_thesis(settings, IMPROVED):
+        told.append(f"Against what it can be improved to: {_told(improved)}.")
+    return told
 
 
 def _told(duels: Sequence[Duel]) -> str:
@@ -307,7 +330,7 @@ def _like_for_like(settings: Sequence[Setting]) -> list[str]:
     told = [
         f"{closed.times_faster(thesis):.2g} times as fast as {thesis.name}"
         for closed in of_kinds(settings, CLOSED_FORM)
-        for thesis in of_kinds(settings, THESIS)
+        for thesis in of_kinds(settings, THESIS, IMPROVED)
     ]
     if not told:
         return []
@@ -370,9 +393,20 @@ MARKS = {
     IN_NOISE: ("<", canvas.LINES[7], "the same, noise in every bin"),
     CLOSED_FORM: ("X", canvas.LINES[5], "in closed form what the thesis's way has"),
     THESIS: ("v", canvas.LINES[4], "the thesis's way"),
+    IMPROVED: ("p", canvas.LINES[4], "the thesis's way, improved"),
     WRITTEN: ("*", canvas.LINES[6], "as written"),
 }
 """Marker, colour and words of each kind."""
+
+HALO = [withStroke(linewidth=2.5, foreground="white")]
+"""Halo that keeps a name readable upon lines; marks are drawn upon it."""
+
+
+PLACES = ((6, 5), (-6, -10), (6, -10), (-6, 5), (6, 15), (-6, -20), (6, -20), (-6, 15))
+"""Places that a name may take: right of its mark and above it, or left and below [points]."""
+
+MARK_SIZE = 7
+"""Width of most marks [points]."""
 
 
 def sheet(dataset: xr.Dataset, settings: Sequence[Setting]) -> Sheet:
@@ -383,6 +417,7 @@ def sheet(dataset: xr.Dataset, settings: Sequence[Setting]) -> Sheet:
         *zip(*map(_place, front(drawn)), strict=True), where="post", color="0.35", linewidth=1.2,
         linestyle="--", zorder=1, label="front of the best",
     )  # fmt: skip
+    names: list[Annotation] = []
     for kind, (marker, colour, words) in MARKS.items():
         some = of_kinds(drawn, kind)
         for i, setting in enumerate(some):
@@ -390,15 +425,12 @@ def sheet(dataset: xr.Dataset, settings: Sequence[Setting]) -> Sheet:
         if kind in JOINED and some:
             line = zip(*map(_place, some), strict=True)
             axes.plot(*line, color=colour, linewidth=0.8, alpha=0.5, zorder=1)
-            some = [some[0], some[-1]]
-        for setting in some:
-            axes.annotate(
-                _short(setting), _place(setting), xytext=(6, 5), textcoords="offset points",
-                fontsize=7.5, color=colour,
-            )  # fmt: skip
+        names += _names(axes, some, above=kind not in BY_NUMBER)
     _finish(axes, min(setting.quantile(0.5) for setting in drawn))
     canvas.title(sheet, f"{dataset.attrs['title']}: what accuracy costs")
     canvas.caption(sheet, _note(dataset, drawn))
+    sheet.draw_without_rendering()
+    _keep_apart(axes, names, drawn)
     return sheet
 
 
@@ -411,7 +443,7 @@ def _mark(axes: Axes, setting: Setting, marker: str, colour: str, words: str) ->
         axes.plot([time], [most], marker="_", color=colour, markersize=7, zorder=2)
     if half > EXACT:
         axes.plot([time], [half], marker=".", color=colour, markersize=4, zorder=2)
-    size = 11 if marker == "*" else 7
+    size = 11 if marker == "*" else MARK_SIZE
     axes.plot(
         [time], [worst], marker=marker, color=colour, markersize=size, linestyle="",
         markeredgecolor="white", markeredgewidth=0.7, label=words or None, zorder=4,
@@ -421,6 +453,64 @@ def _mark(axes: Axes, setting: Setting, marker: str, colour: str, words: str) ->
 def _place(setting: Setting) -> tuple[float, float]:
     """Time [us] and error at which a setting is drawn."""
     return 1e6 * setting.seconds, max(setting.error, EXACT)
+
+
+def _names(axes: Axes, settings: Sequence[Setting], above: bool) -> list[Annotation]:
+    """Short names beside marks; settings whose marks are all but one have one name."""
+    found = []
+    for together in _clusters(settings):
+        ladder = [_short(setting) for setting in settings if setting in together]
+        names = list(dict.fromkeys(filter(None, ladder)))
+        if names:
+            words = names[0] if len(names) == 1 else f"{names[0]} … {names[-1]}"
+            beside = together[-1] if above else together[0]
+            name = axes.annotate(
+                words, _place(beside), xytext=PLACES[0], textcoords="offset points", fontsize=7.5,
+                color=MARKS[beside.kind][1], path_effects=HALO, zorder=3,
+            )  # fmt: skip
+            _put(name, PLACES[0 if above else 1])
+            found.append(name)
+    return found
+
+
+def _put(name: Annotation, place: tuple[float, float]) -> None:
+    """Draw a name so far to the right of its mark, and above it [points]."""
+    name.set_position(place)
+    name.set_horizontalalignment("left" if place[0] > 0 else "right")
+
+
+def _keep_apart(axes: Axes, names: Sequence[Annotation], settings: Sequence[Setting]) -> None:
+    """Move names off marks and off each other, where another place beside their marks is free."""
+    marks = [axes.transData.transform(_place(setting)) for setting in settings]
+    half = MARK_SIZE / 2 * canvas.DPI / 72
+    taken = [Bbox([mark - half, mark + half]) for mark in marks]
+    for name in names:
+        own = name.get_position()
+        for place in (own, *PLACES):
+            _put(name, place)
+            if not name.get_window_extent().count_overlaps(taken):
+                break
+        else:
+            _put(name, own)
+        taken.append(name.get_window_extent())
+
+
+def _clusters(settings: Sequence[Setting]) -> list[list[Setting]]:
+    """Group settings by time, if their marks are too close for names of their own."""
+    clusters: list[list[Setting]] = []
+    for setting in sorted(settings, key=lambda each: each.seconds):
+        near = (cluster for cluster in clusters if _alike(setting, cluster[-1]))
+        if (cluster := next(near, None)) is not None:
+            cluster.append(setting)
+        else:
+            clusters.append([setting])
+    return clusters
+
+
+def _alike(one: Setting, other: Setting) -> bool:
+    """Tell whether two marks are too close for a name each."""
+    apart = np.abs(np.log(_place(one)) - np.log(_place(other)))
+    return bool((apart < (0.25, 1.2)).all())
 
 
 def _short(setting: Setting) -> str:

@@ -3,8 +3,9 @@
 [T 3.3.1] convolves the spectra with the window's transform "with much higher sampling rate in the
 frequency domain than the FFT bin spacing", by an FFT "typically of size 2^11 or 2^12". The grid has
 16 cells a bin around the beam's centre, and each beamlet's line goes into the nearest cell. One FFT
-follows, a product with the transform of the window's own, and the way back. Changes of lines within
-a record (range walk, line width) are skipped, and leakage beyond the grid.
+follows, a product with the transform of the window's own, and the way back. The improvements
+`real`, `folded` and `degree` are those of docs/accuracy.md. Changes of lines within a record (range
+walk, line width) are skipped, and leakage beyond the grid.
 """
 
 from __future__ import annotations
@@ -132,7 +133,7 @@ def spread(shape: tuple[int, ...], number: int) -> np.ndarray:
 
 def look_of(rung: Rung) -> Look:
     """Finder of a rung's peaks in the spectra."""
-    return partial(find_on_grid, size=rung.thesis) if rung.thesis else shot.find
+    return partial(find_on_grid, **rung.thesis) if rung.thesis else shot.find
 
 
 def along_axes(
@@ -302,11 +303,15 @@ _ROWS = 32
 """Spectra that are transformed together: as many as the processor's cache holds."""
 
 
-def find_on_grid(shots: Shots, *, size: int = SIZE) -> np.ndarray:
+def find_on_grid(
+    shots: Shots, *, degree: int = 0, size: int = SIZE, real: bool = False, folded: bool = False
+) -> np.ndarray:
     """Largest bins of each segment's spectrum, (3, 6, n) as of :func:`sweep.model.shot.find`.
 
-    A grid has ``size`` cells at the least, a power of two, and more where a point's lines spread
-    farther. There is no leakage.
+    A line is shared out by a polynomial of a ``degree`` of 0, to the nearest cell, or 9, among
+    ten. A grid has ``size`` cells at the least, a power of two, and more where a point's lines
+    spread farther. ``real`` transforms powers as real numbers; ``folded`` goes back to the bins
+    alone. There is no leakage.
     """
     found = np.full((3, 6, shots.size), np.nan)
     table, sizes = shots.point_table(), grid_sizes(shots, size)
@@ -314,7 +319,9 @@ def find_on_grid(shots: Shots, *, size: int = SIZE) -> np.ndarray:
         for segment in np.flatnonzero(shots.segments):
             members = np.flatnonzero(sizes == cells)
             for index in np.split(members, range(_ROWS, members.size, _ROWS)):
-                low, magnitude = magnitudes(shots, table, index, int(segment), int(cells))
+                low, magnitude = magnitudes(
+                    shots, table, index, int(segment), int(cells), (degree, real, folded)
+                )
                 out = np.empty((6, index.size))
                 bins = shots.fft_size // 2, 1.0 / shots.fft_size
                 levels = table[13, index], table[11, index]
@@ -337,33 +344,73 @@ def grid_sizes(shots: Shots, least: int = SIZE) -> np.ndarray:
 
 
 def magnitudes(
-    shots: Shots, table: np.ndarray, index: np.ndarray, segment: int, cells: int
+    shots: Shots,
+    table: np.ndarray,
+    index: np.ndarray,
+    segment: int,
+    cells: int,
+    how: tuple[int, bool, bool],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """First bin (m,) and |X| (m, cells / CELLS) of some points' spectra around their lines."""
+    """First bin (m,) and |X| (m, cells / CELLS) of some points' spectra around their lines.
+
+    ``how``: `degree`, `real` and `folded` of :func:`find_on_grid`.
+    """
+    degree, real, folded = how
     power, length = shots.incoherent, shots.window.length
-    grid = np.zeros((index.size, cells), complex)
+    real = real and power
+    grid = np.zeros((index.size, cells), float if real else complex)
     origin = np.empty(index.size, np.int64)
     _deposit(
         np.ascontiguousarray(table[:, index]), shots.row[index], shots.footprint, segment,
-        np.array([shots.fft_size, length, 0, 0, power, 0]), shots.image, origin, grid,
+        np.array([shots.fft_size, length, 0, 0, power, 0]), shots.image, _weights(degree), origin,
+        grid.view(float).reshape(index.size, cells, -1),
     )  # fmt: skip
-    transform = fft.fft(grid, axis=1, overwrite_x=True)
-    transform *= _kernel(shots.window.name, length, shots.fft_size, cells, power)
-    convolved = fft.ifft(transform, axis=1, overwrite_x=True)[:, ::CELLS]
+    kernel = _kernel(shots.window.name, length, shots.fft_size, cells, power, real)
+    convolved = (_real_bins if real else _complex_bins)(grid, kernel, folded)
     # Rounding takes a sum of squares that is all but nothing below it.
     magnitude = np.sqrt(np.maximum(convolved.real, 0.0)) if power else np.abs(convolved)
-    return origin - cells // (2 * CELLS), np.asarray(magnitude)
+    return origin - cells // (2 * CELLS), magnitude
+
+
+def _complex_bins(grid: np.ndarray, kernel: np.ndarray, folded: bool) -> np.ndarray:
+    """Return the convolution of amplitudes at every sixteenth cell."""
+    transform = fft.fft(grid, axis=1, overwrite_x=True)
+    transform *= kernel
+    if not folded:
+        return np.asarray(fft.ifft(transform, axis=1, overwrite_x=True)[:, ::CELLS])
+    transform = transform.reshape(len(grid), CELLS, -1).sum(axis=1)
+    return np.asarray(fft.ifft(transform, axis=1, overwrite_x=True)) / CELLS
+
+
+def _real_bins(grid: np.ndarray, kernel: np.ndarray, folded: bool) -> np.ndarray:
+    """Convolve powers, by half of their transforms."""
+    half = fft.rfft(grid, axis=1)
+    half *= kernel
+    if not folded:
+        return np.asarray(fft.irfft(half, grid.shape[1], axis=1, overwrite_x=True)[:, ::CELLS])
+    rows, bins = len(grid), grid.shape[1] // CELLS
+    above = half[:, :-1].reshape(rows, CELLS // 2, bins)[:, :, : bins // 2 + 1].sum(axis=1)
+    below = half[:, 1:].reshape(rows, CELLS // 2, bins)[:, :, : bins // 2 - 2 : -1].sum(axis=1)
+    return np.asarray(fft.irfft(above + below.conj(), bins, axis=1)) / CELLS
 
 
 @lru_cache(maxsize=32)
-def _kernel(name: str, length: int, fft_size: int, cells: int, power: bool) -> np.ndarray:
+def _kernel(
+    name: str, length: int, fft_size: int, cells: int, power: bool, real: bool
+) -> np.ndarray:
     """Transform of the window's own, of mid-record, on a grid of cells; no closed form is used."""
     place = np.concatenate([np.arange(cells // 2), np.arange(-cells // 2, 0)])
     transform = fft.fft(windows.samples(name, length), CELLS * fft_size)[place]
     transform *= np.exp(1j * np.pi * place * (length / fft_size / CELLS))
     if power:
         transform = np.abs(transform) ** 2
-    return np.asarray(fft.fft(transform))
+    return np.asarray(fft.rfft(transform) if real else fft.fft(transform))
+
+
+def _weights(degree: int) -> np.ndarray:
+    """Barycentric weights of degree + 1 cells in a row."""
+    node = np.arange(degree + 1.0)
+    return np.array([1 / np.prod(np.delete(node[j] - node, j)) for j in range(node.size)])
 
 
 @njit(cache=True, error_model="numpy")
@@ -387,17 +434,44 @@ def _image(origin, delta, re, im, sizes, centre):
 
 
 @njit(cache=True, error_model="numpy")
-def _deposit(p, row, footprint, segment, sizes, image, origin, grid):
-    """Put the lines of m points each into the nearest cell of its grid, (m, cells)."""
+def _deposit(p, row, footprint, segment, sizes, image, weights, origin, grid):
+    """Lines of m points, each shared out among as many cells of its grid, (m, cells, 2 or 1)."""
     n, cells, power = footprint.shape[2], grid.shape[1], sizes[4] != 0
     room = np.empty((BLOCK + 1, n))
     delta, re, im = room[PLACE], room[RE], room[IM]
-    centre = cells // 2
+    centre, share = cells // 2, np.empty(weights.size)
+    low, high = (-0.5, cells - 1.0) if weights.size == 1 else (5.0, cells - 6.0)
     for i in range(row.size):
         origin[i] = _lines(i, p, row, footprint, segment, sizes, room)
         for b in range(n):
-            grid[i, int(np.rint(centre + CELLS * delta[b]))] += complex(re[b], im[b])
+            _share_out(grid, i, centre + CELLS * delta[b], re[b], im[b], weights, share)
             if image:
                 at, a, c = _image(origin[i], delta[b], re[b], im[b], sizes, centre)
-                if -0.5 < at < cells - 1.0:
-                    grid[i, int(np.rint(at))] += complex(abs(a) if power else a, c)
+                if low < at < high:
+                    _share_out(grid, i, at, abs(a) if power else a, c, weights, share)
+
+
+@njit(cache=True, error_model="numpy")
+def _share_out(grid, i, at, re, im, weights, share):
+    """Add a line to the nearest cell, or to ten cells by Lagrange's polynomial."""
+    if weights.size == 1:
+        _add(grid, i, int(np.rint(at)), re, im)
+        return
+    first = int(np.floor(at)) - 4
+    t = at - first
+    total = 0.0
+    for j in range(weights.size):
+        if t == j:
+            _add(grid, i, first + j, re, im)
+            return
+        share[j] = weights[j] / (t - j)
+        total += share[j]
+    for j in range(weights.size):
+        _add(grid, i, first + j, re * share[j] / total, im * share[j] / total)
+
+
+@njit(inline="always")
+def _add(grid, i, cell, re, im):
+    grid[i, cell, 0] += re
+    if grid.shape[2] > 1:
+        grid[i, cell, 1] += im

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import tempfile
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from pathlib import Path
+from time import process_time
 from typing import Any
 
 import numpy as np
@@ -29,8 +32,8 @@ from sweep.tasks.accuracy.rungs import (
 )
 from sweep.tasks.errors import StoreError, TaskError
 from sweep.tasks.progress import Interrupts, Progress, chosen, working
-from sweep.tasks.studies import ACCURACY
-from sweep.tasks.study import ArrayLayout, described
+from sweep.tasks.studies import ACCURACY, study_of
+from sweep.tasks.study import ArrayLayout, Study, described
 
 AnyBench = GridBench | FlightBench
 
@@ -67,6 +70,9 @@ LONG = 1.0
 FIXED_AS_AT = (1e-1, 1e-3, 1e-6)
 """Tolerances whose effects are tried at every point alike."""
 
+
+TRIALS = 3
+"""Of each part of storing; the first may import and open what the others find."""
 
 _ABOUT = {
     "pd_error": "largest error of a probability of detection, of segments and shot",
@@ -116,8 +122,9 @@ def measure(
             ).run()
         except Nothing:
             return False
+    stored = storing(study_of(spec, store_path))
     _refuse_in_the_way(store_path, overwrite)  # it may hold something else by now
-    store.create(store_path, Content(spec, bench, measured), replace=overwrite)
+    store.create(store_path, Content(spec, bench, measured, stored), replace=overwrite)
     return True
 
 
@@ -129,6 +136,36 @@ def _refuse_in_the_way(path: Location, overwrite: bool) -> None:
     if not overwrite:
         raise StoreError(f"{path} is there already: --overwrite measures anew")
     store.refuse_to_replace(path)
+
+
+def storing(study: Study) -> float:
+    """Processor time that making a study's store takes [s], and writing its blocks, of zeros."""
+    block = study.n_blocks // 2
+    results = {
+        name: np.zeros([s.stop - s.start for s in region], study.layouts[name].dtype)
+        for name, region in study.regions(block).items()
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "study.zarr"
+
+        def make() -> None:
+            if path.exists():
+                store.remove(path)
+            store.create(path, study)
+
+        made = _least(make)
+        arrays = store.Arrays(path, study)
+        return made + study.n_blocks * _least(lambda: arrays.write(block, results))
+
+
+def _least(work: Callable[[], object]) -> float:
+    """Least processor time of a work in some trials [s]."""
+    spent = []
+    for _ in range(TRIALS):
+        begun = process_time()
+        work()
+        spent.append(process_time() - begun)
+    return min(spent)
 
 
 @dataclass
@@ -357,8 +394,8 @@ def _chances_apart(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 class Content:
     """Content of the store: errors by rung and point, seconds by rung and round."""
 
-    def __init__(self, spec: Declared, bench: AnyBench, measured: Measured) -> None:
-        self._spec, self._bench, self._measured = spec, bench, measured
+    def __init__(self, spec: Declared, bench: AnyBench, measured: Measured, stored: float) -> None:
+        self._spec, self._bench, self._measured, self._stored = spec, bench, measured, stored
 
     @property
     def id(self) -> str:
@@ -378,6 +415,7 @@ class Content:
             "unit": self._bench.unit,
             "points": len(measured.done),
             "study_points": self._bench.whole,
+            "storing_seconds": self._stored,
             "notes": list(measured.ladder.notes),
             "thesis_beamlets": self._thesis_beamlets(),
             "stopped": measured.stopped,

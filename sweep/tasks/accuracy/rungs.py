@@ -10,6 +10,7 @@ from typing import Any
 
 from sweep.model.effects.catalogue import EFFECTS, NAMES
 from sweep.model.effects.segment_motion import SEGMENT_MOTION
+from sweep.model.ground import powers_add
 from sweep.spec import SceneSpec, Spec
 from sweep.spec.parts import OFF
 
@@ -18,7 +19,7 @@ Declared = Spec | SceneSpec
 WRITTEN, ADAPTIVE, ALL_ON, FIXED, BEAMLETS, IN_A_LINE = (
     "as written", "adaptive", "all on", "fixed effects", "beamlets", "in a line"
 )  # fmt: skip
-CLOSED_FORM, THESIS, REFERENCE = "closed form", "thesis", "reference"
+CLOSED_FORM, THESIS, IMPROVED, REFERENCE = "closed form", "thesis", "thesis improved", "reference"
 MEANS, COUNTED, IN_NOISE = "means of draws", "draws counted", "draws in noise"
 """Kinds of rungs."""
 
@@ -71,21 +72,21 @@ _EXACTLY = dict.fromkeys(
 class Rung:
     """A setting of a study: values of fields of its spec by dotted path, as one would write them.
 
-    ``thesis``: cells of the grid of :func:`sweep.tasks.accuracy.bench.find_on_grid`, where that
-    finds the peaks, else 0. ``rays_error`` is what a flight's rays may leave before there are
-    more, 0 where the spec says that.
+    ``thesis`` has the options of :func:`sweep.tasks.accuracy.bench.find_on_grid`, where that
+    finds the peaks; ``rays_error`` is what a flight's rays may leave before there are more, 0
+    where the spec says that.
     """
 
     name: str
     kind: str
     overrides: Mapping[str, Any] = field(default_factory=dict)
-    thesis: int = 0
+    thesis: Mapping[str, Any] = field(default_factory=dict)
     rays_error: float = 0.0
 
     @property
     def of_lines(self) -> bool:
         """True where nothing is simulated that the thesis's way lacks: effects in a record."""
-        return self.kind in (CLOSED_FORM, THESIS)
+        return self.kind in (CLOSED_FORM, THESIS, IMPROVED)
 
     @property
     def plans(self) -> bool:
@@ -182,7 +183,7 @@ def ladder(spec: Declared) -> Ladder:
         finest |= follow | {_TOLERANCE: FINEST_TOLERANCE}
         about += f", beamlets as at {FINEST_TOLERANCE:g}"
     rungs += () if why else _numbers(isinstance(spec, SceneSpec))
-    rungs += _thesis_rungs({} if why else {_BEAMLETS: OF_THESIS})
+    rungs += _thesis_rungs({} if why else {_BEAMLETS: OF_THESIS}, powers_add(spec.parameters()))
     rungs.append(Rung(name="reference", kind=REFERENCE, overrides=finest, rays_error=rays_error))
     return Ladder(tuple(rungs), about, tuple(notes), partial(_fixed_beamlets, spec, bool(why)))
 
@@ -207,12 +208,18 @@ def _numbers(flight: bool) -> Iterator[Rung]:
         yield Rung(name=f"{n} in a line", kind=IN_A_LINE, overrides=put)
 
 
-def _thesis_rungs(overrides: Mapping[str, Any]) -> Iterator[Rung]:
-    """Yield the same beamlets and effects in closed form, and by the thesis's way."""
+def _thesis_rungs(overrides: Mapping[str, Any], powers: bool) -> Iterator[Rung]:
+    """Yield the same beamlets and effects in closed form, and by the thesis's way, improved too."""
     yield Rung(name="closed form, as thesis", kind=CLOSED_FORM, overrides=overrides)
-    for power in (11, 12):
-        cells = 1 << power
-        yield Rung(name=f"thesis 2^{power}", kind=THESIS, overrides=overrides, thesis=cells)
+    forms: list[tuple[str, str, int, dict[str, Any]]] = [
+        *((THESIS, "", power, {}) for power in (11, 12)),
+        *((IMPROVED, ", real", power, {"real": True}) for power in (11, 12) if powers),
+        *((IMPROVED, ", folded", power, {"folded": True, "real": powers}) for power in (11, 12)),
+        (IMPROVED, ", folded, degree 9", 12, {"folded": True, "real": powers, "degree": 9}),
+    ]
+    for kind, how, power, options in forms:
+        thesis = {"size": 1 << power} | options
+        yield Rung(name=f"thesis 2^{power}{how}", kind=kind, overrides=overrides, thesis=thesis)
 
 
 def _drawn_ladder(spec: Declared) -> Ladder:
