@@ -135,8 +135,8 @@ def test_an_unknown_name_is_told_what_there_is():
         told = refusal(written)
         assert told.startswith(f"instrument{path}: is no instrument of the library")
         assert "did you mean 'settembrini_2026'?" in told
-        assert all(name in told for name in NAMES)
-    assert "did you mean" not in refusal("no_such_thing_at_all")
+    told = refusal("no_such_thing_at_all")
+    assert "did you mean" not in told and all(name in told for name in NAMES)
     assert "must be the name of an instrument" in refusal({"like": 3})
     assert "is no field" in refusal({"like": "rogers_2021", "file": "a.yaml"})
 
