@@ -379,7 +379,7 @@ def _fitted(shots: Shots, drawn: Drawn) -> Told:
     carriers = [np.broadcast_to(carrier, shots.size) for carrier in shots.carriers]
     rate = np.broadcast_to(shots.chirp_rate, shots.size)
     peaks = np.moveaxis(drawn.peaks, 3, 0).reshape(3, point.size, -1)
-    there = np.isfinite(peaks[..., ERROR])
+    seen = np.isfinite(peaks[..., ERROR])
 
     def deviation(errors: np.ndarray, at: np.ndarray) -> Deviation:
         """Of errors [bins], (3, m), of points."""
@@ -392,12 +392,14 @@ def _fitted(shots: Shots, drawn: Drawn) -> Told:
 
     columns_of = []
     for kind in (WHOLE, FINE):
-        errors = np.where(there, peaks[..., ERROR], np.inf)
+        errors = np.where(seen, peaks[..., ERROR], np.inf)
         errors = np.hypot(errors, math.sqrt(1 / 12) if kind == WHOLE else 0.0)
         found = fit(shots, peaks[..., kind] * width[point], 1 / errors**2, point)
         columns_of.append((*found, *deviation(errors, point)))
+    there = (drawn.code >= 0)[..., None]
     distance, velocity, range_error, velocity_error = (
-        np.stack(pair, axis=-1).reshape(*shape, 2) for pair in zip(*columns_of, strict=True)
+        np.where(there, np.stack(pair, axis=-1).reshape(*shape, 2), np.nan)
+        for pair in zip(*columns_of, strict=True)
     )
     segments = np.array(shots.segments)[:, None]
     half = deviation(np.where(segments, np.sqrt(0.5), np.inf) + 0 * width, np.arange(shots.size))

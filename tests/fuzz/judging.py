@@ -136,7 +136,9 @@ def _signal_and_noise(results: Results) -> None:
     for segment in ("up", "down", "doppler", "shot"):
         total = results[f"pd_{segment}"] + results[f"miss_{segment}"]
         assert not (np.abs(total - 1) > ROUNDING).any(), segment
-    least = np.minimum(results["pd_up"], results["pd_down"])
+    each = [results[f"pd_{segment}"] for segment in ("up", "down", "doppler")]
+    least = np.maximum(np.minimum(*each[:2]), sum(each) / 2)  # nan without a Doppler segment
+    least = np.where(np.isnan(each[2]), np.minimum(*each[:2]), least)  # of any two: half the sum
     assert (results["pd_shot"] <= least + ROUNDING).all(), "a shot is likelier than its segments"
     for name in STRONGEST_OUTPUTS.keys() & results.keys():
         total = results[name] + results[name.replace("p_wrong_range", "pd")]
