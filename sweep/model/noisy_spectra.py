@@ -87,7 +87,7 @@ class Signal(NamedTuple):
     last: int
     """Last of them; below ``first`` where there is no echo, or its largest bin is not searched."""
     frequency: float
-    """Where a lone tone of these magnitudes about the largest bin stands [bins], with its sign."""
+    """Place of a lone tone of these magnitudes about the largest bin [bins], with its sign."""
     cnr: float
     """Power of the signal over that of the noise in the record, before the FFT."""
     segment: int

@@ -308,7 +308,7 @@ class Told(NamedTuple):
     metre: np.ndarray
     speed: np.ndarray
     pulled: np.ndarray | float
-    """How much further than at the shot's start the range is told [m], (n, 1, 1)."""
+    """Excess of the range told over that at the shot's start [m], (n, 1, 1)."""
 
 
 def measured(shots: Shots, found: Groups, drawn: Drawn) -> Returns:

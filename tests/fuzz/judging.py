@@ -121,7 +121,7 @@ def look_at_results(spec: Spec, study: GridStudy, results: Results, block: int) 
     if spec.draws.whole_spectra:
         _whole_spectra(results)
     else:
-        _signal_and_noise(results)
+        _signal_and_noise(results, '"any_two"' in spec.to_json())
     if spec.draws.number:
         _draws(spec, results, no_doppler)
 
@@ -131,14 +131,14 @@ def _probability(name: str, values: np.ndarray) -> None:
     assert ((there >= 0) & (there <= 1)).all(), f"{name} is no probability: {there}"
 
 
-def _signal_and_noise(results: Results) -> None:
+def _signal_and_noise(results: Results, any_two: bool) -> None:
     """What every point keeps, with draws or without."""
     for segment in ("up", "down", "doppler", "shot"):
         total = results[f"pd_{segment}"] + results[f"miss_{segment}"]
         assert not (np.abs(total - 1) > ROUNDING).any(), segment
-    each = [results[f"pd_{segment}"] for segment in ("up", "down", "doppler")]
-    least = np.maximum(np.minimum(*each[:2]), sum(each) / 2)  # nan without a Doppler segment
-    least = np.where(np.isnan(each[2]), np.minimum(*each[:2]), least)  # of any two: half the sum
+    least = np.minimum(results["pd_up"], results["pd_down"])
+    if any_two:  # of three segments half the sum is the most; nan without a Doppler segment
+        least = np.fmax(least, (results["pd_up"] + results["pd_down"] + results["pd_doppler"]) / 2)
     assert (results["pd_shot"] <= least + ROUNDING).all(), "a shot is likelier than its segments"
     for name in STRONGEST_OUTPUTS.keys() & results.keys():
         total = results[name] + results[name.replace("p_wrong_range", "pd")]

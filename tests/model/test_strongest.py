@@ -195,7 +195,7 @@ def test_segments_of_their_own_speckle_are_independent(record, table_4_1):
 
 
 def test_an_echo_outside_the_band_is_never_right(table_4_1):
-    """What alarms there is noise, and what the echo shows in the band."""
+    """All alarms there are of noise, and of the echo's share in the band."""
     band = dict(zip(ENDS, (20.0, 120.0, 2.0, 4.0), strict=True))
     found = evaluate(scene_of(table_4_1, tnr=2.5) | band, CORE)
     assert found["pd_up"] == found["pd_shot"] == 0
