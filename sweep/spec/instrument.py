@@ -281,7 +281,8 @@ class Processing(Part):
     )
     peaks: str = of.choice(
         "Peaks of a segment that are reported: all that cross the threshold; or the strongest "
-        "alone, which may be another than the echo's (p_wrong_range); in grids without draws",
+        "alone, which may be another than the echo's (p_wrong_range); in grids without draws, and "
+        "in flights that draw whole spectra",
         waveform.REPORTED_PEAKS,
         waveform.ALL,
     )
