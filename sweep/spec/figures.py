@@ -135,13 +135,6 @@ class Drawing(Part):
 class GridDrawing(Drawing):
     """Base of figures of grids."""
 
-    @property
-    def coordinates(self) -> dict[str, str]:
-        """Coordinates named, by the field that names them."""
-        named = {key: getattr(self, key, "") for key in ("x", "y", "by", "rows", "columns")}
-        where = {f"where.{name}": name for name in getattr(self, "where", {})}
-        return {key: name for key, name in (named | where).items() if name}
-
 
 class Surface(GridDrawing):
     """A quantity over two coordinates, seen from above."""
@@ -379,6 +372,9 @@ SceneFigure = Annotated[
 
 # What is wrong with figures
 
+_SIDES = ("x", "y", "by", "rows", "columns")
+"""Fields of a grid's figure that name a coordinate."""
+
 LEAST_BEAMS = 3
 """Shots of a cycle from which on there is navigation."""
 
@@ -405,7 +401,7 @@ def scene_figure_findings(
     scanners = scanners if isinstance(scanners, Mapping) else {}
     for at, figure in _readable(written, SceneFigure):
         yield from _scanner_findings(figure, scanners, at)
-        yield from () if axes is None else _where_findings(figure, axes, at)
+        yield from () if axes is None else _coordinate_findings(figure, axes, at)
         yield from _draw_findings(figure, written.get("draws"), at)
     yield from _name_findings(written, SceneFigure, "makes the same file as another")
 
@@ -427,31 +423,28 @@ def _name_findings(written: Mapping[str, Any], kind: Any, rule: str) -> Iterator
         stems.add(figure.stem)
 
 
-def _no_coordinate(name: str, known: list[str], at: Location) -> Finding:
-    remedy = f"the coordinates are {', '.join(known)}" if known else "this study has no axes"
-    suggestion = near_miss(name, known, otherwise=remedy)
-    return Finding(at, "is no coordinate of this study", suggestion, name)
-
-
-def _value_findings(path: str, values: Any, at: Location) -> Iterator[Finding]:
-    """Values that are none of a coordinate."""
-    for value in values if isinstance(values, tuple) else (values,):
-        try:
-            parameter_rules()[path].read(value)
-        except QuantityError as error:
-            yield Finding(at, error.rule, error.suggestion, value)
-
-
 def _coordinate_findings(figure: Any, axes: tuple[Axis, ...], at: Location) -> Iterator[Finding]:
-    """Coordinates that no axis has, and values that are none of a coordinate."""
+    """Coordinates that no axis has, and values that are none, or in a scene not one, of them."""
+    of_grid = isinstance(figure, GridDrawing)
+    named = {field: getattr(figure, field, "") for field in _SIDES} if of_grid else {}
+    where = getattr(figure, "where", {})
     paths = {member.name: member.path for axis in axes for member in axis.members}
-    known = list(dict.fromkeys([*paths, *(axis.name for axis in axes)]))
-    for field, name in figure.coordinates.items():
+    known = list(dict.fromkeys([*paths, *(axis.name for axis in axes if of_grid)]))
+    for field, name in (named | {f"where.{name}": name for name in where}).items():
         location: Location = (*at, *field.split("."))
-        if name not in known:
-            yield _no_coordinate(name, known, location)
-        elif field.startswith("where.") and name in paths:
-            yield from _value_findings(paths[name], figure.where[name], location)
+        values = where[name] if field.startswith("where.") else ()
+        if name and name not in known:
+            remedy = f"the coordinates are {', '.join(known)}" if known else "it has no axes"
+            suggestion = near_miss(name, known, otherwise=remedy)
+            yield Finding(location, "is no coordinate of this study", suggestion, name)
+        elif isinstance(values, tuple) and values and not of_grid:
+            yield Finding(location, "must be one value", "make a figure for each")
+        elif name in paths:
+            for value in values if isinstance(values, tuple) else (values,):
+                try:
+                    parameter_rules()[paths[name]].read(value)
+                except QuantityError as error:
+                    yield Finding(location, error.rule, error.suggestion, value)
 
 
 def _variable_findings(
@@ -511,19 +504,6 @@ def _navigates(written: object) -> bool:
         return scanner is None or shots_a_cycle(scanner.pattern()) >= LEAST_BEAMS
     except ValueError:
         return True
-
-
-def _where_findings(figure: Any, axes: tuple[Axis, ...], at: Location) -> Iterator[Finding]:
-    """Coordinates that no axis has, and values that are none, or not one, of a coordinate."""
-    paths = {member.name: member.path for axis in axes for member in axis.members}
-    for name, value in figure.where.items():
-        location = (*at, "where", name)
-        if name not in paths:
-            yield _no_coordinate(name, list(paths), location)
-        elif isinstance(value, tuple):
-            yield Finding(location, "must be one value", "make a figure for each")
-        else:
-            yield from _value_findings(paths[name], value, location)
 
 
 def _draw_findings(figure: Any, written: object, at: Location) -> Iterator[Finding]:
