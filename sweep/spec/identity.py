@@ -16,8 +16,7 @@ from sweep.spec.axes import Axis, Member
 from sweep.spec.fields import parameter_rules
 from sweep.spec.flight import AnyScanner, Platform
 from sweep.spec.grounds import OPTICAL
-from sweep.spec.parts import Models, all_parts, fields_of, leaves, models_at, rule_of
-from sweep.spec.rules import File
+from sweep.spec.parts import Models, all_parts, fields_of, models_at, rule_of, values_of
 from sweep.spec.scene import ErrorFloor, Navigation, Scene, SceneDraws, SceneStorage
 
 LISTED_VALUES = 64
@@ -69,14 +68,6 @@ def digest(identity: Mapping[str, Any]) -> str:
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
 
-def leaf_values(part: BaseModel, digests: Mapping[str, str]) -> dict[str, Any]:
-    """SI values of a part by dotted path; of files, their digests."""
-    return {
-        ".".join(path): digests.get(value, value) if isinstance(rule, File) else value
-        for path, rule, value in leaves(part)
-    }
-
-
 def geometry_of(
     scene: Scene, platform: Platform, scanner: BaseModel, digests: Mapping[str, str]
 ) -> dict[str, Any]:
@@ -88,12 +79,12 @@ def geometry_of(
     places = {name: place for place, name in enumerate(scene.objects)}
     return {
         "objects": [
-            _object_geometry(leaf_values(thing, digests), places)
+            _object_geometry(values_of(thing, digests=digests), places)
             for thing in scene.objects.values()
         ],
         "origin": places.get(scene.origin, -1),
-        "platform": leaf_values(platform, digests),
-        "scanner": leaf_values(scanner, digests),
+        "platform": values_of(platform, digests=digests),
+        "scanner": values_of(scanner, digests=digests),
     }
 
 
