@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from sweep.spec.axes import Axis, Member
-from sweep.spec.fields import parameter_rules
+from sweep.spec.fields import SECTIONS
 from sweep.spec.flight import AnyScanner, Platform
 from sweep.spec.grounds import OPTICAL
 from sweep.spec.parts import Models, all_parts, fields_of, models_at, rule_of, values_of
@@ -95,11 +95,14 @@ def _object_geometry(values: Mapping[str, Any], places: Mapping[str, int]) -> di
 
 
 @cache
-def scene_units() -> MappingProxyType[str, str]:
-    """SI unit of every field of a scene by its name: one name has one unit wherever it stands."""
-    fields = [item for model in all_parts(*ROOTS) for item in fields_of(model).items()]
-    rules = {name: rule for name, field in fields if (rule := rule_of(field))}
-    return MappingProxyType({name: rule.units for name, rule in rules.items()})
+def field_units() -> MappingProxyType[str, str]:
+    """SI unit of every field by its name: one name has one unit wherever it stands."""
+    return MappingProxyType({
+        name: rule.units
+        for model in all_parts(*SECTIONS.values(), *ROOTS)
+        for name, field in fields_of(model).items()
+        if (rule := rule_of(field))
+    })  # fmt: skip
 
 
 class Identified(Protocol):
@@ -140,11 +143,7 @@ def _flat(identity: Mapping[str, Any]) -> dict[str, Any]:
 
 def _told(path: str, value: Any) -> str:
     """Format a leaf of an identity in words."""
-    rules = parameter_rules()
-    rule = rules.get(path) or next(
-        (rules[known] for known in rules if path.endswith("." + known)), None
-    )
-    unit = scene_units().get(path.rsplit(".", 1)[-1], "") if rule is None else rule.units
+    unit = field_units().get(path.rsplit(".", 1)[-1], "")
     units = f" {unit}" if unit else ""
     if value is None:
         return "(none)"
