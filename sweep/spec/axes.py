@@ -48,18 +48,6 @@ class Member:
     display: np.ndarray
     units: str
 
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, Member):
-            return NotImplemented
-        return (
-            (self.path, self.name, self.units) == (other.path, other.name, other.units)
-            and np.array_equal(np.asarray(self.values), np.asarray(other.values))
-            and np.array_equal(self.display, other.display)
-        )
-
-    def __hash__(self) -> int:
-        return hash((self.path, self.name, self.units, len(self.values)))
-
 
 @dataclass(frozen=True)
 class Axis:

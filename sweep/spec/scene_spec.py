@@ -234,11 +234,3 @@ class SceneSpec(Study):
                 for path, value in values_of(scanner, (name,), digests).items()
             },
         }
-
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, SceneSpec):
-            return NotImplemented
-        return self.to_json() == other.to_json()
-
-    def __hash__(self) -> int:
-        return hash(self.id)

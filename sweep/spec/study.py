@@ -275,6 +275,9 @@ class Study(Part):
         """Hash of the identity, 32 hexadecimal digits."""
         return digest(self.identity())
 
+    def __eq__(self, other: object) -> bool:
+        return type(other) is type(self) and self.to_json() == other.to_json()  # type: ignore[attr-defined]
+
     def __hash__(self) -> int:
         return hash(self.id)
 

@@ -3,6 +3,7 @@ import pickle
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -260,7 +261,11 @@ def test_a_stored_spec_comes_back_the_same():
     again = Spec.from_stored(text)
     assert again == original and hash(again) == hash(original)
     assert again.id == original.id
-    assert again.axes == original.axes
+    for one, other in zip(again.axes, original.axes, strict=True):
+        assert one.name == other.name
+        for a, b in zip(one.members, other.members, strict=True):
+            assert (a.path, a.name, a.units) == (b.path, b.name, b.units)
+            assert np.array_equal(a.values, b.values) and np.array_equal(a.display, b.display)
     assert again.figures == original.figures
     assert again.parameters() == original.parameters()
     assert again.to_json() == text
