@@ -6,7 +6,7 @@ They are held against the study that they draw: its coordinates, stored quantiti
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
@@ -110,6 +110,9 @@ def _variable() -> Any:
 class Drawing(Part):
     """Base of all figures."""
 
+    SHOWN: ClassVar[tuple[str, ...]] = ("kind",)
+    """Fields whose values make the file's name, and words between them."""
+
     name: str = of.text(
         "Stem of the picture's file name",
         "",
@@ -121,12 +124,8 @@ class Drawing(Part):
     @property
     def stem(self) -> str:
         """Stem of the picture's file name."""
-        return self.name or "_".join([*filter(None, self._shown), self.kind])  # type: ignore[attr-defined]
-
-    @property
-    def _shown(self) -> tuple[str | None, ...]:
-        """Contents of the figure, as parts of its file's name."""
-        return (getattr(self, "variable", self.kind),)  # type: ignore[attr-defined]
+        named = [getattr(self, part, part) for part in (*self.SHOWN, "kind")]
+        return self.name or "_".join(str(part) for part in named if part is not None)
 
 
 # Figures of grids
@@ -139,6 +138,7 @@ class GridDrawing(Drawing):
 class Surface(GridDrawing):
     """A quantity over two coordinates, seen from above."""
 
+    SHOWN = ("variable",)
     kind: Literal["surface"]
     variable: str = _variable()
     x: str = _coordinate()
@@ -149,6 +149,7 @@ class Surface(GridDrawing):
 class Slices(GridDrawing):
     """A quantity along one coordinate, a line for each value of another."""
 
+    SHOWN = ("variable",)
     kind: Literal["slices"]
     variable: str = _variable()
     x: str = _coordinate()
@@ -159,6 +160,7 @@ class Slices(GridDrawing):
 class Table(GridDrawing):
     """A quantity averaged over all but rows and columns."""
 
+    SHOWN = ("variable",)
     kind: Literal["table"]
     variable: str = _variable()
     rows: str = _coordinate()
@@ -273,18 +275,11 @@ class SceneDrawing(Drawing):
 
     where: dict[str, Selection] = _where()
 
-    @property
-    def named_scanners(self) -> dict[tuple[str | int, ...], str]:
-        """Scanners named, by where in the figure."""
-        scanner = getattr(self, "scanner", None)
-        listed = getattr(self, "scanners", None) or ()
-        named: dict[tuple[str | int, ...], str] = {("scanner",): scanner} if scanner else {}
-        return named | {("scanners", i): name for i, name in enumerate(listed)}
-
 
 class CloudFigure(SceneDrawing):
     """A point cloud."""
 
+    SHOWN = ("scanner", "colour")
     kind: Literal["cloud"]
     scanner: str | None = _scanner()
     colour: str = _quantity("What colours the points", "range")
@@ -299,14 +294,11 @@ class CloudFigure(SceneDrawing):
     dropouts: bool = of.flag("Whether to mark shots without a point", default=False)
     draw: int = _draw()
 
-    @property
-    def _shown(self) -> tuple[str | None, ...]:
-        return self.scanner, self.colour
-
 
 class Scatter(SceneDrawing):
     """A quantity of shots or points over another."""
 
+    SHOWN = ("scanner", "y", "over", "x")
     kind: Literal["scatter"]
     scanner: str | None = _scanner()
     x: str = _quantity("Quantity along x", "time")
@@ -316,14 +308,11 @@ class Scatter(SceneDrawing):
     time: Crop | None = _time()
     draw: int = _draw()
 
-    @property
-    def _shown(self) -> tuple[str | None, ...]:
-        return self.scanner, f"{self.y}_over_{self.x}"
-
 
 class ShotSpectra(SceneDrawing):
     """The three spectra of one shot, with threshold, noise and detections."""
 
+    SHOWN = ("scanner", "shot")
     kind: Literal["shot_spectra"]
     scanner: str | None = _scanner()
     shot: int | str = of.count(
@@ -332,14 +321,11 @@ class ShotSpectra(SceneDrawing):
     )  # fmt: skip
     draw: int = _draw()
 
-    @property
-    def _shown(self) -> tuple[str | None, ...]:
-        return self.scanner, str(self.shot)
-
 
 class _OfNavigation(SceneDrawing):
     """Base of figures and tables of navigation."""
 
+    SHOWN = ("quantity", "show")
     scanners: tuple[str, ...] | None = of.several(
         of.named("Scanner", "three"), 1, 10_000, None,
         about="Scanners; all by default", noun="names", distinct=True,
@@ -347,10 +333,6 @@ class _OfNavigation(SceneDrawing):
     quantity: str = of.choice("Velocity vector or altitude", ("velocity", "altitude"), "velocity")
     show: str = of.choice("Which statistics", ("all", "availability", "bias", "rmse"), "all")
     bins: int = of.count("Bins of altitude", "12", "1", "1000", default=12)
-
-    @property
-    def _shown(self) -> tuple[str | None, ...]:
-        return (f"{self.quantity}_{self.show}",)
 
 
 class NavigationFigure(_OfNavigation):
@@ -482,7 +464,9 @@ def _spectra_findings(figure: Any, at: Location) -> Iterator[Finding]:
 
 def _scanner_findings(figure: Any, scanners: Mapping[str, Any], at: Location) -> Iterator[Finding]:
     """Scanners that the study lacks, or of too few beams for navigation."""
-    for place, name in figure.named_scanners.items():
+    one, several = getattr(figure, "scanner", None), getattr(figure, "scanners", None) or ()
+    named: dict[Location, str] = {("scanner",): one} if one else {}
+    for place, name in (named | {("scanners", i): name for i, name in enumerate(several)}).items():
         if name not in scanners:
             remedy = near_miss(name, scanners, otherwise=f"it has {', '.join(scanners)}")
             yield Finding((*at, *place), "is no scanner of this study", remedy, name)
