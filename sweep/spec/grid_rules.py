@@ -72,7 +72,7 @@ class Grid:
     Parameters
     ----------
     values : mapping
-        SI values of the parameters off the axes by dotted path.
+        SI values of the parameters by dotted path; of those on axes, the value off the axis.
     axes : tuple of Axis
         The axes.
     modes : mapping
@@ -86,12 +86,9 @@ class Grid:
     @classmethod
     def of(cls, written: Mapping[str, Any], axes: tuple[Axis, ...]) -> Grid:
         """Grid of a spec as written."""
-        on_axes = {member.path for axis in axes for member in axis.members}
         values: dict[str, Any] = {}
         for path, rule in parameter_rules().items():
             found = at(written, path)
-            if path in on_axes:
-                continue
             with suppress(QuantityError):
                 value = default_of(path) if found is ABSENT else rule.read(found)
                 if value is not None:

@@ -13,11 +13,10 @@ import numpy as np
 from pydantic import BaseModel
 
 from sweep.spec.axes import Axis, Member
-from sweep.spec.fields import parameter_rules
+from sweep.spec.fields import SECTIONS
 from sweep.spec.flight import AnyScanner, Platform
 from sweep.spec.grounds import OPTICAL
-from sweep.spec.parts import Models, all_parts, fields_of, leaves, models_at, rule_of
-from sweep.spec.rules import File
+from sweep.spec.parts import Models, all_parts, fields_of, models_at, rule_of, values_of
 from sweep.spec.scene import ErrorFloor, Navigation, Scene, SceneDraws, SceneStorage
 
 LISTED_VALUES = 64
@@ -69,14 +68,6 @@ def digest(identity: Mapping[str, Any]) -> str:
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
 
-def leaf_values(part: BaseModel, digests: Mapping[str, str]) -> dict[str, Any]:
-    """SI values of a part by dotted path; of files, their digests."""
-    return {
-        ".".join(path): digests.get(value, value) if isinstance(rule, File) else value
-        for path, rule, value in leaves(part)
-    }
-
-
 def geometry_of(
     scene: Scene, platform: Platform, scanner: BaseModel, digests: Mapping[str, str]
 ) -> dict[str, Any]:
@@ -88,12 +79,12 @@ def geometry_of(
     places = {name: place for place, name in enumerate(scene.objects)}
     return {
         "objects": [
-            _object_geometry(leaf_values(thing, digests), places)
+            _object_geometry(values_of(thing, digests=digests), places)
             for thing in scene.objects.values()
         ],
         "origin": places.get(scene.origin, -1),
-        "platform": leaf_values(platform, digests),
-        "scanner": leaf_values(scanner, digests),
+        "platform": values_of(platform, digests=digests),
+        "scanner": values_of(scanner, digests=digests),
     }
 
 
@@ -104,11 +95,14 @@ def _object_geometry(values: Mapping[str, Any], places: Mapping[str, int]) -> di
 
 
 @cache
-def scene_units() -> MappingProxyType[str, str]:
-    """SI unit of every field of a scene by its name: one name has one unit wherever it stands."""
-    fields = [item for model in all_parts(*ROOTS) for item in fields_of(model).items()]
-    rules = {name: rule for name, field in fields if (rule := rule_of(field))}
-    return MappingProxyType({name: rule.units for name, rule in rules.items()})
+def field_units() -> MappingProxyType[str, str]:
+    """SI unit of every field by its name: one name has one unit wherever it stands."""
+    return MappingProxyType({
+        name: rule.units
+        for model in all_parts(*SECTIONS.values(), *ROOTS)
+        for name, field in fields_of(model).items()
+        if (rule := rule_of(field))
+    })  # fmt: skip
 
 
 class Identified(Protocol):
@@ -149,11 +143,7 @@ def _flat(identity: Mapping[str, Any]) -> dict[str, Any]:
 
 def _told(path: str, value: Any) -> str:
     """Format a leaf of an identity in words."""
-    rules = parameter_rules()
-    rule = rules.get(path) or next(
-        (rules[known] for known in rules if path.endswith("." + known)), None
-    )
-    unit = scene_units().get(path.rsplit(".", 1)[-1], "") if rule is None else rule.units
+    unit = field_units().get(path.rsplit(".", 1)[-1], "")
     units = f" {unit}" if unit else ""
     if value is None:
         return "(none)"

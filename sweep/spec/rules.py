@@ -34,6 +34,11 @@ BROKEN_RULE = "broken_rule"
 Json = dict[str, Any]
 
 
+def broken(rule: str, suggestion: str) -> PydanticCustomError:
+    """Mistake in a value, or in a section as a whole, told in pydantic's way."""
+    return PydanticCustomError(BROKEN_RULE, "{rule}", {"rule": rule, "suggestion": suggestion})
+
+
 @dataclass(frozen=True, kw_only=True)
 class Rule:
     """Rule of what a field may hold.
@@ -85,8 +90,7 @@ class Rule:
         try:
             return self.read(written)
         except QuantityError as error:
-            context = {"rule": error.rule, "suggestion": error.suggestion}
-            raise PydanticCustomError(BROKEN_RULE, "{rule}", context) from None
+            raise broken(error.rule, error.suggestion) from None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,8 +12,9 @@ from written_scenes import BOULDERS, RELIEF, RICH, with_object, written
 
 from sweep.scenes.files import SceneError
 from sweep.spec import SceneSpec, difference, from_stored
+from sweep.spec.fields import SECTIONS
 from sweep.spec.grounds import OPTICAL
-from sweep.spec.identity import ROOTS, scene_units
+from sweep.spec.identity import ROOTS, field_units
 from sweep.spec.parts import all_parts, fields_of, leaves, rule_of
 
 
@@ -306,11 +307,11 @@ def test_differences_are_told_with_units():
 
 
 def test_a_name_has_one_unit_wherever_it_stands():
-    for model in all_parts(*ROOTS):
+    for model in all_parts(*SECTIONS.values(), *ROOTS):
         for name, field in fields_of(model).items():
             rule = rule_of(field)
-            assert rule is None or scene_units()[name] == rule.units, name
-    assert scene_units()["half_angle"] == "rad" and len(all_parts(*ROOTS)) > 30
+            assert rule is None or field_units()[name] == rule.units, name
+    assert field_units()["half_angle"] == "rad" and len(all_parts(*ROOTS)) > 30
 
 
 def test_random_things_of_one_seed_share_no_numbers():
