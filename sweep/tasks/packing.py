@@ -28,7 +28,7 @@ from sweep.storage.opening import open_group
 from sweep.tasks import store, studies
 from sweep.tasks.errors import StoreError, told
 from sweep.tasks.journal import LOGS, RECIPE, committed
-from sweep.tasks.progress import Late, Progress, chosen
+from sweep.tasks.progress import Progress, chosen
 from sweep.tasks.study import ArrayLayout, BlockGrid, Study
 
 #: Bytes of a shard, before compression, as far as whole chunks allow; one a thread is in memory.
@@ -52,7 +52,7 @@ def pack(
         raise StoreError(f"{path} {why}")
     if output.exists():
         raise StoreError(f"{output} is there already: name another place")
-    shown = Late(chosen(progress))
+    shown = chosen(progress)
     with told(f"{output} can't be made"):
         if isinstance(output, Path):
             with draft(output) as aside:

@@ -34,7 +34,7 @@ from sweep.tasks import journal, lock, store, studies
 from sweep.tasks.errors import StoreError, told
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.journal import RECIPE, read_recipe
-from sweep.tasks.progress import Late, Progress, chosen
+from sweep.tasks.progress import Progress, chosen
 from sweep.tasks.studies import AnyStudy
 from sweep.tasks.study import Study
 
@@ -89,7 +89,7 @@ def verify(
     StoreError where there is no store of this program's, or one of another study than `spec`;
     where it can't be repaired.
     """
-    path, shown = located(path).absolute(), Late(chosen(progress))
+    path, shown = located(path).absolute(), chosen(progress)
     settle(path)
     study = _study(path, spec if repair else None)
     stores: dict[Location, AnyStudy | None] = {path: study}
@@ -174,6 +174,7 @@ def _of_blocks(path: Location, study: Study, shown: Progress) -> Iterator[Damage
     """Damages of the blocks that were committed."""
     committed = journal.digests(path, study.n_blocks)
     blocks = np.flatnonzero(committed != b"")
+    shown = shown if len(blocks) > BATCH else Progress()  # what is over soon shows nothing
     shown.begin(points=len(blocks), done=0, unit="blocks")
     try:
         with ThreadPoolExecutor(THREADS) as pool:
