@@ -100,7 +100,7 @@ def test_mistakes_over_a_scene_end_in_plain_words_and_exit_code_2(here):
     refused(sweep("figures", eyepoints), "eyepoints")
     (here / "turned.yaml").write_text(SCENE.replace("22.5 deg", "20 deg"))
     told = sweep("run", "turned.yaml", "--store", "results/descent.zarr")
-    refused(told, "scanners.three.half_angle", "0.39269", "rad")
+    refused(told, "scanners.three.half_angle: 22.5 deg -> 20 deg")
 
 
 def test_a_file_that_changes_under_a_study_is_noticed(here):
