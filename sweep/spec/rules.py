@@ -528,11 +528,11 @@ class Beams(Rule):
         example = "write e.g. [[22.5 deg, 0 deg], [0 deg, 0 deg]]"
         if not isinstance(written, list | tuple) or not 0 < len(written) <= MOST_BEAMS:
             raise QuantityError(f"must be a list of 1 to {MOST_BEAMS} beams", example)
-        return tuple(_read_element(_rule_of_beam(b), i, b) for i, b in enumerate(written))
+        return tuple(_read_element(rule_of_beam(b), i, b) for i, b in enumerate(written))
 
     def written(self, value: Any) -> Any:
         """Return lists that read back as exactly `value`."""
-        return [_rule_of_beam(beam).written(beam) for beam in value]
+        return [rule_of_beam(beam).written(beam) for beam in value]
 
     def schema(self) -> Json:
         """JSON Schema: a list of lists."""
@@ -541,7 +541,7 @@ class Beams(Rule):
         return {"description": self.about, "type": "array", "items": beam} | number
 
 
-def _rule_of_beam(beam: object) -> Several:
+def rule_of_beam(beam: object) -> Several:
     """Rule of a beam, by how many numbers it has."""
     return _POINTED if isinstance(beam, list | tuple) and len(beam) == 3 else STEERED
 
