@@ -285,12 +285,12 @@ def accuracy(
 ) -> None:
     """Measure what accuracy costs in SPEC: error against time of a ladder of settings.
 
-    A sample of the study's own points, the same every time, is computed with many settings: the
-    spec as written, effects on demand at tolerances from 0.1 to 1e-6, all effects on, the same
-    effects everywhere, fixed numbers of beamlets or draws, and the thesis's way. Errors are taken
-    against the finest of them all, and that is held against the time domain. All settings take
-    turns on parts of the sample, round after round, so that whatever slows the machine slows them
-    alike; the best round counts. Planning is counted, storing is not.
+    A sample of the study's own points, the same every time, is computed with many settings. These
+    are the spec as written, effects on demand at tolerances from 0.1 to 1e-6, all effects on, and
+    the same effects everywhere. Fixed numbers of beamlets or draws and the thesis's way follow.
+    Errors are differences from the finest setting, which is compared with the time domain. All
+    settings take turns on parts of the sample, round after round, so that a slow machine slows
+    them alike; the best round counts. Planning is counted, storing is not.
 
     The table has the time a point on one core and the errors; * marks settings that no other is
     both as fast and as accurate as. The store holds errors by setting and point, and opens with
