@@ -30,16 +30,16 @@ STUDIES = {
     "published": Study(
         "range_angle",
         "The published study",
-        "The thesis's range-angle study, 900,000 points, with the coherent footprint of 109 "
-        "beamlets that it has. Their number is part of that scene, so what can be chosen is "
-        "which effects are simulated, and where.",
+        "The thesis's range-angle study, 900,000 points, with its coherent footprint of 109 "
+        "beamlets. Their number is part of that scene. The only choice is which effects are "
+        "simulated, and where.",
     ),
     "rough_ground": Study(
         "range_angle",
         "The same over rough ground",
-        "The same grid as a user would ask for it today: the footprint's powers add, which is the "
-        "mean over rough ground, and `auto` takes as many beamlets as the tolerance needs, point "
-        "by point. Against it stand fixed numbers of them, in the thesis's lattice or in a line "
+        "The same grid as a user would write it today. The powers of beamlets add, which is the "
+        "mean over rough ground. At each point `auto` takes as many beamlets as the tolerance "
+        "needs. It is compared with fixed numbers of them, in the thesis's lattice or in a line "
         "along the slope.",
         {"title": "Detection over range and grazing angle, rough ground",
          "footprint.phases": "incoherent", "footprint.beamlets": "auto"},
@@ -48,21 +48,21 @@ STUDIES = {
         "scan_pattern_comparison",
         "A landing",
         "Three, four and sixteen beams in a descent from 2 km, with all of the light and with "
-        "little of it. A point is a shot with its rays: casting them, planning, spectra and "
-        "probabilities.",
+        "little of it. A point is a shot with its rays. Its time covers casting the rays, "
+        "planning, spectra and probabilities.",
     ),
     "speckle": Study(
         "speckled_target",
         "A speckled target",
-        "A rough plane whose speckle is drawn. Draws are what accuracy costs here: the mean of "
-        "each draw's probabilities, detections counted against them, or noise in every bin.",
+        "A rough plane whose speckle is drawn. Here accuracy costs draws: the mean of each draw's"
+        " probabilities, detections counted against them, or noise in every bin.",
     ),
 }  # fmt: skip
 
 HEAD = """# What accuracy costs
 
-How accurate is a probability of detection, and how much time does each digit take? `sweep accuracy`
-answers that for any spec, on a sample of its own points, in a minute:
+How accurate is a probability of detection, and how much time does each digit take? `sweep
+accuracy` answers that for any spec, on a sample of its own points, in a minute:
 
 ```sh
 sweep accuracy experiments/range_angle.yaml
@@ -82,30 +82,30 @@ The same code that computes the study computes a ladder of settings, in one proc
 - fixed numbers of beamlets, where they add as powers, and of draws, in studies with draws;
 - the thesis's way.
 
-Settings take turns on parts of the sample, each round in an order of its own, so a slow machine
-slows all of them alike. A very short study has up to 27 rounds. The cost of a point depends on its
+Settings take turns on parts of the sample, in a new order each round, so a slow machine slows all
+of them alike. A very short study has up to 27 rounds. The cost of a point depends on its
 neighbours, because they share intermediate results. Times are therefore measured on some thousands
-of points of a block, around points of the sample. They are processor times. The best round counts
-for them. Ratios are medians of those within each round, or of the best if there are but two.
-Planning counts with the points planned. Storing does not count, as all settings share it; the page
-gives the processor time for making the store and writing its blocks separately.
+of points of a block, around points of the sample. They are processor times of the best round. A
+ratio is the median of the ratios within each round, or the ratio of the best of two rounds. The
+time for planning is divided among the points planned. Storing is left out, because all settings
+share it. The page gives the processor time for making the store and writing its blocks separately.
 
 The **error** of a setting is the quantity that a tolerance bounds: the largest difference from the
 reference over all points. It covers the probabilities of detection of the segments and the shot,
 log10 of a probability of false alarm, and the magnitude of a peak's bin over itself or sigma. If
 draws make errors random, the error is that of pd at 95 % of the points.
 
-The error of the leakage probability has a column of its own. It jumps where a bin comes to the
-threshold and counts as detected, so no error of the spectrum bounds it. A setting that skips
-leakage where there is some does less than the others, and is none of the fixed settings compared.
+The error of the leakage probability has a column of its own. This probability jumps where a bin
+reaches the threshold and counts as detected, so no error of the spectrum bounds it. A setting that
+skips leakage where there is some does less than the others. It is left out of the comparison.
 
 The reference has all effects on, lines and leakage to 1e-9, and the finest footprint. It is
 compared with the time domain, sample by sample, at some of the same points. The figures also show
-the error in pd that 90 % and half of the points stay below.
+the error in pd at the median and at 90 % of the points.
 
 **The thesis's way** ([T] 3.3.1) puts each beamlet's line into the nearest cell of a grid with 16
-cells a bin. It convolves the grid with the window's transform by a complex FFT of 2^11 or 2^12, and
-samples the result at the bins. Three improvements are measured as well:
+cells a bin. It convolves the grid with the window's transform by a complex FFT of 2^11 or 2^12,
+and samples the result at the bins. Three improvements are measured too:
 
 - `real`: half the transform, where powers add and the grid is real ([T] adds amplitudes, which are
   complex);
@@ -113,19 +113,20 @@ samples the result at the bins. Three improvements are measured as well:
 - `degree 9`: lines shared out among ten cells, which puts them at their exact place.
 
 All are compiled and transform many spectra at once (`sweep/tasks/accuracy/bench.py`). They compute
-neither leakage nor range walk, and share preparation and detection with the rest. The closed form
-with the same beamlets and effects is measured too.
+neither leakage nor range walk. They share preparation and detection with the other settings. The
+closed form with the same beamlets and effects is measured too.
 
 Adaptive settings have to meet two requirements, which the numbers below test:
 
-- at equal error they are never slower by more than 10 % than the best single fixed setting;
+- at equal error (neither setting exceeds it) they are never slower by more than 10 % than the best
+  single fixed setting;
 - they are at least 5 times as fast as the thesis's way at its error.
 
-Planning counts for adaptive settings alone. A block takes some 1 ms to be planned. This is
-negligible for a thousand points, and most of the time of a study of one or two points. If adaptive
-settings are slower by more than 10 %, `sweep accuracy` prints the loss, and the loss including the
-making of the store. A real run plans fixed settings too, because its store holds the error of
-skipped effects, and its blocks draw points and solve for velocities as well.
+Planning is counted for adaptive settings alone. It takes some 1 ms a block. This is negligible for
+a thousand points, and most of the time of a study of one or two points. If adaptive settings are
+slower by more than 10 %, `sweep accuracy` prints the loss, with and without the making of the
+store. A real run plans fixed settings too, because its store holds the error of skipped effects.
+Its blocks also draw points and solve for velocities.
 """
 
 TAIL = """

@@ -64,58 +64,58 @@ VARIANTS = {
 HEAD = """# Is the tolerance kept?
 
 Written by `make promise`. It computes 1,000 random points of each experiment (of flights, some
-tiles of shots) at each `accuracy.tolerance`, with `footprint.beamlets: auto` where their number is
-free. The reference has all effects on and as many beamlets as at 1e-9, or in flights more rays than
-any tolerance needs.
+tiles of shots) at each `accuracy.tolerance`. `footprint.beamlets` is `auto` where the experiment
+leaves the number free. The reference has all effects on. It has as many beamlets as at 1e-9, or in
+flights more rays than any tolerance needs.
 
 The columns are the errors of pd (the largest of segments and shot), of log10 of the probability of
 a false alarm, and of |X| of the largest bins. The error of |X| is relative to itself, or to sigma
 if that is larger. A cell has the error of the worst point. If not all points are within the
-tolerance, it begins with the share of those that are; 99.9 % are required. Points that are drawn
-have a table of their own.
+tolerance, it begins with the share of those that are; 99.9 % are required. Studies with draws have
+a table of their own.
 
-Leakage has a column too, the probability in the up- or the down-chirp. Skipping leakage itself
-keeps the tolerance. The tolerance does not cover its change by other skipped effects and by few
-beamlets ([effects](effects.md)), which this column shows. Settings are not compared by it.
+The last error is that of the probability of leakage in the up- or the down-chirp. Skipping leakage
+itself keeps the tolerance. The tolerance does not cover the change of leakage by other skipped
+effects and by few beamlets ([effects](effects.md)). This column shows that change. It does not
+count in comparisons of settings.
 
-One bin more or fewer that a detection occupies, of the 65,536 that could raise a false alarm, is
-6.6e-6 of log10 pfa.
+A detection occupies some of the 65,536 bins that could raise a false alarm. One bin more or fewer
+changes log10 pfa by 6.6e-6.
 
-`us` is processor time a point, planning included. `fixed` is that of the cheapest setting that
-keeps the tolerance here with the same effects at every point, and with lines and leakage to one of
-the six tolerances. `front` is that of the cheapest such setting whose worst error is no larger than
-this row's: the front of error against time of `sweep accuracy`.
+`us` is processor time a point, planning included. Two columns have the time of other settings, with
+the same effects at every point, and with lines and leakage to one of the six tolerances. `fixed` is
+the cheapest of these that keeps the tolerance. `front` is the cheapest whose worst error is no
+larger than this row's, as on the front of error against time of `sweep accuracy`.
 
 """
 RAYS = f"""
 ## Flights against many more rays
 
 Each beamlet of a flight is a ray. If powers add, `footprint.beamlets: auto` casts few rays for
-every shot, and more for shots that need them. The rows show the number of rays of a shot, and the
-error against all effects on with {FINEST_RAYS:,} rays of every shot, or with more until the
-estimated error is below {FINEST_RAYS_TOLERANCE:g}, {Accuracy.rays[-1]:,} at the most. A number
-given by an experiment has a row too, with all effects on. The last row of each flight shows that
-the reference suffices: it compares it with {MORE_RAYS:,} rays and more, at a part of the flight. A
-cell has the share of shots within the tolerance, the error that 90 % of the shots keep, and the
-worst. `us` is processor time a shot, rays included.
+every shot, and more for shots that need them. The rows show the number of rays of a shot, and
+the error against a reference. The reference has all effects on and {FINEST_RAYS:,} rays of every
+shot, or more until the estimated error is below {FINEST_RAYS_TOLERANCE:g}, {Accuracy.rays[-1]:,} at
+the most. A number given by an experiment has a row too, with all effects on. The last row of each
+flight compares the reference with {MORE_RAYS:,} rays and more, at a part of the flight. A cell has
+the share of shots within the tolerance, the largest error of the best 90 % of the shots, and the
+worst error. `us` is processor time a shot, rays included.
 
-If phases are coherent the number of beamlets is part of the scene, as in the thesis, and no number
-is enough: a smooth slope sends next to nothing back, and the rest of the sum depends on the number.
-These flights have one row, their own number against {MANY:,}.
+If phases are coherent, the number of beamlets is part of the scene, as in the thesis. No number is
+enough: a smooth slope sends almost nothing back, and the small sum that remains depends on the
+number. These flights have one row, their own number against {MANY:,}.
 """
 COSTS = """
 ## Cost and tolerance
 
-Does cost rise with accuracy no faster than the front of error against time? The first table has the
-ratio of `us` to the cheapest setting with the same effects at every point whose worst error is no
-larger (`front`), from one tolerance to the next. Cost has risen no faster if no ratio is higher by
-more than {margin:.0%} than the first, or than 1 if the first is lower.
+The test asks whether cost rises with accuracy no faster than on the front of error against time.
+The first table has the ratio of `us` to `front` at each tolerance. The answer is yes if no ratio is
+higher by more than {margin:.0%} than the first, or than 1 if the first is lower.
 
 {front}
 
 A stricter test compares with the cheapest setting that keeps the tolerance (`fixed`). Its accuracy
 is known only afterwards, and most settings are far more accurate than their tolerance. So the
-setting for a loose tolerance often does for tighter ones too, at the same cost.
+setting for a loose tolerance often serves for tighter ones too, at the same cost.
 
 {fixed}
 """

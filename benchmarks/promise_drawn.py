@@ -38,14 +38,14 @@ HEAD = """
 ## Points that are drawn
 
 {name}: all of its {points} points, drawn until the tolerance is met, {seeds}, each with another
-seed. They are held against the exact means over endless draws: of one beamlet a closed form, of the
-shot an integral (on segments it is within {off:.0e} of the closed form). Promised is, with
-{confidence:.0%} confidence, that pd is `within` the tolerance, and within its own half-width.
+seed. They are compared with the exact means over endless draws. For segments this is a closed form,
+for the shot an integral (on segments it is within {off:.0e} of the closed form). The promise is
+that pd is `within` the tolerance, and within its own half-width, with {confidence:.0%} confidence.
 
-Draws decide where pd varies and is further than the tolerance from 0 and 1; nearer to them
-intervals are surer than promised ([draws.md](draws.md)). Of those points, columns by name have the
-share that is within its half-width, and how many standard deviations of such a share it is from
-{confidence:.0%}: within {sigmas:g} is asked for.
+The test counts the points where pd varies and is further than the tolerance from 0 and 1. Nearer to
+0 and 1 intervals are surer than promised ([draws.md](draws.md)). The columns named after
+probabilities have the share of these points that is within its half-width, and how many standard
+deviations of such a share it is from {confidence:.0%}. At most {sigmas:g} are allowed.
 """
 COLUMNS = (
     "tolerance", "points", "within", "draws decide", "within of these", *PROMISED, "draws", "us",

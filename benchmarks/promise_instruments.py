@@ -163,11 +163,11 @@ def _apart(own: dict[str, Any], exact: dict[str, Any], told: np.ndarray, leaks: 
 SECTION = """
 ## Instruments drawn at random
 
-{number:,} instruments, drawn anew each time, whose lines lie within {near:g} bins of DC or Nyquist
-and are smeared by range walk, acceleration, a crooked sweep, line width and jitter, each over many
-decades; every point is planned by itself. A cell has the share of the points within the tolerance,
-and the worst error: of pd; of |X|, and so the root of `snr_*`, over itself or sigma; of leakage
-where it is asked for.
+The test draws {number:,} new instruments each time. Their lines lie within {near:g} bins of DC or
+Nyquist. Range walk, acceleration, a nonlinear sweep, line width and jitter smear them, each over
+many decades. Every point is planned by itself. A cell has the share of the points within the
+tolerance, and the worst error. The errors are those of pd, of |X| (and so of the root of `snr_*`)
+over itself or sigma, and of leakage if the spec requests it.
 """
 
 

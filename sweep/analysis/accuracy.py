@@ -251,16 +251,17 @@ def _written(dataset: xr.Dataset, settings: Sequence[Setting]) -> str:
     (written,) = of_kinds(settings, WRITTEN)
     number, unit = dataset.attrs["study_points"], dataset.attrs["unit"]
     best = cheapest(candidates(settings), written.error)
-    whole = f"all {number:,} {unit} take" if number > 1 else "that is"
+    whole = f"All {number:,} {unit} take" if number > 1 else "The study takes"
     text = (
-        f"As written: {microseconds(written.seconds)} us a point, error {error(written.error)}; "
+        f"As written: {microseconds(written.seconds)} us a point, error {error(written.error)}. "
         f"{whole} {_time(number * written.seconds)} on one core"
     )
     if (stored := dataset.attrs.get(STORING)) is not None:
-        text += f", and at least {_time(stored)} to be stored, whatever the setting"
+        text += f"; storing them takes at least {_time(stored)} more with any setting"
     if best is None or best is written or best.times_faster(written) < 1.05:
-        return text + ". Nothing tried is faster and as accurate."
-    return text + f". As accurate and {best.times_faster(written):.2g} times faster: {best.name}."
+        return text + ". No other setting is both faster and as accurate."
+    times = f"{best.times_faster(written):.2g}"
+    return text + f". The setting {best.name} is {times} times as fast and as accurate."
 
 
 def _fixed(duels: Sequence[Duel], attributes: dict) -> list[str]:
@@ -269,13 +270,13 @@ def _fixed(duels: Sequence[Duel], attributes: dict) -> list[str]:
         return []
     worst = min(duels, key=lambda duel: duel.times_faster)
     if worst.other is None:
-        return ["At equal error: no fixed setting is as accurate as any adaptive one."]
-    kept = "kept" if worst.times_faster >= AS_FAST else _lost(worst, duels, attributes)
+        return ["No fixed setting is as accurate as any adaptive one."]
+    met = "met" if worst.times_faster >= AS_FAST else _lost(worst, duels, attributes)
     several = [duel.times_faster for duel in duels if duel.other]
     return [
-        f"At equal error, adaptive against the best single fixed setting: {_span(several)} times "
-        f"as fast; least {worst.adaptive.name} against {worst.other.name}. "
-        f"Never slower by more than 10 %: {kept}."
+        f"At equal error, adaptive settings are {_span(several)} times as fast as the best single "
+        f"fixed setting. Least speed-up: {worst.adaptive.name} over {worst.other.name}. "
+        f"Requirement, never slower by more than 10 %: {met}."
     ]
 
 
@@ -284,7 +285,7 @@ def _lost(worst: Duel, duels: Sequence[Duel], attributes: dict) -> str:
     points = attributes["study_points"]
     slower = worst.adaptive.seconds * (1 - worst.times_faster)
     lost, planning = (_time(points * each) for each in (slower, worst.adaptive.planning))
-    told = f"NOT kept, by {lost} in all; planning takes {planning}"
+    told = f"NOT met, by {lost} in all; planning takes {planning}"
     if (stored := attributes.get(STORING)) is None:
         return told
     whole = min(duel.with_besides(stored / points) for duel in duels)
@@ -296,26 +297,27 @@ def _thesis(settings: Sequence[Setting], beamlets: int) -> list[str]:
     duels = against_thesis(settings)
     if not duels:
         return []
-    kept = " and ".join(
-        f"{'kept' if duel.times_faster >= TIMES_FASTER else 'NOT kept'} against {_name(duel)}"
+    met = " and ".join(
+        f"{'met' if duel.times_faster >= TIMES_FASTER else 'NOT met'} over {_name(duel)}"
         for duel in duels
     )
-    least = f"At least {TIMES_FASTER:g} times as fast: {kept}."
+    least = f"Requirement, at least {TIMES_FASTER:g}: {met}."
     if beamlets != OF_THESIS:
-        least = f"With this scene's {beamlets} beamlets, that is, where the thesis has {OF_THESIS}."
-    told = [f"Against the thesis's way at the error that it has: {_told(duels)}. {least}"]
+        least = f"This scene has {beamlets} beamlets, the thesis {OF_THESIS}."
+    told = [f"The thesis's way is compared at its own error. {_speed_ups(duels)} {least}"]
     if improved := against_thesis(settings, IMPROVED):
-        told.append(f"Against what it can be improved to: {_told(improved)}.")
+        told.append(f"Improved versions of it are compared likewise. {_speed_ups(improved)}")
     return told
 
 
-def _told(duels: Sequence[Duel]) -> str:
-    return "; ".join(
-        f"{duel.adaptive.name} is {duel.times_faster:.2g} times as fast as {_name(duel)} "
-        f"(error {error(duel.other.error)})"
-        for duel in duels
-        if duel.other
-    )
+def _speed_ups(duels: Sequence[Duel]) -> str:
+    """One sentence for each adaptive setting and error."""
+    groups: dict[str, list[str]] = {}
+    for duel in duels:
+        if duel.other:
+            of = f"{duel.adaptive.name}, error {error(duel.other.error)}"
+            groups.setdefault(of, []).append(f"{duel.times_faster:.2g} over {duel.other.name}")
+    return " ".join(f"Speed-up of {of}: {'; '.join(each)}." for of, each in groups.items())
 
 
 def _name(duel: Duel) -> str:
@@ -324,28 +326,32 @@ def _name(duel: Duel) -> str:
 
 def _like_for_like(settings: Sequence[Setting]) -> list[str]:
     """Compare the closed form with the thesis's way: same beamlets, same effects."""
-    told = [
-        f"{closed.times_faster(thesis):.2g} times as fast as {thesis.name}"
-        for closed in of_kinds(settings, CLOSED_FORM)
-        for thesis in of_kinds(settings, THESIS, IMPROVED)
-    ]
-    if not told:
+    described, improved = (
+        "; ".join(
+            f"{closed.times_faster(thesis):.2g} over {thesis.name}"
+            for closed in of_kinds(settings, CLOSED_FORM)
+            for thesis in of_kinds(settings, kind)
+        )
+        for kind in (THESIS, IMPROVED)
+    )
+    if not described:
         return []
-    return [
-        "Like for like, the same beamlets and effects (none within a record, as range walk, and no "
-        f"leakage), the closed form is {', '.join(told)}."
-    ]
+    text = (
+        "The closed form is compared with the thesis's way for the same beamlets and effects, "
+        f"without leakage and changes within a record (range walk). Speed-up: {described}."
+    )
+    return [text + (f" Speed-up over improved versions: {improved}." if improved else "")]
 
 
 def _reference(attributes: dict) -> str:
     text = f"Reference: {attributes['reference']}"
     if not attributes["truth_points"]:
-        return text + ", not held against the time domain."
+        return text + ". It is not compared with the time domain."
     fewer = f", with {n} beamlets in both," if (n := attributes["truth_beamlets"]) else ""
     return text + (
-        f"; at {attributes['truth_points']} {attributes['unit']}{fewer} it is within "
-        f"{error(attributes['truth_pd_difference'])} of the time domain's pd, within "
-        f"{error(attributes['truth_magnitude_difference'])} of its magnitudes."
+        f". At {attributes['truth_points']} {attributes['unit']}{fewer} it differs from the time "
+        f"domain by {error(attributes['truth_pd_difference'])} in pd and by "
+        f"{error(attributes['truth_magnitude_difference'])} in magnitude."
     )
 
 

@@ -99,27 +99,28 @@ class Commands(click.Group):
 def main() -> None:
     """Sweep an FMCW Doppler lidar's parameters and store how well it detects.
 
-    A study is a short YAML file, its result a Zarr store. A session may go:
+    A study is a short YAML file. Its results are a Zarr store. A typical session:
 
     \b
       sweep plan experiments/quickstart.yaml      how much work is it?
-      sweep run experiments/quickstart.yaml       do it, on all cores
-      sweep status results/quickstart.zarr        how far is it? (any time)
-      sweep resume results/quickstart.zarr        go on after an interruption
-      sweep extend results/quickstart.zarr ...    more values, axes, draws: only what is new
-      sweep verify results/quickstart.zarr        is every byte as it was written?
-      sweep figures results/quickstart.zarr       draw it
-      sweep report results/quickstart.zarr        one page with all of it, for a browser
+      sweep run experiments/quickstart.yaml       compute it on all cores
+      sweep status results/quickstart.zarr        show its progress (any time)
+      sweep resume results/quickstart.zarr        continue after an interruption
+      sweep extend results/quickstart.zarr ...    add values, axes, draws
+      sweep verify results/quickstart.zarr        check every byte
+      sweep figures results/quickstart.zarr       draw its figures
+      sweep report results/quickstart.zarr        write one page for a browser
       sweep compare results/a.zarr results/b.zarr what differs between two studies?
       sweep accuracy experiments/quickstart.yaml  what does accuracy cost in time?
       sweep instruments                           which instruments can a spec name?
 
-    A spec with a scene flies the lidar over terrain and makes point clouds; sweep export writes
-    them as PLY, LAS or CSV, or as the unit's interface reports them.
+    A spec with a scene flies the lidar over terrain and makes point clouds. sweep export writes
+    them as PLY, LAS or CSV, or as reports of the unit's interface.
 
-    Ctrl-C once finishes what runs and stops; nothing that is written is lost.
+    One Ctrl-C finishes the running blocks and stops. Results already written are kept.
 
-    Exit codes: 0 done, 1 failed, 2 a mistake in what was asked, 3 incomplete (resume goes on).
+    Exit codes: 0 done, 1 failed, 2 a mistake in the spec or the command, 3 incomplete (sweep resume
+    continues).
     """  # noqa: D301
 
 
@@ -128,22 +129,22 @@ def main() -> None:
 @click.option(
     "--store",
     type=StorePath(),
-    help="Where to, on disk or s3://bucket/name.zarr [results/<name of the spec>.zarr].",
+    help="Store to write, on disk or s3://bucket/name.zarr [results/<name of the spec>.zarr].",
 )
 @click.option(
     "--overwrite",
     is_flag=True,
-    help="Replace a store that is there, once the new one is complete; on disk only.",
+    help="Replace an existing store once the new one is complete; on disk only.",
 )
-@click.option("--yes", is_flag=True, help="Begin a very large study without a question.")
+@click.option("--yes", is_flag=True, help="Start a very large study without asking.")
 @computing
 def run(spec: Path, store: Location | None, overwrite: bool, yes: bool, **how: Any) -> None:
     """Compute the study SPEC into a Zarr store.
 
-    More than 1e9 points, 1 TB of results or 30 days of one core begin only after a question.
+    Studies of more than 1e9 points, 1 TB of results or 30 days of one core ask before they start.
 
-    A table at the end says how probable detection is; where the study draws, another says at how
-    many points that is known within accuracy.tolerance, and how many draws the worst one needs.
+    A table at the end has the probability of detection. For a study with draws, a second table has
+    the number of points within accuracy.tolerance, and the draws that the worst point needs.
 
     \b
       sweep run experiments/quickstart.yaml
@@ -171,15 +172,15 @@ def _default_store(spec: Path) -> Path:
 @click.option(
     "--spec",
     type=LocalPath(exists=True, dir_okay=False),
-    help="Go on only if the store holds this study.",
+    help="Resume only if the store holds this study.",
 )
-@click.option("--retry-failed", is_flag=True, help="Also try again what failed before.")
+@click.option("--retry-failed", is_flag=True, help="Compute again the blocks that failed before.")
 @computing
 def resume(store: Location, spec: Path | None, retry_failed: bool, **how: Any) -> None:
-    """Compute what STORE lacks: what was interrupted, what was lost.
+    """Compute the missing and damaged blocks of STORE.
 
-    Blocks that failed twice are skipped, since they might cost every later run a worker, unless
-    --retry-failed is given; sweep status lists them with their errors.
+    Blocks that failed twice are skipped unless --retry-failed is given, because they might kill a
+    worker in every later run. sweep status lists them with their errors.
 
     \b
       sweep resume results/range_angle.zarr
@@ -199,9 +200,9 @@ def resume(store: Location, spec: Path | None, retry_failed: bool, **how: Any) -
 def plan(spec: Path, workers: int | None) -> None:
     """Print the size and time of SPEC, and the effects it simulates. Nothing is written.
 
-    The time comes from about a second of computing points of the study itself. For each effect a
-    table gives the points at which it is simulated, a bound on its change of pd, log10 pfa or
-    magnitude, and its share of a point's time.
+    The time is measured on points of the study, in about a second. For each effect a table gives
+    the points at which it is simulated, a bound on its change of pd, log10 pfa or magnitude, and
+    its share of a point's time.
     """
     from sweep.spec import load
     from sweep.tasks.progress import working
@@ -223,9 +224,11 @@ def plan(spec: Path, workers: int | None) -> None:
 
 @main.command()
 @SPEC
-@at("A parameter's value; as often as needed.")
-@click.option("--noise/--no-noise", default=True, help="Draw the noise of one shot, or only lines.")
-@click.option("--seed", type=click.IntRange(min=0), help="Seed of that noise [the spec's].")
+@at("Value of a parameter; can be repeated.")
+@click.option(
+    "--noise/--no-noise", default=True, help="Add the noise of one draw [default], or not."
+)
+@click.option("--seed", type=click.IntRange(min=0), help="Seed of the noise [the spec's].")
 @folder("Directory of the figure [results/<name of the spec>].")
 @FORMAT
 def shot(
@@ -269,7 +272,7 @@ def _list(files: Sequence[Location]) -> None:
 @click.option(
     "--store",
     type=StorePath(),
-    help="Where to [results/<name of the spec>_accuracy.zarr].",
+    help="Store to write [results/<name of the spec>_accuracy.zarr].",
 )
 @click.option(
     "--points", type=click.IntRange(min=1), default=200, help="Points of the sample [200]."
@@ -279,7 +282,7 @@ def _list(files: Sequence[Location]) -> None:
     type=click.FloatRange(min=0, min_open=True),
     default=60.0,
     metavar="SECONDS",
-    help="Time that it may take, about [60].",
+    help="Approximate limit of the time [60].",
 )
 @OVERWRITE
 def accuracy(
@@ -287,16 +290,18 @@ def accuracy(
 ) -> None:
     """Measure what accuracy costs in SPEC: error against time of a ladder of settings.
 
-    A sample of the study's own points, the same every time, is computed with many settings: the
-    spec as written, effects on demand at tolerances from 0.1 to 1e-6, all effects on, the same
-    effects everywhere, fixed numbers of beamlets or draws, and the thesis's way. Errors are taken
-    against the finest of them all, and that is held against the time domain. All settings take
-    turns on parts of the sample, round after round, so that whatever slows the machine slows them
-    alike; the best round counts. Planning is counted, storing is not.
+    The command computes a sample of the study's own points, the same every time, with many
+    settings. These are the spec as written, effects on demand at tolerances from 0.1 to 1e-6, all
+    effects on, and the same effects everywhere. Fixed numbers of beamlets or draws and the thesis's
+    way are measured too.
+    Errors are differences from the finest setting, which is compared with the time domain. All
+    settings take turns on parts of the sample, round after round, so that a slow machine slows
+    them alike; the best round counts. Planning is counted, storing is not.
 
-    The table has the time a point on one core and the errors; * marks settings that no other is
-    both as fast and as accurate as. The store holds errors by setting and point, and opens with
-    xarray; the figure is next to it, and `sweep figures` draws it anew. Ctrl-C keeps what is done.
+    The table has the time a point on one core and the errors. A star marks settings that no other
+    setting beats in both time and error. The store holds errors by setting and point, and opens
+    with xarray. The figure is next to the store, and `sweep figures` draws it again. Ctrl-C keeps
+    the results so far.
 
     \b
       sweep accuracy experiments/quickstart.yaml
@@ -318,10 +323,10 @@ def accuracy(
 
 @main.command()
 @STORE
-@folder("Directory of the figures [NAME-figures beside NAME.zarr].")
+@folder("Directory of the figures [NAME-figures next to NAME.zarr].")
 @FORMAT
 def figures(store: Location, output: Path | None, form: str) -> None:
-    """Draw the figures and tables that the study in STORE asks for."""
+    """Draw the figures and tables of the study in STORE."""
     from sweep.analysis.figures import draw
     from sweep.tasks.progress import working
 
@@ -333,14 +338,14 @@ def figures(store: Location, output: Path | None, form: str) -> None:
 @main.command()
 @STORE
 @click.argument("file", type=LocalPath(dir_okay=False))
-@click.option("--scanner", help="Which scanner's points, where the study has several.")
+@click.option("--scanner", help="Scanner of the points, if the study has several.")
 @click.option("--draw", type=click.IntRange(min=0), default=0, help="Number of the draw [0].")
 @click.option(
     "--ranges",
     default="interpolated",
-    help="Ranges and velocities: interpolated between bins [default], or quantised to them.",
+    help="Ranges and velocities: interpolated between bins [default], or quantised to bins.",
 )
-@at("Value of a coordinate, where the study has axes; as often as needed.")
+@at("Value of a coordinate, if the study has axes; can be repeated.")
 @click.option(
     "--as",
     "form",
@@ -352,7 +357,7 @@ def figures(store: Location, output: Path | None, form: str) -> None:
     "--interface",
     multiple=True,
     metavar="NAME=VALUE",
-    help="A field of the spec's interface set anew, for reports; as often as needed.",
+    help="New value of a field of the spec's interface, for reports; can be repeated.",
 )
 def export(
     store: Location, file: Path, at: tuple[str, ...], form: str, interface: tuple[str, ...],
@@ -360,9 +365,9 @@ def export(
 ) -> None:  # fmt: skip
     """Write the point cloud in STORE to FILE: .ply, .las, .laz or .csv.
 
-    Reports are what a unit's interface passes on: values in whole quanta and within limits, at its
-    own rate, with a flag of validity and a latency, as the spec's section `interface` states them.
-    Nothing is computed anew, so any interface can be tried on one store.
+    Reports are the points as a unit's interface passes them on: values in whole quanta and within
+    limits, at its own rate, with a flag of validity and a latency. The spec's section `interface`
+    states these. No point is computed again, so one store serves to try any interface.
 
     \b
       sweep export results/forest_scan.zarr forest.las
@@ -394,9 +399,9 @@ def export(
 def certificates(directory: Path) -> None:
     """Make certificates for a cluster in DIRECTORY: ca.pem, certificate.pem and key.pem.
 
-    Put the output into the cluster's file: scheduler, workers and client then talk TLS, and refuse
-    whoever has no such certificate. Keep the directory to yourself, where all machines of the
-    cluster see it. They hold for a year.
+    Put the output into the cluster's file. Scheduler, workers and client then use TLS, and refuse
+    connections without such a certificate. All machines of the cluster must see the directory, and
+    nobody else may read it. The certificates are valid for a year.
     """
     from sweep.tasks.clusters.machines import make_certificates
 
@@ -409,16 +414,17 @@ def certificates(directory: Path) -> None:
 @main.command()
 @click.argument("name", required=False)
 def instruments(name: str | None) -> None:
-    """List the instruments that a spec may name, or tell all about NAME.
+    """List the instruments that a spec may name, or describe NAME.
 
-    A spec takes one whole, `instrument: settembrini_2026`, or with some fields set anew:
+    A spec takes a whole instrument, `instrument: settembrini_2026`, or changes some fields:
 
     \b
       instrument:
         like: settembrini_2026
         laser: {power: 1 mW}
 
-    A result's store holds all of its fields, and a study is the same as with them written out.
+    A store holds all fields of the instrument. The study is the same as with all fields in the
+    spec.
 
     \b
       sweep instruments
@@ -440,7 +446,7 @@ def instruments(name: str | None) -> None:
 
 @main.command()
 def schema() -> None:
-    """Print the JSON Schema of specs, for editors that check while one types."""
+    """Print the JSON Schema of specs, for editors that check a spec as you type."""
     import json
 
     from sweep.spec import json_schema
@@ -456,18 +462,18 @@ def schema() -> None:
     "fields",
     multiple=True,
     metavar="FIELD=VALUE",
-    help="A field of the larger study, as it would stand in a file; as often as needed.",
+    help="A field of the larger study, written as in a spec file; can be repeated.",
 )
 @click.option(
     "--store",
     "to",
     type=StorePath(),
-    help="Where the larger store goes; the old one then stays [in its place].",
+    help="Path of the larger store; the old store is then kept [replace STORE].",
 )
 @click.option(
     "--overwrite",
     is_flag=True,
-    help="Begin anew where one was begun; with --store, replace what is there.",
+    help="Discard an unfinished extension; with --store, replace an existing store.",
 )
 @computing
 def extend(
@@ -478,15 +484,15 @@ def extend(
     overwrite: bool,
     **how: Any,
 ) -> None:
-    """Extend STORE to a larger study, and compute only what is new.
+    """Extend STORE to a larger study, and compute only the new points and draws.
 
-    The larger study is the one in the file SPEC, or the one in STORE with fields --set anew. It may
-    have more values on an axis, a new axis, more draws, a tighter tolerance, more scanners of a
-    flight. Points that STORE has are reused; the result is byte for byte that of the larger study
-    run at once.
+    The larger study is the one in the file SPEC, or the one in STORE with fields changed by --set.
+    It may have more values on an axis, a new axis, more draws, a tighter tolerance, or more
+    scanners of a flight. Points in STORE are reused. The result has the same bytes as the larger
+    study run at once.
 
     The larger store is made in the same folder and replaces STORE once it is complete. Until then
-    nothing in STORE changes; sweep extend, or sweep resume STORE, goes on after an interruption.
+    STORE does not change. After an interruption sweep extend, or sweep resume STORE, continues.
 
     \b
       sweep extend results/range_angle.zarr experiments/range_angle.yaml
@@ -514,9 +520,9 @@ def extend(
 
 @main.command()
 @click.argument("study", type=StorePath())
-@at("A parameter's value; as often as needed. Axes that are not named take their first value.")
+@at("Value of a parameter; can be repeated. Other axes take their first value.")
 @click.option("--draws", type=click.IntRange(min=1), default=1, help="Number of draws [1].")
-@click.option("--first", type=click.IntRange(min=0), default=0, help="Number of the first [0].")
+@click.option("--first", type=click.IntRange(min=0), default=0, help="First draw [0].")
 @click.option(
     "-o",
     "--output",
@@ -530,9 +536,9 @@ def spectra(
 ) -> None:
     """Write spectra of a shot of STUDY, a spec or a store, with noise in every bin.
 
-    For trying detectors and estimators of one's own: complex spectra, draw by draw, with
-    frequencies, noise level, threshold, window, and what is true: lines, range and velocity.
-    The draws are those that a study with draws.method: spectra looks at.
+    Use the spectra to try your own detectors and estimators. They are complex, draw by draw, with
+    frequencies, noise level, threshold and window. The true lines, range and velocity are there
+    too. A study with draws.method: spectra has the same draws.
 
     \b
       sweep spectra experiments/cfar.yaml --at range=2km --draws 100 -o spectra.npz

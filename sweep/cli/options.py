@@ -71,42 +71,44 @@ STORE = click.argument("store", type=StorePath())
 WORKERS = click.option(
     "--workers",
     type=click.IntRange(min=1),
-    help="Workers to start [all cores here, none for little work; those of --cluster].",
+    help="Workers to start [all cores, none for little work, or as --cluster says].",
 )
 SCHEDULER = click.option(
-    "--scheduler", metavar="ADDRESS|none", help="A Dask scheduler, or none: a plain loop, no Dask."
+    "--scheduler",
+    metavar="ADDRESS|none",
+    help="Address of a Dask scheduler; none: a plain loop without Dask.",
 )
 CLUSTER = click.option(
     "--cluster",
     type=LocalPath(exists=True, dir_okay=False),
-    help="A file that describes a cluster: deploy/ has one of each kind.",
+    help="File that describes a cluster; deploy/ has examples.",
 )
 BLOCK_TIMEOUT = click.option(
     "--block-timeout",
     type=click.FloatRange(min=0, min_open=True),
     metavar="SECONDS",
-    help="Give a block up that takes longer, twice [none].",
+    help="Give up a block that takes longer than this twice [none].",
 )
 PERFORMANCE_REPORT = click.option(
     "--performance-report",
     type=LocalPath(dir_okay=False),
     metavar="FILE.html",
-    help="Write Dask's own account of the run.",
+    help="Write Dask's own report of the run.",
 )
 DURABLE = click.option(
-    "--durable", is_flag=True, help="Blocks count once they are on the disk: safe from power loss."
+    "--durable",
+    is_flag=True,
+    help="Commit blocks only once they are on the disk, against power loss.",
 )
 
-OVERWRITE = click.option(
-    "--overwrite", is_flag=True, help="Put the new one in the place of an old one."
-)
+OVERWRITE = click.option("--overwrite", is_flag=True, help="Replace an existing result.")
 
 FORMAT = click.option(
     "--format",
     "form",
     type=click.Choice(["png", "pdf", "svg"]),
     default="png",
-    help="Format of the pictures [png]; pdf and svg for print.",
+    help="Format of the figures [png]; pdf and svg for print.",
 )
 
 
@@ -132,7 +134,7 @@ ALLOW_CODE = click.option(
     metavar="MODULE",
     expose_value=False,
     callback=_allow,
-    help="Let the study run detectors and estimators of this Python module; as often as needed.",
+    help="Let the study run detectors and estimators of this Python module; can be repeated.",
 )
 
 

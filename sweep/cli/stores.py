@@ -26,9 +26,9 @@ MOST_LISTED = 20
 @click.command()
 @STORE
 def status(store: Location) -> None:
-    """Say how far STORE is, also while it runs somewhere else.
+    """Show the progress of STORE, also while another process computes it.
 
-    With draws, a table has the number of points within accuracy.tolerance.
+    For a study with draws, a table has the number of points within accuracy.tolerance.
     """
     from sweep.analysis.labels import counted
     from sweep.tasks.progress import amount, duration
@@ -84,29 +84,29 @@ def _tell_what_is_under_way(store: Location) -> None:
 @click.option(
     "--repair",
     is_flag=True,
-    help="Put back metadata, coordinates and spec; blocks are resume's to compute.",
+    help="Restore metadata, coordinates and spec; sweep resume computes blocks.",
 )
 @click.option(
     "--spec",
     "spec_file",
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    help="With --repair: the study's spec, for a store that no longer holds it undamaged.",
+    help="With --repair: the study's spec, if the store's own spec is damaged.",
 )
 def verify(store: Location, repair: bool, spec_file: Path | None) -> None:
-    """Check every byte of STORE against the digests taken as it was written.
+    """Check every byte of STORE against the digests stored with it.
 
-    Names every object that has a flipped, missing or surplus byte: results block by block,
-    metadata, coordinates, the spec, the journal, and the eyepoints of a flight. It names files and
-    arrays that are no part of the store as well. Damaged blocks are marked, so that sweep resume
-    computes just them, to the same bytes as before.
+    The command names every object with a flipped, missing or surplus byte: results block by block,
+    metadata, coordinates, the spec, the journal, and the eyepoints of a flight. It also names files
+    and arrays that do not belong to the store. It marks damaged blocks, so that sweep resume
+    computes only these, with the same bytes as before.
 
     \b
       sweep verify results/range_angle.zarr
       sweep verify results/range_angle.zarr --repair
       sweep verify results/range_angle.zarr --repair --spec range_angle.yaml
 
-    Exit codes: 0 all there and undamaged, 1 damage was found, 2 a mistake in what was asked or
-    nothing of sweep's there, 3 undamaged but incomplete (resume goes on).
+    Exit codes: 0 complete and undamaged, 1 damaged, 2 a mistake in the command or no store of sweep
+    there, 3 undamaged but incomplete (sweep resume continues).
     """  # noqa: D301
     from sweep.spec import load
     from sweep.tasks.verify import verify as check
@@ -131,9 +131,9 @@ def finalize(store: Location, output: Location | None) -> None:
     """Copy the complete STORE into OUTPUT as few large files [NAME_final.zarr next to NAME.zarr].
 
     A store has a file for every array and block, so that any number of processes can write it. The
-    copy has the same values, attributes and names in files (shards) of up to 64 MB: quick to move,
-    to list, and to open over a network. Every value is read back and compared; sweep verify checks
-    the copy from then on, and all that reads stores reads it. It can't be resumed.
+    copy has the same values, attributes and names in files (shards) of up to 64 MB. These are quick
+    to move, to list, and to open over a network. Every value is read back and compared. All
+    commands that read stores, and sweep verify, accept the copy. It cannot be resumed.
 
     \b
       sweep finalize results/range_angle.zarr
@@ -183,14 +183,14 @@ def _say_what_to_do(store: Location, reports: list[Report]) -> None:
     "--output",
     "-o",
     type=LocalPath(dir_okay=False),
-    help="The page [NAME-report.html beside NAME.zarr, here for a store in an object store].",
+    help="The page [NAME-report.html next to NAME.zarr, here for an object store].",
 )
 def report(store: Location, output: Path | None) -> None:
-    """Write the study in STORE as one page that needs no network.
+    """Write the study in STORE as one page that opens without a network.
 
-    It says what was asked and simulated, has the figures to turn, cut and save, tables to sort and
-    download, and how to cite and repeat the study. Any current browser opens it, from a disk or an
-    e-mail. Large studies are reduced first, and the page says by how much.
+    The page states the question, the simulation and how to cite and repeat it. It has figures to
+    turn, cut and save, and tables to sort and download. Any current browser opens the page, from a
+    disk or an e-mail. Large studies are reduced first, and the page says by how much.
 
     \b
       sweep report results/range_angle.zarr
@@ -216,15 +216,15 @@ def report(store: Location, output: Path | None) -> None:
     help="Draw the differences of pd into this file: .png, .pdf or .svg.",
 )
 def compare(a: Location, b: Location, figure: Path | None) -> None:
-    """Say what differs between the studies in two stores A and B, and by how much: B less A.
+    """Show the differences between the studies in two stores: B less A.
 
     Points of grids are matched by the values of their parameters, shots of flights by scanner,
-    time, beam, position and direction. Probabilities of detection agree where they differ by no
-    more than is known of both: half-widths of what is drawn, and what effects and beamlets that
-    were left out may change.
+    time, beam, position and direction. Probabilities of detection agree if their difference is
+    within the uncertainty of both: the half-widths of draws, and the errors of skipped effects and
+    few beamlets.
 
-    Exit codes: 0 they agree wherever both are computed, 2 a mistake in what was asked, 3 nothing
-    to compare is computed yet, 4 they differ.
+    Exit codes: 0 both agree wherever both are computed, 2 a mistake in the command, 3 nothing to
+    compare is computed yet, 4 they differ.
 
     \b
       sweep compare results/range_angle.zarr results/other.zarr

@@ -96,10 +96,10 @@ def read_waypoints(path: str | Path) -> Table:
     """Waypoints of a CSV table.
 
     The first row names the columns and their units: ``time [s]``, ``x [km]``, ``y [km]``, ``z
-    [m]``, and for the attitude either ``qw, qx, qy, qz`` (body to world) or ``heading [deg]``
-    (counter-clockwise from the x axis), ``pitch [deg]`` (nose up) and ``roll [deg]`` (left side
-    up), of which those left out are 0. Lines that begin with # are passed over. SceneError for
-    a file that is missing or no such table.
+    [m]``. The attitude is either ``qw, qx, qy, qz`` (body to world) or angles. The angles are
+    ``heading [deg]`` (counter-clockwise from the x axis), ``pitch [deg]`` (nose up) and
+    ``roll [deg]`` (left side up); a missing one is 0. Lines that begin with # are skipped. A file
+    that is missing or no such table raises SceneError.
     """
     table = read_columns(path, COLUMNS, _POSITION, _EXAMPLE)
     position = np.column_stack([table[name] for name in "xyz"])

@@ -306,10 +306,10 @@ def half_ball(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
 class Tree:
     """Mean measures of the trees of a clump.
 
-    Leaves lie at random, with the spherical distribution of leaf angles (every direction of the
-    leaf's normal is as likely as any other), so the probability of a gap along a ray is Beer's law,
-    ``exp(-G * density * path)`` with ``G = 1/2``: de Wit, Photosynthesis of Leaf Canopies (1965);
-    Ross, The Radiation Regime and Architecture of Plant Stands (1981).
+    Leaves lie at random, with the spherical distribution of leaf angles: every direction of a
+    leaf's normal is as likely as any other. So the probability of a gap along a ray is Beer's law,
+    ``exp(-G * density * path)`` with ``G = 1/2``. Sources: de Wit, Photosynthesis of Leaf Canopies
+    (1965); Ross, The Radiation Regime and Architecture of Plant Stands (1981).
     """
 
     height: float = 12.0  # from the ground to the top of the crown [m]

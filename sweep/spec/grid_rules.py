@@ -439,7 +439,7 @@ def _search_findings(grid: Grid) -> Iterator[Finding]:
 
 
 class Need(NamedTuple):
-    """A parameter that means nothing beside some values of another."""
+    """A parameter that has no meaning with some values of another."""
 
     path: str
     asks: Condition

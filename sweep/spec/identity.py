@@ -117,7 +117,7 @@ class Identified(Protocol):
 
 
 def difference(a: Identified | Mapping[str, Any], b: Identified | Mapping[str, Any]) -> list[str]:
-    """Lines ``path: value -> value`` for all that differs between two specs or their identities."""
+    """Lines ``path: value -> value`` for each difference between two specs or their identities."""
     left, right = (
         _flat(canonical(side if isinstance(side, Mapping) else side.identity())) for side in (a, b)
     )

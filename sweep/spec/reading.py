@@ -306,7 +306,7 @@ def _instrument_of(reference: object, location: Location, base: Path) -> tuple[i
 def library() -> dict[str, Path]:
     """Files of the instruments that a spec may name, by name.
 
-    Each file says beside its ``instrument`` where it is published, and what it must reproduce.
+    Each file also names its publication, and the numbers that it must reproduce.
 
     >>> "settembrini_2026" in library()
     True

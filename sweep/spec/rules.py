@@ -46,7 +46,7 @@ class Rule:
     Parameters
     ----------
     about : str
-        What the field is, for people.
+        Description of the field, for people.
     """
 
     about: str
@@ -258,7 +258,7 @@ class Choice(Rule):
     options : tuple of str
         The words.
     rule, remedy : str
-        What is wrong with others, by default that they are none of the options.
+        Message for other words; by default that they are none of the options.
     """
 
     options: tuple[str, ...]
@@ -337,7 +337,7 @@ class Text(Rule):
     pattern : str
         Regular expression that the whole text matches.
     remedy : str
-        What to write where it doesn't.
+        Text to write instead.
     """
 
     example: str = ""
@@ -389,11 +389,11 @@ class Several(Rule):
     Parameters
     ----------
     of : Rule
-        What each value may be.
+        Rule of each value.
     least, most : int
         Number of values.
     noun : str
-        What they are together.
+        Name of all values together.
     rising : bool
         Whether each must exceed the one before.
     distinct : bool

@@ -1,4 +1,4 @@
-"""A scene: meshes and solids, what stands on its ground, and all that a study has beside it."""
+"""A scene: meshes and solids, objects on its ground, and the other parts of a study."""
 
 from __future__ import annotations
 
@@ -218,7 +218,7 @@ class Trees(Part):
         Raises
         ------
         ValueError
-            Where they do not find room, or one would stand beside the ground.
+            If there is no room for them, or one would stand off the ground.
         """
         from sweep.scenes.scattered import Tree, clump
 

@@ -62,7 +62,7 @@ class Atmosphere(Part):
 
 @with_modes
 class Effects(Part):
-    """Modes of physical effects: simulated where the scene calls for it, always or never."""
+    """Modes of physical effects: simulated where the tolerance needs it, always or never."""
 
 
 def _share(about: str) -> Any:

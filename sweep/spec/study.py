@@ -88,7 +88,7 @@ class Study(Part):
         Parameters
         ----------
         mapping : mapping
-            What a spec file holds; left as it is.
+            Content of a spec file; it is not changed.
         base : path
             Folder that the files which it names are relative to.
 
@@ -396,7 +396,7 @@ class Spec(Study):
     def identity(self) -> dict[str, Any]:
         """Content that makes the study this one, in SI values.
 
-        What looks at whole spectra is no part of it where none are drawn.
+        Settings of detectors and estimators for whole spectra count only if these are drawn.
         """
         identity = super().identity()
         if not self.draws.whole_spectra:

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 REPOSITORY = Path(__file__).parents[2]
-PACKAGES = ("analysis", "cli", "report", "scenes", "storage", "tasks")
+PACKAGES = ("analysis", "cli", "model", "report", "scenes", "spec", "storage", "tasks")
 """Packages whose docstrings are checked; also the modules directly in sweep/."""
 
 LONGEST = 35

@@ -38,11 +38,11 @@ def compare(ours: xr.Dataset, other: xr.Dataset) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        Lazy, over the axes of `ours` and those of `other` that stay: the difference of every
-        output by its name; of each probability of detection `pd_.._allowed`, how large it may be
-        by what is known of both: half-widths of what is drawn, and what effects and beamlets
-        left out may change; and `pd_.._agrees`, whether it is no larger (false where either is
-        not computed).
+        Lazy, over the axes of `ours` and those of `other` that stay. It has the difference of every
+        output by its name. For each probability of detection it also has `pd_.._allowed` and
+        `pd_.._agrees`. The first is the difference that the half-widths of draws and the errors of
+        skipped effects and few beamlets allow. The second is true if the difference is no larger,
+        and false where either is not computed.
 
     Raises
     ------
@@ -182,12 +182,12 @@ def compare_flights(ours: xr.DataTree, other: xr.DataTree) -> xr.DataTree:
     Returns
     -------
     xarray.DataTree
-        A group for each scanner that both have, with dimensions axes and `shot`: differences of
-        the probabilities and SNRs of a shot; where both stores are complete also of `detected`,
-        the share of draws in which the shot has a true point; `.._allowed` and `.._agrees` of
-        probabilities of detection and `detected`, as :func:`compare` has them. Of
-        `detected` the intervals are those of Clopper and Pearson with each study's confidence.
-        A group's attributes `shots` and `other_shots` tell how many each flight has.
+        A group for each scanner that both have, with dimensions axes and `shot`. It has the
+        differences of the probabilities and SNRs of a shot. If both stores are complete, it also
+        has the difference of `detected`, the share of draws in which the shot has a true point.
+        `.._allowed` and `.._agrees` belong to probabilities of detection and to `detected`, as in
+        :func:`compare`. The intervals of `detected` are those of Clopper and Pearson with each
+        study's confidence. The attributes `shots` and `other_shots` are the numbers of shots.
 
     Raises
     ------

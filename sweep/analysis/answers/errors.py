@@ -36,12 +36,12 @@ def range_error(dataset: xr.Dataset) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        [m], lazy: `reported`, reported less true range without noise, from whole bins;
-        `resolution`, the spread that whole bins make on the average, a bin over sqrt(24) as
-        two peaks tell of it; `bound`, the least standard deviation, of a lone line of the stored
-        SNR in the three segments together (:mod:`sweep.model.estimators`). Below the threshold
-        noise is taken for signal, and no estimate comes near it. Of a study that draws whole
-        spectra instead what it stores: `bias`, `rmse` and `bound`.
+        [m], lazy. `reported` is the reported less the true range without noise, from whole bins.
+        `resolution` is the mean spread that whole bins make: a bin over sqrt(24), because two
+        peaks share the error. `bound` is the least standard deviation, that of a lone line with
+        the stored SNR in the three segments together (:mod:`sweep.model.estimators`). Below the
+        threshold noise is taken for signal, and no estimate comes near the bound. A study that
+        draws whole spectra has instead what it stores: `bias`, `rmse` and `bound`.
     """
     return _errors(dataset, "range", "range_error", lambda found: found.range)
 

@@ -66,9 +66,9 @@ def limit(
 
         - `unbroken`: the farthest value up to which pd is at the level or above all the way;
         - `farthest`: the farthest value at which pd is at the level at all;
-        - `unbroken_reason`, `farthest_reason`: flags that say why there is none (nan): pd is
-          below the level at the very first value (or at all of them), or is not below it up to
-          the last, or what decides is not computed.
+        - `unbroken_reason`, `farthest_reason`: flags for the reason of a nan. Either pd is below
+          the level at the first value (or at all of them), or it is not below the level up to the
+          last value, or a deciding value is not computed.
 
         `unbroken_low`, `unbroken_high` and so on are the answers with the lower and the upper ends
         of pd's intervals, if it is drawn.
