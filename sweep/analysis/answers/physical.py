@@ -72,7 +72,9 @@ def si(array: xr.DataArray) -> xr.DataArray:
     rule = parameter_rules().get(array.attrs.get("path", ""))
     units = array.attrs.get("units", "")
     if array.dtype.kind not in "fiu":
-        return array.astype(str)
+        return array.copy(
+            data=np.array([str(v) for v in array.values.ravel()]).reshape(array.shape)
+        )
     if not isinstance(rule, Numeric) or not units:
         return array
     unit = rule.exact(f"1 {units}")[1]
