@@ -40,7 +40,6 @@ from sweep.analysis.tables import Page
 from sweep.model.effects.catalogue import names_of
 from sweep.model.eyepoints import prepare_eyepoints
 from sweep.spec import (
-    Axis,
     FalseAlarmTable,
     Figure,
     SceneSpec,
@@ -199,7 +198,11 @@ def default_figures(spec: Spec) -> list[Figure]:
     ]
     long = [axis for axis, _ in numeric if axis.size >= LONG]
     if not zipped and len(long) >= 2:
-        x, y = _range_before_angle(long)
+        # range and angle before others, and the angle up
+        paths = {axis.name: axis.members[0].path for axis in long}
+        rank = {RANGE: 0, GRAZING_ANGLE: 1}
+        two = sorted(paths, key=lambda name: rank.get(paths[name], 2))[:2]
+        x, y = sorted(two, key=lambda name: paths[name] == GRAZING_ANGLE)
         return [Surface(kind="surface", variable=v, x=x, y=y) for v in VARIABLES]
     if numeric:
         axis, x = numeric[0]
@@ -208,15 +211,6 @@ def default_figures(spec: Spec) -> list[Figure]:
         return [Slices(kind="slices", variable=v, x=x, **by) for v in VARIABLES]
     return [Table(kind="table", variable=v, rows=a.members[0].name)
             for a in axes[:1] for v in VARIABLES]  # fmt: skip
-
-
-def _range_before_angle(long: list[Axis]) -> tuple[str, str]:
-    """Range along x and angle along y where they are long, else the longest two."""
-    rank = {RANGE: 0, GRAZING_ANGLE: 1}
-    first = sorted(long, key=lambda axis: rank.get(axis.members[0].path, 2))[:2]
-    if first[0].members[0].path == GRAZING_ANGLE:
-        first.reverse()
-    return first[0].name, first[1].name
 
 
 COLOURS = ("range", "radial_velocity")

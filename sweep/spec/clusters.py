@@ -106,24 +106,19 @@ class Security(Part):
     key: str = of.file("Its private key")
 
 
-def _threads() -> Any:
-    return of.count("Threads, each with a block of its own", "1", at_most="1000", default=1)
-
-
-class Worker(Part):
-    """One worker process."""
-
-    threads: int = _threads()
-    memory: float = _memory("Memory that it may take")
-
-
 class LocalWorker(Part):
     """One worker process of this machine."""
 
-    threads: int = _threads()
+    threads: int = of.count("Threads, each with a block of its own", "1", at_most="1000", default=1)
     memory: float | None = _memory(
         "Memory that it may take; without one, its share of 90 % of it", None
     )
+
+
+class Worker(LocalWorker):
+    """One worker process."""
+
+    memory: float = _memory("Memory that it may take")
 
 
 class Scheduler(Part):

@@ -247,14 +247,6 @@ def _interval(default: str, value: float | None) -> Any:
     return of.duration(about, "10 ms", default=value)
 
 
-def _together() -> Any:
-    return _interval("0, all at once,", 0.0)
-
-
-def _spread() -> Any:
-    return _interval("spread evenly over the cycle", None)
-
-
 def _angles(about: str, example: str, *bounds: str, number: tuple[int, int], **more: Any) -> Any:
     """Field of several angles."""
     return of.several(of.measure("Angle", "rad", example, *bounds), *number, about=about, **more)
@@ -268,7 +260,7 @@ class Cone(Part):
     half_angle: float = of.angle("From nadir", "22.5 deg", *_REACH)
     azimuth: float = of.angle("Of the first beam, from forward to the left", default=0.0)
     rate: float = _rate()
-    interval: float = _together()
+    interval: float = _interval("0, all at once,", 0.0)
 
     def pattern(self) -> Scanner:
         """Return the scan pattern."""
@@ -284,7 +276,7 @@ class FixedBeams(Part):
         Beams(about="Angles towards forward and left, or vectors in the body frame, of each beam")
     )
     rate: float = _rate()
-    interval: float = _together()
+    interval: float = _interval("0, all at once,", 0.0)
 
     def pattern(self) -> Scanner:
         """Return the scan pattern."""
@@ -298,7 +290,7 @@ class Corners(Part):
     kind: Literal["corners"]
     angle: float = of.angle("Of both axes from nadir", "22.5 deg", *_REACH)
     rate: float = _rate()
-    interval: float | None = _spread()
+    interval: float | None = _interval("spread evenly over the cycle", None)
 
     def pattern(self) -> Scanner:
         """Return the scan pattern."""
@@ -314,7 +306,7 @@ class Squares(Part):
         "15 deg", "1e-6 deg", "45 deg", number=(1, 5),
     )  # fmt: skip
     rate: float = _rate()
-    interval: float | None = _spread()
+    interval: float | None = _interval("spread evenly over the cycle", None)
 
     def pattern(self) -> Scanner:
         """Return the scan pattern."""
@@ -351,7 +343,7 @@ class Line(Part):
         "250 urad", "-89 deg", "89 deg", number=(1, 1000), default=(0.0,),
     )  # fmt: skip
     wave: str = of.choice("Constant rate or resonant mirror", ("triangle", "sine"), "triangle")
-    interval: float = _together()
+    interval: float = _interval("0, all at once,", 0.0)
 
     def pattern(self) -> Scanner:
         """Return the scan pattern."""

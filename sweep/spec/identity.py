@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from functools import cache
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from pydantic import BaseModel
@@ -108,15 +108,7 @@ def field_rules() -> MappingProxyType[str, Rule]:
     })  # fmt: skip
 
 
-class Identified(Protocol):
-    """Something with an identity: a spec."""
-
-    def identity(self) -> dict[str, Any]:
-        """Content in SI values."""
-        ...
-
-
-def difference(a: Identified | Mapping[str, Any], b: Identified | Mapping[str, Any]) -> list[str]:
+def difference(a: Any, b: Any) -> list[str]:
     """Lines ``path: value -> value`` for each difference between two specs or their identities."""
     left, right = (
         _flat(canonical(side if isinstance(side, Mapping) else side.identity())) for side in (a, b)

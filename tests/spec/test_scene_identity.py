@@ -233,7 +233,7 @@ def test_a_stored_study_needs_its_files_only_where_rays_do(study_with_files):
             look()
     found = from_stored(text, base=moved)
     assert found.cycles("three") == 21 and found.world().reports
-    assert found.base == moved and found == lost
+    assert found.files.base == moved and found == lost
 
 
 def test_a_file_that_has_changed_since_is_refused(study_with_files):
