@@ -100,7 +100,7 @@ def _grid_page(store: Location, say: Say) -> Page:
     tables = list(_tables(study, say))
     say("the maximum range")
     reach = detector.maximum_range(study)
-    figures.append(reach)
+    figures.append(None if detector.is_empty(reach) else reach)
     say("the detector")
     found = detector.tracks(study)
     trades: list[Made] = [detector.noise_budget(study, *found)]
@@ -168,7 +168,7 @@ def _page(
         ("study", attributes["study_id"][:8]),
         ("model", str(attributes["model_version"])),
         ("sweep", attributes["software"]["sweep"]),
-        ("finished", str(attributes["finished"])[:16].replace("T", " ")),
+        ("finished (UTC)", str(attributes["finished"])[:16].replace("T", " ")),
     ]
     done, number = attributes[f"{unit}_committed"], attributes[unit]
     remark = (
