@@ -426,7 +426,7 @@ def sheet(dataset: xr.Dataset, settings: Sequence[Setting]) -> Sheet:
             line = zip(*map(_place, some), strict=True)
             axes.plot(*line, color=colour, linewidth=0.8, alpha=0.5, zorder=1)
         names += _names(axes, some, above=kind not in BY_NUMBER)
-    _finish(axes, min(setting.quantile(0.5) for setting in drawn))
+    _finish(axes, min(setting.quantile(0.5) for setting in drawn), max(s.error for s in drawn))
     canvas.title(sheet, f"{dataset.attrs['title']}: what accuracy costs")
     canvas.caption(sheet, _note(dataset, drawn))
     sheet.draw_without_rendering()
@@ -524,10 +524,10 @@ def _short(setting: Setting) -> str:
     return ""
 
 
-def _finish(axes: Axes, least: float) -> None:
+def _finish(axes: Axes, least: float, largest: float) -> None:
     axes.set_xscale("log")
     axes.set_yscale("log")
-    axes.set_ylim(max(EXACT, least) / 2, 2.5)
+    axes.set_ylim(max(EXACT, least) / 2, max(2.5, 2 * largest))
     axes.margins(x=0.16)
     plain = FuncFormatter(lambda value, _: f"{value:g}")
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
