@@ -93,7 +93,7 @@ def draw_masking(path: Path) -> None:
             axis.plot(apart, pd[:, k], canvas.DASHES[k], color=canvas.LINES[k], label=kind)
         axis.set(title=f"{name} window", xlabel="distance of the stronger return (bins)")
         axis.grid(alpha=0.3)
-    axes[0].set_ylabel("share of draws in which the weak one is found")
+    axes[0].set_ylabel("share of draws that\nfind the weak return")
     axes[0].legend()
     canvas.title(figure, "A second return")
     canvas.caption(
@@ -153,7 +153,7 @@ def bounds(name: str) -> tuple[np.ndarray, np.ndarray]:
 
 def draw_estimators(found: dict[str, dict[str, np.ndarray]], path: Path) -> None:
     """RMSE and bias over SNR, a column for each window."""
-    figure, axes = canvas.panels(11.0, 7.0, 2, len(found), sharex=True, sharey="row")
+    figure, axes = canvas.panels(12.5, 7.0, 2, len(found), sharex=True, sharey="row")
     for column, (name, every) in enumerate(found.items()):
         top, low = axes[column], axes[len(found) + column]
         least, windowed = bounds(name)
@@ -168,7 +168,8 @@ def draw_estimators(found: dict[str, dict[str, np.ndarray]], path: Path) -> None
         low.set(xlabel="SNR after the FFT (dB)", ylabel="" if column else "|bias| (bins)")
         top.grid(alpha=0.3)
         low.grid(alpha=0.3)
-    axes[len(found) - 1].legend(fontsize=7)
+    named = axes[len(found) - 1].get_legend_handles_labels()
+    figure.legend(*named, loc="outside right upper", frameon=False, fontsize=8)
     canvas.title(figure, "Frequency between bins")
     canvas.caption(
         figure,

@@ -111,7 +111,7 @@ def test_the_table_of_a_large_study_is_by_some_of_its_blocks_and_says_so(here, m
 
 def test_a_second_run_is_refused_and_says_how_to_go_on_or_begin_anew(here):
     sweep("run", "small.yaml", "--scheduler", "none")
-    refused(sweep("run", "small.yaml", "--scheduler", "none"), "sweep resume", "--overwrite")
+    refused(sweep("run", "small.yaml", "--scheduler", "none"), "sweep status", "--overwrite")
     assert sweep("run", "small.yaml", "--scheduler", "none", "--overwrite").exit_code == 0
 
 
@@ -306,6 +306,21 @@ def test_no_number_is_cut_however_narrow_the_terminal_and_nothing_is_folded_with
     assert "…" not in "".join(shown)
     assert not {*" ".join([*cells, where, "pd_doppler"]).split()} - {*shown}
     assert all(cell in " ".join(shown) for cell in cells)
+
+
+@pytest.mark.parametrize("columns", [40, 60, 80])
+def test_sentences_are_folded_to_a_terminal_and_commands_in_them_stay_whole(monkeypatch, columns):
+    from sweep.cli.output import folded
+
+    command = "`sweep resume results/a_study.zarr`"
+    text = f"  one.yaml:7: is no field, and {command} goes on with what there is by now"
+    assert folded(text) == text
+    monkeypatch.setenv("COLUMNS", str(columns))
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
+    lines = folded(f"2 mistakes:\n{text}").splitlines()
+    assert max(map(len, lines)) <= columns and len(lines) > 2
+    assert sum(command in line for line in lines) == 1
+    assert " ".join(" ".join(lines).split()) == " ".join(f"2 mistakes:\n{text}".split())
 
 
 @pytest.mark.parametrize(
@@ -577,7 +592,14 @@ def _lines_of_progress(capsys):
 
 @pytest.mark.parametrize(
     ("seconds", "text"),
-    [(0.4, "0 s"), (59.6, "1 min 00 s"), (200, "3 min 20 s"), (7320, "2 h 02 min")],
+    [
+        (0, "0 s"),
+        (0.042, "0.04 s"),
+        (0.96, "1 s"),
+        (59.6, "1 min 00 s"),
+        (200, "3 min 20 s"),
+        (7320, "2 h 02 min"),
+    ],
 )
 def test_durations_are_said_in_words(seconds, text):
     assert progress.duration(seconds) == text

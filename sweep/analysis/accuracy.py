@@ -423,7 +423,7 @@ def sheet(dataset: xr.Dataset, settings: Sequence[Setting]) -> Sheet:
                 _short(setting), _place(setting), xytext=(6, 5), textcoords="offset points",
                 fontsize=7.5, color=colour,
             )  # fmt: skip
-    _finish(axes, min(setting.quantile(0.5) for setting in drawn))
+    _finish(axes, min(setting.quantile(0.5) for setting in drawn), max(s.error for s in drawn))
     canvas.title(sheet, f"{dataset.attrs['title']}: what accuracy costs")
     canvas.caption(sheet, _note(dataset, drawn))
     return sheet
@@ -461,10 +461,10 @@ def _short(setting: Setting) -> str:
     return ""
 
 
-def _finish(axes: Axes, least: float) -> None:
+def _finish(axes: Axes, least: float, largest: float) -> None:
     axes.set_xscale("log")
     axes.set_yscale("log")
-    axes.set_ylim(max(EXACT, least) / 2, 2.5)
+    axes.set_ylim(max(EXACT, least) / 2, max(2.5, 2 * largest))
     axes.margins(x=0.16)
     plain = FuncFormatter(lambda value, _: f"{value:g}")
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))

@@ -254,7 +254,7 @@ def _panel(axes: Axes, panel: Panel) -> None:
     if panel.x.kind != WORDS:
         axes.margins(x=0.0 if max(line.x.size for line in panel.lines) > 1 else 0.05)
     if panel.y.kind != LOG:
-        axes.ticklabel_format(axis="y", style="sci", scilimits=(-3, 4))
+        axes.ticklabel_format(axis="y", style="sci", scilimits=(-3, 5))
     axes.grid(True)
     axes.set_axisbelow(True)
     axes.set_title(panel.title, size=9, loc="left")

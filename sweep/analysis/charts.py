@@ -385,11 +385,11 @@ def _kinds(dataset: xr.Dataset, variable: str) -> tuple[xr.Dataset, float]:
 
 def _remark(together: int, confidence: float, drawn: bool) -> str:
     """Remark on how a line is reduced; empty where each point is on it."""
-    sure = f" of a confidence of {confidence:g}" if confidence else ""
+    interval = f"{100 * confidence:g} % confidence interval" if confidence else "interval"
     if together > 1:
-        with_ends = f", their intervals{sure} included" if sure else ""
+        with_ends = f", their {interval}s included" if confidence else ""
         return (
             f"line: mean of {together} neighbouring points; band: from the lowest of them "
             f"to the highest{with_ends}, so that no narrow dip is hidden"
         )
-    return f"band: interval of each point{sure}" if drawn else ""
+    return f"band: {interval} of each point" if drawn else ""

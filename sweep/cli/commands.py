@@ -33,7 +33,9 @@ from sweep.cli.output import (
     conclude,
     conclude_accuracy,
     effects_of,
+    folded,
     plan_lines,
+    tell,
     tell_effects,
     warn_before,
     warn_of_alarms,
@@ -83,12 +85,12 @@ class Commands(click.Group):
             )  # fmt: skip
             said = worded(error)
             if line := remedy(said):
-                click.echo(line, err=True)
+                tell(line, err=True)
             elif isinstance(said, told):
-                click.echo(str(said), err=True)
+                tell(str(said), err=True)
             elif isinstance(said, OSError) and said.filename and said.errno in UNUSABLE:
                 place = f"{said.filename}: {said.strerror}"
-                click.echo(f"{place}: mend that, or name another place", err=True)
+                tell(f"{place}: mend that, or name another place", err=True)
             else:
                 raise
             ctx.exit(MISTAKE)
@@ -204,18 +206,19 @@ def plan(spec: Path, workers: int | None) -> None:
     the points at which it is simulated, a bound on its change of pd, log10 pfa or magnitude, and
     its share of a point's time.
     """
-    from sweep.spec import load
     from sweep.tasks.progress import working
 
-    study = load(spec)
     with working("planning"):
+        from sweep.spec import load
+
+        study = load(spec)
         lines = list(plan_lines(study, _default_store(spec), workers))
         effects = effects_of(study, _default_store(spec))
     if alarms := alarms_told(study):
         lines.append(("false alarms", alarms))
     # Nothing is printed before all is known: any of it may find a point that can't be simulated.
     for name, text in lines:
-        click.echo(f"{name:>12}  {text}")
+        click.echo(folded(f"{name:>12}  {text}", 2 + len(name)))
     tell_effects(effects)
     warn_of_beam(study)
     warn_of_path(study)
@@ -327,10 +330,11 @@ def accuracy(
 @FORMAT
 def figures(store: Location, output: Path | None, form: str) -> None:
     """Draw the figures and tables of the study in STORE."""
-    from sweep.analysis.figures import draw
     from sweep.tasks.progress import working
 
     with working("drawing"):
+        from sweep.analysis.figures import draw
+
         files = draw(store, output, form)
     _list(files)
 
@@ -440,7 +444,7 @@ def instruments(name: str | None) -> None:
         raise click.UsageError(f"{name!r} is no instrument of the library; {close}")
     for each in [name] if name else known:
         own = read_document(known[each]).value
-        lines = instrument_lines(own) if name else [f"{each:<24} {own['title']}"]
+        lines = instrument_lines(own) if name else [folded(f"{each:<24} {own['title']}", 25)]
         click.echo("\n".join(lines))
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import re
 import shutil
 import sys
+import textwrap
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -29,17 +31,37 @@ MOST_POINTS, MOST_BYTES, MOST_SECONDS = 10**9, 10**12, 30 * 86400.0
 MEASURED = 10**7
 """Points times draws beyond which a run measures the time that it takes, before it begins."""
 
-LEAST_WORDS, BETWEEN = 14, 3
-"""Characters of a table: a column of sentences at the least, and between columns."""
+LEAST_WORDS, BETWEEN, MOST_WHOLE = 14, 3, 36
+"""Characters of a table: least column of sentences, between columns, most of an unbroken cell."""
+
+
+def folded(text: str, hanging: int = 2, *, err: bool = False) -> str:
+    """Text in lines of the terminal's width; unchanged where the output is no terminal.
+
+    Lines break between words, and commands in backquotes, which are copied, stay whole.
+    """
+    if not (sys.stderr if err else sys.stdout).isatty():
+        return text
+    width = shutil.get_terminal_size().columns
+    whole = re.sub(r"`[^`]*`", lambda found: found[0].replace(" ", "\xa0"), text)
+    lines = (
+        textwrap.fill(
+            line, width, subsequent_indent=" " * (hanging + len(line) - len(line.lstrip())),
+            break_long_words=False, break_on_hyphens=False,
+        )
+        for line in whole.splitlines()
+    )  # fmt: skip
+    return "\n".join(lines).replace("\xa0", " ")
+
+
+def tell(text: str, *, err: bool = False) -> None:
+    """Print sentences, folded to the terminal's width."""
+    click.echo(folded(text, err=err), err=err)
 
 
 def instrument_lines(own: Mapping[str, Any]) -> Iterator[str]:
     """Yield what the file of an instrument of the library says."""
     import yaml
-
-    def folded(text: str) -> str:
-        width = shutil.get_terminal_size().columns if sys.stdout.isatty() else 1 << 16
-        return click.wrap_text(text, width, subsequent_indent="  ")
 
     yield folded(own["title"])
     yield folded(own["source"] + (f", https://doi.org/{own['doi']}" if own["doi"] else ""))
@@ -67,7 +89,7 @@ def conclude(outcome: Outcome, store: Location) -> None:
     for scanner, rays in outcome.rays.items():
         told = f"{rays:,} rays cast" if rays else "eyepoints were there, no ray cast"
         click.echo(f"{scanner}: {told}")
-    click.echo(
+    tell(
         f"{store}: {outcome.points_done:,} of {outcome.points:,} {outcome.unit}, "
         f"computed {outcome.blocks_computed:,} of {outcome.blocks:,} blocks "
         f"in {duration(outcome.seconds)}"
@@ -76,7 +98,7 @@ def conclude(outcome: Outcome, store: Location) -> None:
         click.echo(f"sweep figures {store}  draws it.")
         return
     for failure in outcome.failures[:5]:
-        click.echo(f"block {failure.block} failed: {failure.error}", err=True)
+        tell(f"block {failure.block} failed: {failure.error}", err=True)
     left = outcome.blocks - outcome.blocks_done
     failed = len(outcome.failures) + outcome.left_out
     why = outcome.stopped or f"{failed:,} failed; sweep status {store}  tells why"
@@ -94,7 +116,7 @@ def _print_summary(store: Location) -> None:
     attributes, study = studies.read(store)
     (_print_scene if attributes["kind"] == "scene" else _print_grid)(store)
     if alarms := alarms_told(study.spec):
-        click.echo(f"False alarms of noise: {alarms}.")
+        tell(f"False alarms of noise: {alarms}.")
 
 
 def _print_grid(store: Location) -> None:
@@ -123,7 +145,7 @@ def _print_scene(store: Location) -> None:
 
     print_table(
         "What came back",
-        ["scanner", "shots", "mean pd", "true", "false points", "velocity"],
+        ["scanner", "shots", "mean pd", "true points", "false points", "velocity solved"],
         [
             [
                 row.part,
@@ -145,10 +167,10 @@ def tell_accuracy(store: Location) -> None:
     number, why = beyond_model(store)
     if number:
         told = f"points beyond the model, which have no results: {number:,}; the first: {why}"
-        click.echo(f"warning: {told}", err=True)
+        tell(f"warning: {told}", err=True)
     if rows := accuracy_table(store):
         print_table(
-            "Half-widths of what is drawn",
+            "Half-widths of pd by its draws, and where accuracy.tolerance is met",
             ["", "met", "worst", "missed by", "draws", "needed", "at"],
             [
                 [
@@ -217,12 +239,12 @@ def print_table(title: str, headings: list[str], rows: list[list[str]], words: s
 
 
 def _print_lists(title: str, headings: list[str], rows: list[list[str]]) -> None:
-    """Print each row of a table as a list of its cells."""
-    click.echo(title)
+    """Print each row of a table as a list of its cells, as many to a line as it has room for."""
+    tell(title)
     for row in rows:
-        click.echo(f"\n{row[0]}")
-        for heading, cell in zip(headings[1:], row[1:], strict=True):
-            click.echo(f"  {heading}: {cell}")
+        told = (f"{head}: {cell}" for head, cell in zip(headings[1:], row[1:], strict=True))
+        cells = (f"`{each}`" if len(each) < MOST_WHOLE else each for each in told)
+        click.echo(f"{row[0]}\n{folded('  ' + '   '.join(cells), 0).replace('`', '')}")
     click.echo()
 
 
@@ -292,8 +314,8 @@ def tell_effects(table: EffectsTable) -> None:
     print_table("Effects", headings, [_effect_cells(row) for row in there], "called for")
     absent = [row.name for row in table.rows if row not in there]
     if absent:
-        click.echo(f"Nothing of these in the scene: {', '.join(absent).replace('_', ' ')}.")
-    click.echo(
+        tell(f"Not in this study: {', '.join(absent).replace('_', ' ')}.")
+    tell(
         f"What is left out may change pd, log10 pfa or |X| by {table.error:.2g} at the most; "
         f"the tolerance is {table.tolerance:g}."
     )
@@ -353,7 +375,7 @@ def warn_of_alarms(study: Spec | SceneSpec) -> None:
 
     most = max((any_ for any_, _ in alarms_of_study(study)), default=0.0)
     if most > MANY_ALARMS:
-        click.echo(
+        tell(
             "warning: noise alone raises a false alarm in either chirp with probability "
             f"{most:.3g} (more than {MANY_ALARMS:g}): raise the threshold, or lower detector.pfa",
             err=True,
@@ -365,7 +387,7 @@ def warn_of_beam(study: Spec | SceneSpec) -> None:
     from sweep.spec.grid_rules import too_narrow
 
     if told := too_narrow(study.parameters_off_axes(), study.axes):
-        click.echo(f"warning: {told}", err=True)
+        tell(f"warning: {told}", err=True)
 
 
 def warn_of_path(study: Spec | SceneSpec) -> None:
@@ -397,7 +419,7 @@ def effects_of(study: Spec | SceneSpec, store: Location, *, costs: bool = True) 
 def warn(table: EffectsTable) -> None:
     """Say which effects are forced off though they matter."""
     for warning in table.warnings():
-        click.echo(f"warning: {warning}", err=True)
+        tell(f"warning: {warning}", err=True)
 
 
 def _effect_cells(row: EffectRow) -> list[str]:
@@ -437,5 +459,5 @@ def conclude_accuracy(store: Location, *, measured: bool) -> tuple[list[Location
         "cheapest setting",
     )
     for sentence in accuracy.sentences(dataset, settings):
-        click.echo(sentence)
+        tell(sentence)
     return [store, *accuracy.draw(store)], dataset.attrs["stopped"] != "interrupted"

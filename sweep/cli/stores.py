@@ -10,7 +10,7 @@ import click
 from rich.filesize import decimal
 
 from sweep.cli.options import STORE, LocalPath, StorePath, shown
-from sweep.cli.output import INCOMPLETE, print_table, tell_accuracy
+from sweep.cli.output import INCOMPLETE, print_table, tell, tell_accuracy
 from sweep.storage.locations import Location, beside, files_below
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ def status(store: Location) -> None:
     s = read(store)
     left = duration(s.left) if s.rate else "unknown"
     click.echo(f"{s.title or store}\nstudy {s.study_id}")
-    click.echo(
+    tell(
         f"{s.points_done:,} of {s.points:,} {s.unit}, {s.blocks_done:,} of {s.blocks:,} blocks"
         f"{f', {amount(s.points_begun)} more begun' if s.points_begun else ''}"
         f"{f', {s.draws_done:,} draws' if s.draws_done else ''}, {decimal(s.bytes)} stored"
@@ -46,7 +46,7 @@ def status(store: Location) -> None:
         rate = f"{float(f'{s.rate:.3g}'):,.12g} {s.unit}/s"
         click.echo(f"{rate} in the last run, by {counted(s.workers, 'worker')}")
     if s.holder_lives and s.holder:
-        click.echo(
+        tell(
             f"running: process {s.holder.pid} on {s.holder.host}, {left} left, "
             f"last heartbeat {duration(s.heartbeat)} ago"
         )
@@ -58,7 +58,7 @@ def status(store: Location) -> None:
         click.echo(f"not running; sweep resume {store}  goes on.")
     _tell_what_is_under_way(store)
     for block, failure in sorted(s.failures.items()):
-        click.echo(f"block {block} failed on {failure['host']}: {failure['error']}")
+        tell(f"block {block} failed on {failure['host']}: {failure['error']}")
     if s.failures:
         click.echo(f"sweep resume {store} --retry-failed  tries failed blocks again.")
     if s.blocks_done:
@@ -152,18 +152,18 @@ def _tell(report: Report) -> None:
         click.echo(f"{store}: {name} put back")
     for damage in report.damages[:MOST_LISTED]:
         block = f"block {damage.block}: " if damage.block >= 0 else ""
-        click.echo(f"{store}: {block}{damage.object} {damage.what}", err=True)
+        tell(f"{store}: {block}{damage.object} {damage.what}", err=True)
     if len(report.damages) > MOST_LISTED:
         click.echo(f"and {len(report.damages) - MOST_LISTED:,} more", err=True)
     if report.blocks:
-        click.echo(f"{store}: {report.whole:,} of {report.blocks:,} blocks committed and undamaged")
+        tell(f"{store}: {report.whole:,} of {report.blocks:,} blocks committed and undamaged")
 
 
 def _say_what_to_do(store: Location, reports: list[Report]) -> None:
     """Print what mends what was found."""
     for report in reports:
         if report.unmarked:
-            click.echo(
+            tell(
                 f"Damaged blocks are not marked for resume: {report.unmarked}. "
                 "Verify again when that is settled.",
                 err=True,
@@ -236,21 +236,22 @@ def compare(a: Location, b: Location, figure: Path | None) -> None:
         raise click.BadParameter(
             f"{figure} ends in none of {', '.join(FORMATS)}", param_hint="--figure"
         )
-    from sweep.analysis.answers import comparison
-    from sweep.spec import difference
     from sweep.tasks.progress import working
 
-    left, right = _opened(a), _opened(b)
     try:
         with working("comparing"):
+            from sweep.analysis.answers import comparison
+            from sweep.spec import difference
+
+            left, right = _opened(a), _opened(b)
             compared = comparison.compared(left, right)
     except ValueError as error:
         raise click.UsageError(str(error)) from None
     for line in difference(left.sweep.spec, right.sweep.spec) or ["the same study"]:
-        click.echo(line)
+        tell(line)
     for scanner, found in compared.items():
         if scanner:
-            click.echo(f"{scanner}: {comparison.met(found)}")
+            tell(f"{scanner}: {comparison.met(found)}")
         print_table(
             f"{b.name} less {a.name}{scanner and ', '}{scanner}",
             list(comparison.COLUMNS),
@@ -260,7 +261,7 @@ def compare(a: Location, b: Location, figure: Path | None) -> None:
     if figure is not None:
         click.echo(comparison.save_figure(compared, figure))
     verdict, words = comparison.verdict(compared.values())
-    click.echo(words)
+    tell(words)
     if code := {"different": DIFFERENT, "nothing": INCOMPLETE}.get(verdict, 0):
         sys.exit(code)
 

@@ -318,6 +318,13 @@ def maximum_range(study: Study) -> Chart | Table | None:
     return _reach_chart(reaches, x, words, fewer) if x else _reach_table(reaches, words)
 
 
+def is_empty(found: Chart | Table | None) -> bool:
+    """Return whether a chart has no value, as where pd is above the level at every range."""
+    if not isinstance(found, Chart):
+        return False
+    return not any(np.isfinite(line.y).any() for panel in found.panels for line in panel.lines)
+
+
 def reached(found: Chart | Table | None) -> list[str]:
     """Maximum range in a sentence, as a chart or table of :func:`maximum_range` has it."""
     kept = next(iter(ANSWERS))
@@ -334,13 +341,15 @@ def reached(found: Chart | Table | None) -> list[str]:
     if there.size:
         ends = " to ".join(dict.fromkeys(f"{end:.3g}" for end in (there.min(), there.max())))
         part = ", of the parts shown here" if any("not shown" in c for c in found.caption) else ""
+        what, _, units = words.rstrip(")").partition(" (")
         told = [
-            f"{words.capitalize()} with a probability of {PD:g} or more all the way{part}: {ends}."
+            f"{what.capitalize()} with a probability of {PD:g} or more all the way{part}: "
+            f"{ends} {units}."
         ]
     if lacking := values.size - there.size:
         told.append(
-            f"There is no such range at {lacking:,} of {values.size:,} places: detection is less "
-            "probable from the first range on, or is not up to the last."
+            f"No maximum range at {lacking:,} of {values.size:,} places: there the probability is "
+            f"below {PD:g} from the first range on, or {PD:g} or more up to the last."
         )
     return told
 

@@ -179,8 +179,8 @@ def _traces(words: str, cloud: Cloud, ground: Ground | None) -> Iterator[go.Scat
                     meta=when(cloud=words, colour=_option(name)) | {"scaled": True},
                     hovertemplate=f"{label(name)}: %{{customdata:.5g}}<extra>{kind}</extra>",
                     marker={
-                        "size": 3 if of_true else 4,
-                        "symbol": "circle" if of_true else "diamond-open",
+                        "size": 3 if of_true else 5,
+                        "symbol": "circle" if of_true else "diamond",
                         "color": colour, "cmin": low, "cmax": high,
                         "showscale": of_true or not true.any(), "colorbar": COLOUR_BAR,
                     },

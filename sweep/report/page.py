@@ -276,6 +276,10 @@ def _axis(axis: Axis, **further: Any) -> dict[str, Any]:
     made = {"title": {"text": words, "standoff": 12}, "zeroline": False, "type": axis.kind}
     if axis.limits is not None:
         made |= {"rangemode": "tozero"} if None in axis.limits else {"range": list(axis.limits)}
+    if axis.kind == "log":
+        made["nticks"] = 6  # decades without digits 2 and 5 between them, unless there are few
+    if axis.words.startswith("number of") and axis.kind == "linear":  # 8,000 rather than 0.8 10^4
+        return made | {"exponentformat": "none", "separatethousands": True} | further
     return made | {"exponentformat": "power"} | further
 
 

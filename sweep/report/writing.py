@@ -92,7 +92,7 @@ def _grid_page(store: Location) -> Page:
     figures: list[Made] = list(_figures(study))
     tables = list(_tables(study))
     reach = detector.maximum_range(study)
-    figures.append(reach)
+    figures.append(None if detector.is_empty(reach) else reach)
     found = detector.tracks(study)
     trades: list[Made] = [detector.noise_budget(study, *found)]
     if not spec.draws.whole_spectra:  # of what looks at those there are no closed forms
@@ -157,7 +157,7 @@ def _page(
         ("study", attributes["study_id"][:8]),
         ("model", str(attributes["model_version"])),
         ("sweep", attributes["software"]["sweep"]),
-        ("finished", str(attributes["finished"])[:16].replace("T", " ")),
+        ("finished (UTC)", str(attributes["finished"])[:16].replace("T", " ")),
     ]
     done, number = attributes[f"{unit}_committed"], attributes[unit]
     remark = (

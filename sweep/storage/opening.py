@@ -160,6 +160,9 @@ def _document(path: Location) -> dict[str, Any]:
         raise NotAStoreError(f"there is no store at {path}{_near(path)}")
     if how := remedy(path):
         raise NotAStoreError(f"{path / 'zarr.json'} is damaged{how}")
+    if isinstance(path, Path) and path.is_file():
+        what = "a file, and no Zarr store of sweep's: `sweep run` computes a spec into one"
+        raise NotAStoreError(f"{path} is {what}{_near(path)}")
     raise NotAStoreError(f"{path} is not a Zarr store of sweep's{_near(path)}")
 
 
@@ -188,7 +191,8 @@ def remedy(path: Location) -> str:
 def _near(path: Location) -> str:
     """Remark on the stores in a directory or beside a path; empty where there are none."""
     directory = path if path.is_dir() else path.parent
-    names = sorted(str(store) for store in directory.glob("*.zarr")) if directory.is_dir() else []
+    found = directory.glob("*.zarr/zarr.json") if directory.is_dir() else ()
+    names = sorted(str(document.parent) for document in found)
     shown = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
     return f"; stores near it: {shown}" if names else ""
 

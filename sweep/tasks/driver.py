@@ -213,17 +213,19 @@ def _refuse_unsound(
 
 def _refuse_in_the_way(path: Location, study: GridStudy | FlightStudy) -> None:
     """Refuse a place in which there is something, or for which something is under way."""
-    new = under_way(path)
+    new, what_next = under_way(path), f"`sweep resume {path}` goes on with it"
     if path.exists():
         attributes, held = _held(path)
         refuse_other_study(path, attributes, held.spec, study.spec)
         done = int(np.count_nonzero(receipted(path, study)))
         said = f"{path} holds this study already, {done} of {study.n_blocks} blocks done"
+        if done == study.n_blocks:
+            what_next = f"`sweep status {path}` tells about it"
     elif new:
         said = f"a study is under way in {new}"
     else:
         return
-    raise StoreError(f"{said}: `sweep resume {path}` goes on with it, --overwrite begins anew")
+    raise StoreError(f"{said}: {what_next}, --overwrite begins anew")
 
 
 def _into(
@@ -335,6 +337,8 @@ def _go_on(
         if _is_done(path, study):
             return session.run()
         rays, why = _cast(study, pool)
+        if any(rays.values()) and not why:  # progress begins anew, at none of the same shots
+            pool.told.say("all rays are cast; simulating shots")
         return session.run(before=why, rays=rays)
 
 

@@ -247,7 +247,9 @@ def amount(points: float) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Put a time into words: `45 s`, `3 min 20 s`, `5 h 02 min`, `5,950 years`."""
+    """Put a time into words: `0.3 s`, `45 s`, `3 min 20 s`, `5 h 02 min`, `5,950 years`."""
+    if seconds < 0.95:
+        return f"{max(seconds, 0.0):.1g} s"
     whole = int(seconds + 0.5)
     if whole < 60:
         return f"{whole} s"

@@ -48,7 +48,7 @@ def test_a_weaker_laser_differs_by_4_and_the_table_says_where(stores, tmp_path):
 
 def test_the_same_store_is_the_same_study(stores):
     result = compared(stores["one"], stores["one"])
-    assert result.exit_code == 0 and result.output.startswith("the same study\n")
+    assert result.exit_code == 0 and result.stdout.startswith("the same study\n")
 
 
 def test_what_cannot_be_compared_ends_with_2(stores, tmp_path):

@@ -156,10 +156,10 @@ def test_a_grid_s_page_opens_with_reach_alarms_and_tolerance(grid_page, grid_sto
         "The probability of detection of a shot is 0.9 or more at "
         f"{int((pd >= 0.9).sum()):,} of {pd.size:,} points; its mean is {float(pd.mean()):.3g}, "
         f"its lowest {float(pd.min()):.3g}.",
-        "Maximum range (km) with a probability of 0.9 or more all the way: "
-        f"{float(reach.min()):.3g} to {float(reach.max()):.3g}.",
-        f"There is no such range at {lacking} of {reach.size} places: detection is less probable "
-        "from the first range on, or is not up to the last.",
+        "Maximum range with a probability of 0.9 or more all the way: "
+        f"{float(reach.min()):.3g} to {float(reach.max()):.3g} km.",
+        f"No maximum range at {lacking} of {reach.size} places: there the probability is below 0.9 "
+        "from the first range on, or 0.9 or more up to the last.",
         "The tolerance of 0.001 is kept at all of these points.",
     ]
 

@@ -89,6 +89,12 @@ def test_cuts_along_a_zipped_axis_have_a_maximum_range_each_and_no_range_none(tm
     (tmp_path / "powers").mkdir()
     powers = made(tmp_path / "powers", GRID | {"axes": power, "target": target, "figures": []})
     assert detector.maximum_range(powers) is None
+    near = {"target.range": ["50 m", "60 m"], "target.grazing_angle": ["50 deg", "60 deg"]}
+    (tmp_path / "near").mkdir()
+    sure = detector.maximum_range(made(tmp_path / "near", GRID | {"axes": near, "figures": []}))
+    assert detector.is_empty(sure) and not detector.is_empty(chart)
+    (told,) = detector.reached(sure)
+    assert told.startswith("No maximum range at 2 of 2 places") and "up to the last" in told
 
 
 def test_where_a_study_draws_lines_have_the_intervals_of_their_points(drawn):
@@ -102,7 +108,7 @@ def test_where_a_study_draws_lines_have_the_intervals_of_their_points(drawn):
         np.testing.assert_allclose(line.y, own.pd, atol=1e-6)
         np.testing.assert_allclose(line.low, own.low, atol=1e-6)
         np.testing.assert_allclose(line.high, own.high, atol=1e-6)
-    assert "interval of each point of a confidence of 0.95" in " ".join(chart.caption)
+    assert "95 % confidence interval of each point" in " ".join(chart.caption)
 
 
 def test_the_maximum_range_has_an_interval_where_pd_has(drawn):
@@ -113,7 +119,7 @@ def test_the_maximum_range_has_an_interval_where_pd_has(drawn):
     assert known.any()
     np.testing.assert_allclose(line.low[known], expected.unbroken_low[known], rtol=1e-6)
     np.testing.assert_allclose(line.high[known], expected.unbroken_high[known], rtol=1e-6)
-    assert "confidence of 0.95" in " ".join(chart.caption)
+    assert "95 % confidence interval" in " ".join(chart.caption)
 
 
 def test_false_alarms_of_a_shot_are_those_that_are_told_a_second(grid_store):
