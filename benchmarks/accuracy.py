@@ -133,7 +133,7 @@ TAIL = """
 ## On your own study
 
 ```sh
-sweep accuracy my_study.yaml --points 500 --time-limit 300
+sweep accuracy experiments/quickstart.yaml --points 500 --time-limit 30
 ```
 
 prints the tables, draws the figure and leaves a store that opens with xarray:
@@ -141,7 +141,7 @@ prints the tables, draws the figure and leaves a store that opens with xarray:
 ```python
 import xarray as xr
 
-ds = xr.open_zarr("results/my_study_accuracy.zarr")
+ds = xr.open_zarr("results/quickstart_accuracy.zarr")
 ds.pd_error.max("point")  # by setting
 ds.seconds.min("round")  # a point
 ```

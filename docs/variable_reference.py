@@ -22,10 +22,16 @@ and `pd_shot` for the whole shot. Other names follow the same pattern.
 Attributes follow the CF conventions: units, names in words, standard names where the CF table has
 them, `flag_masks` or `flag_values` with `flag_meanings`. With `pint-xarray` and `cf-xarray`,
 
+```sh
+sweep run experiments/quickstart.yaml
+```
+
 ```python
 import cf_xarray.units  # before pint_xarray
 import pint_xarray
+import sweep
 
+ds = sweep.open("results/quickstart.zarr")
 ds.pint.quantify()  # units on every variable
 ds.effects.cf.flags  # one boolean per effect
 ```

@@ -5,6 +5,7 @@ import io
 import os
 import re
 import runpy
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -15,19 +16,34 @@ import yaml
 import sweep
 from sweep.cli import main
 from sweep.model import outputs
-from sweep.spec import Spec
+from sweep.spec import load_cluster
 
 REPOSITORY = Path(__file__).parents[2]
 DOCS = REPOSITORY / "docs"
-RUN = [REPOSITORY / "README.md", DOCS / "tutorial.md", *sorted((DOCS / "howto").glob("*.md"))]
-IN_SECONDS = ("README", "read_results", "search_a_band")
+CHANGES = REPOSITORY / "CHANGELOG.md"
+"""Names what is gone too."""
+
+PAGES = sorted([*REPOSITORY.glob("*.md"), *REPOSITORY.glob("*/*.md"), *DOCS.glob("howto/*.md")])
+PAGES.remove(CHANGES)
+IN_SECONDS = ("README.md", "docs/howto/read_results.md", "docs/howto/search_a_band.md")
 """Pages that the fast suite runs."""
 
-NEEDED = {"keep_stores_in_a_bucket": "moto.server"}
+NEEDED = {"keep_stores_in_a_bucket": "moto.server", "variables": "pint_xarray"}
 """What a page has its reader install."""
 
-SETS_UP = "make "
-"""Beginning of a block that sets up a copy of the repository: not run by a test in that copy."""
+ELSEWHERE = re.compile(r"^(make|pip|helm|kubectl) |--cluster deploy/", re.M)
+"""Commands that set up a copy of the repository or need a cluster: they are named, and not run."""
+
+LAID_OVER = "laid_over.yaml"
+
+WHOLE = {
+    "title": "What a fragment of a spec is laid over",
+    "instrument": "chester_2017_table_4_1",
+    "target": {"range": "20 m", "grazing_angle": "60 deg", "radial_velocity": "1 m/s",
+               "reflectance": "0.1"},
+}  # fmt: skip
+
+SOURCES = sorted((REPOSITORY / "sweep").rglob("*.py"))
 
 MAKES_A_FILE = ("import trimesh\n", "import numpy as np\n\ntime")
 """Beginnings of blocks that make what a spec reads."""
@@ -36,20 +52,34 @@ BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.S | re.M)
 
 
 def blocks(page):
-    """Language and text of every block of a page, in order."""
+    """Language and text of every block of a page, in order, but for those that run elsewhere."""
     found = BLOCK.findall(page.read_text(encoding="utf-8"))
-    return [(language, text) for language, text in found if not text.startswith(SETS_UP)]
+    return [(language, text) for language, text in found if not ELSEWHERE.search(text)]
+
+
+def name(page):
+    return str(page.relative_to(REPOSITORY))
+
+
+WITH_BLOCKS = [page for page in PAGES if blocks(page)]
 
 
 def lines(text):
     return [line.rstrip() for line in text.strip("\n").splitlines()]
 
 
-def save(text):
-    """A spec under the name that its first line gives."""
-    path = Path(re.match(r"# (\S+\.yaml)\n", text).group(1))
-    path.write_text(text, encoding="utf-8")
+def save(text, over=WHOLE):
+    """A spec under the name that its first line gives; one without is laid over a whole spec."""
+    found = re.match(r"# (\S+\.yaml)\n", text)
+    path = Path(found.group(1) if found else LAID_OVER)
+    laid = text if found else yaml.dump(over | yaml.load(text, yaml.BaseLoader))
+    path.write_text(laid, encoding="utf-8")
     return path
+
+
+def is_quoted(code):
+    """Whether code is a part of the source, shown to its first colon or comma."""
+    return code.rstrip()[-1] in ":,"
 
 
 @pytest.fixture
@@ -62,43 +92,94 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-@pytest.mark.parametrize("page", RUN, ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", WITH_BLOCKS, ids=name)
 def test_blocks_are_of_kinds_that_can_be_run_and_specs_are_right(page, here):
     found = blocks(page)
     assert {language for language, _ in found} <= {"yaml", "sh", "python", "text"}
-    assert {"sh", "python"} & {language for language, _ in found}
-    for language, text in found:
+    over = WHOLE
+    for (before, _), (language, text) in zip([("", ""), *found], found, strict=False):
         if language == "python" and text.startswith(MAKES_A_FILE):
             exec(compile(text, page.name, "exec"), {})
-        elif language == "yaml":
-            assert sweep.load(save(text)).title
-    for (before, _), (language, _) in zip([("", ""), *found], found, strict=False):
-        assert language != "text" or before == "python"
+        elif language == "python" and is_quoted(text):
+            assert any(text in module.read_text("utf-8") for module in SOURCES)
+        elif language == "yaml" and page.parent.name != "deploy":
+            path = save(text, over)
+            assert sweep.load(path).title
+            if path.name != LAID_OVER:
+                over = yaml.load(text, yaml.BaseLoader)
+        assert language != "text" or before in {"python", "sh"}
 
 
 @pytest.mark.parametrize(
     "page",
     [
-        pytest.param(p, id=p.stem, marks=[] if p.stem in IN_SECONDS else [pytest.mark.slow])
-        for p in RUN
+        pytest.param(p, id=name(p), marks=[] if name(p) in IN_SECONDS else [pytest.mark.slow])
+        for p in WITH_BLOCKS
+        if {"sh", "python"} & {language for language, _ in blocks(p)}
     ],
 )
 def test_what_a_page_tells_to_run_runs_and_shows_what_comes(page, here):
     if page.stem in NEEDED:
         pytest.importorskip(NEEDED[page.stem])
-    names, printed = {}, ""
+    names, printed = {}, []
     for language, text in blocks(page):
-        if language == "yaml":
+        if language == "yaml" and page.parent.name == "deploy":
+            over = page.with_name("kubernetes.yaml" if "secret:" in text else "slurm.yaml")
+            assert load_cluster(save(text, yaml.safe_load(over.read_text("utf-8")))).security
+        elif language == "yaml":
             save(text)
         elif language == "sh":
-            ran = subprocess.run(["bash", "-ec", text], capture_output=True, text=True)
-            assert ran.returncode == 0, ran.stdout + ran.stderr
-        elif language == "python":
+            ran = subprocess.run(
+                ["bash", "-ec", text], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+            )
+            assert ran.returncode == 0, ran.stdout
+            printed = lines(ran.stdout)
+        elif language == "python" and not is_quoted(text):
             with contextlib.redirect_stdout(io.StringIO()) as out:
                 exec(compile(text, page.name, "exec"), names)
-            printed = out.getvalue()
-        else:
-            assert lines(printed) == lines(text)
+            printed = lines(out.getvalue())
+        elif language == "text":  # what a command prints tells more, such as how far it is
+            told = lines(text)
+            assert [line for line in printed if line in told] == told, printed
+
+
+def commands(page):
+    """Commands that a page names, in its blocks and within its lines, a list of words each."""
+    text = page.read_text(encoding="utf-8").replace("\\\n", " ")
+    indented = re.findall(r"^    ((?:sweep|make) .*)", text, re.M)
+    quoted = [" ".join(code.split()) for code in re.findall(r"`((?:sweep|make) [^`]+)`", text)]
+    blocks = [line for block in re.findall(r"^```sh\n(.*?)^```$", text, re.S | re.M)
+              for line in block.splitlines() if line.startswith(("sweep ", "make "))]  # fmt: skip
+    return [shlex.split(line, comments=True) for line in [*indented, *quoted, *blocks]]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_commands_and_their_options_are_there(page):
+    for program, word, *others in commands(page):
+        if program == "sweep" and word in main.commands:
+            known = {option for p in main.commands[word].params for option in p.opts}
+            given = {other.partition("=")[0] for other in others if other.startswith("-")}
+            assert given <= known | {"--help", "-h"}, (word, given)
+        elif program == "sweep":
+            assert word in {"--help", "COMMAND"}, word
+
+
+TARGETS = sorted(
+    {word for page in PAGES for program, word, *_ in commands(page) if program == "make"}
+)
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_a_target_of_make_starts_programs_that_are_there(target, monkeypatch):
+    monkeypatch.delenv("TIMES", raising=False)  # a file that even a dry run of parts would add to
+    told = subprocess.run(
+        ["make", "--dry-run", "--old-file", ".venv/.core", "--old-file", ".venv/.ready", target],
+        cwd=REPOSITORY, capture_output=True, text=True,
+    )  # fmt: skip
+    assert told.returncode == 0 and told.stdout, told.stderr
+    for path in {REPOSITORY / found for found in re.findall(r"\S+\.py\b", told.stdout)}:
+        monkeypatch.syspath_prepend(str(path.parent))
+        runpy.run_path(str(path), run_name="imported")
 
 
 @pytest.mark.parametrize(
@@ -122,15 +203,6 @@ def test_every_table_of_outputs_has_its_variables_in_the_reference():
     assert {name for name in named if f"| `{name}` |" not in page} == set()
 
 
-def test_the_axes_that_the_page_on_specs_shows_can_be_written():
-    found = [text for language, text in blocks(DOCS / "specs.md") if language == "yaml"]
-    (axes,) = [yaml.load(text, Loader=yaml.BaseLoader) for text in found if "axes:" in text]
-    spec = sweep.load(REPOSITORY / "experiments" / "quickstart.yaml")
-    mapping = spec.to_yaml_mapping() | axes | {"figures": []}
-    names = [axis.name for axis in Spec.from_mapping(mapping, base=Path(".")).axes]
-    assert names == ["range", "grazing_angle", "power", "cut"]
-
-
 def test_every_question_on_the_first_page_leads_to_one_page():
     page = (DOCS / "index.md").read_text(encoding="utf-8").partition("## Ten questions")[2]
     rows = re.findall(r"^\| .*\?.* \| \[[^]]+\]\(([^)#]+\.md)(?:#([-\w]+))?\) \|$", page, re.M)
@@ -151,9 +223,7 @@ def test_every_page_is_two_clicks_or_fewer_from_the_first():
     assert pages - second == set()
 
 
-@pytest.mark.parametrize(
-    "page", sorted([*DOCS.rglob("*.md"), *REPOSITORY.glob("*.md")]), ids=lambda page: page.stem
-)
+@pytest.mark.parametrize("page", [*PAGES, CHANGES], ids=name)
 def test_links_lead_to_files_that_are_there(page):
     for link in re.findall(r"\]\(([^)#\s]+)", page.read_text(encoding="utf-8")):
         assert re.match(r"https?:", link) or (page.parent / link).exists(), link
