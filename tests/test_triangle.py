@@ -94,6 +94,8 @@ def test_no_point_of_a_street_is_lost_whatever_the_slopes(tmp_path, record, chir
     three, found = flown(tmp_path, segments="up doppler down"), flown(tmp_path, record, **chirp)
     kept, before = ((each["flags"] & TRUE > 0).sum().item() for each in (found, three))
     assert kept >= 0.995 * before > 500
+    nothing = found["flags"] == 0
+    assert nothing.any()
     for name in ("range", "radial_velocity"):
         error = found[f"{name}_interpolated"] - found[f"true_{name}"]
         scores = (error / found[f"{name}_interpolated_standard_error"]).to_numpy()
@@ -103,3 +105,5 @@ def test_no_point_of_a_street_is_lost_whatever_the_slopes(tmp_path, record, chir
         whole = found[name] - found[f"true_{name}"]
         scores = (whole / found[f"{name}_standard_error"]).to_numpy()
         assert 0.8 < np.nanstd(scores) < 1.2, (name, np.nanstd(scores))
+        for told in ("standard_error", "interpolated_standard_error"):  # of no point there is none
+            assert (found[f"{name}_{told}"].isnull() == nothing).all(), (name, told)

@@ -250,10 +250,11 @@ class Shots:
         )
         return in_rows([self.whitened(beat) for beat in beats], (self.size,))
 
-    def whitened(self, beat: np.ndarray) -> np.ndarray:
+    def whitened(self, beat: np.ndarray, at: np.ndarray | None = None) -> np.ndarray:
         """Gain of a line at a beat [Hz], (n,), in a spectrum whose noise is white.
 
-        The anti-alias filter's is in it; the poles are none of it, as each line passes them.
+        The anti-alias filter's is in it; the poles are none of it, as each line passes them. Its
+        skirts in bins at another frequency ``at`` [Hz] are beside the noise of these.
         """
         if self.noise_shape == "white":
             return np.ones(())
@@ -261,7 +262,7 @@ class Shots:
             "detector_bandwidth": self.detector_bandwidth,
             "amplifier_bandwidth": self.amplifier_bandwidth, "sample_rate": self.sample_rate,
         } | self.antialias  # fmt: skip
-        density = link.noise_density(beat, **shape)
+        density = link.noise_density(beat if at is None else at, **shape)
         white = self.noise_sources.get(ADC_NOISE, 0.0) / self.quiet_variance
         gain = (density + (1 - density) * white) ** -0.5
         if self.antialias:

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -126,19 +127,35 @@ def measured(study: GridStudy) -> float:
     Whole sets of points that share a geometry are taken, so that sharing shows as it will.
     Points that miss an accuracy after few draws are taken to reach their limit.
     """
-    grid = study.grid
-    blocks = np.unique(np.linspace(0, grid.n_blocks - 1, PLACES).astype(np.int64))
+    study.compile()
+    blocks = _places(study)
 
     def look(rows: int) -> Round:
         begun = time.process_time()
-        found = [_evaluate_some(study, int(block), rows) for block in blocks]
+        found = [_evaluate_some(study, block, rows) for block in blocks]
         taken = time.process_time() - begun
         points, left_out = (sum(each) for each in zip(*found, strict=True))
         return Round(points, (taken + left_out,))
 
-    study.compile()
-    enough = _enough(look, grid.points, MEASURING)
+    enough = _enough(look, study.grid.points, MEASURING)
     return enough.parts[0] / enough.points
+
+
+def _places(study: GridStudy) -> list[int]:
+    """Blocks spread over the grid, fewer where points take long: looked at once.
+
+    That loads what is compiled, which takes longer than many points.
+    """
+    blocks: list[int] = []
+    last, begun = study.grid.n_blocks - 1, time.process_time()
+    for k in sorted(range(PLACES), key=lambda k: -math.gcd(k, PLACES)):  # 0, the middle, quarters
+        block = k * last // (PLACES - 1)
+        if block not in blocks:
+            _evaluate_some(study, block, 1)
+            blocks.append(block)
+        if time.process_time() - begun > 2 * MEASURING:
+            break
+    return blocks
 
 
 class Round(NamedTuple):
@@ -152,7 +169,6 @@ def _enough(look: Callable[[int], Round], points: int, seconds: float) -> Round:
     """Compute so much of a study that the time can be measured, or all of it."""
     from numba.core.event import install_recorder
 
-    look(1)  # loads what is compiled, which takes longer than many points
     amount, begun = 1, time.perf_counter()
     while True:  # once at the least, however long this process has been held up
         with install_recorder("numba:compile") as compiled:
@@ -232,6 +248,7 @@ def _scanner(study: FlightStudy, eyepoints: EyepointStudy) -> ScannerPlan:
         looked = time.process_time()
         return Round(len(numbers), (cast - begun, looked - cast))
 
+    look(1)  # loads what is compiled, which takes longer than many points
     found = _enough(look, eyepoints.points, MEASURING_SCANNER)
     casting, looking = found.parts
     return ScannerPlan(
@@ -254,6 +271,9 @@ FLIGHT_TILES, FLIGHT_PLACES = 16, 12
 #: Tiles on which an effect's cost is measured, points of each, draws of a point, and rounds, of
 #: which the best counts; in flights scanners and places along the axes, and shots of each.
 COST_TILES, COST_POINTS, COST_DRAWS, ROUNDS, COST_LOOKS = 4, 24, 20, 3, 3
+
+#: Time [s] after which an effect's cost is known well enough from one round, point or tile less.
+COST_SECONDS = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -310,13 +330,18 @@ def _of_grid(study: GridStudy, costs: bool) -> EffectsTable:
     flags = selection.absent(study.grid.parameters_at(np.concatenate(numbers)), int(sizes.sum()))
     first = np.cumsum(sizes) - sizes
     there = np.array([np.add.reduceat((flags >> k & 1) == 0, first) for k in range(len(EFFECTS))])
+    drawn = spec
+    if spec.draws.whole_spectra:  # what an effect costs does not go by what looks at spectra
+        draws = spec.draws.model_copy(update={"method": "probabilities"})
+        drawn = spec.model_copy(update={"draws": draws})
+    sample = _sampling(drawn, selection)
     return _table(
         spec,
         _Planned(kept * there, change, error),
         points=int(sizes.sum()),
         where=lambda some: _region(spec, selection, tiles[some]),
         cost=lambda name, selected: (
-            _cost(spec, selection, tiles[selected], name) if costs else math.nan
+            _cost(drawn, sample, tiles[selected], name) if costs else math.nan
         ),
         looked_at=len(tiles) / number,
     )
@@ -413,27 +438,60 @@ def _region(spec: Spec, selection: EffectSelection, tiles: np.ndarray) -> str:
     return ", ".join(words) or "the point"
 
 
-def _cost(spec: Spec, selection: EffectSelection, tiles: np.ndarray, name: str) -> float:
-    """Share of the time of points that an effect takes, from points with it and without."""
-    if spec.draws.whole_spectra:  # what an effect costs does not go by what looks at spectra
-        draws = spec.draws.model_copy(update={"method": "probabilities"})
-        spec = spec.model_copy(update={"draws": draws})
-    spent = total = 0.0
-    for tile in tiles[np.unique(np.linspace(0, len(tiles) - 1, COST_TILES).astype(np.int64))]:
-        parameters = selection.tiles.grid.parameters_at(
-            numbers := _numbers(selection, int(tile), COST_POINTS)
-        )
+class _Sample(NamedTuple):
+    """Points of a tile, with all effects of its plan."""
+
+    parameters: Mapping[str, Value]
+    number: int
+    effects: tuple[str, ...]
+
+
+def _sampling(spec: Spec, selection: EffectSelection) -> Callable[[int], _Sample]:
+    """Choice of points of a tile, made once: of few, or of one where that takes long."""
+
+    @cache
+    def sample(tile: int) -> _Sample:
         ((_, plan),) = selection.plans(np.array([tile]))
-        names = tuple(compress(NAMES, plan.kept[:, 0]))
+        effects = tuple(compress(NAMES, plan.kept[:, 0]))
+        few, one = (_numbers(selection, tile, most) for most in (COST_POINTS, 1))
+        parameters = selection.tiles.grid.parameters_at(one)
+        if _seconds_of(spec, parameters, 1, effects) < COST_SECONDS / 2:
+            return _Sample(selection.tiles.grid.parameters_at(few), len(few), effects)
+        return _Sample(parameters, 1, effects)
+
+    return sample
+
+
+def _fastest(measure: Callable[[], float]) -> float:
+    """Time [s], the least of rounds: the first may load what is compiled."""
+    found, begun = math.inf, time.process_time()
+    for number in range(ROUNDS):
+        found = min(found, measure())
+        if number and time.process_time() - begun > COST_SECONDS:
+            break
+    return found
+
+
+def _seconds_of(
+    spec: Spec, parameters: Mapping[str, Value], number: int, effects: Collection[str]
+) -> float:
+    """Time of some points [s] with some effects."""
+    return _fastest(lambda: sum(timed(spec, parameters, number, effects, most_draws=COST_DRAWS)))
+
+
+def _cost(spec: Spec, sample: Callable[[int], _Sample], tiles: np.ndarray, name: str) -> float:
+    """Share of the time of points that an effect takes, from points with it and without."""
+    spent = total = 0.0
+    for tile in _spread(tiles, COST_TILES):
+        parameters, number, effects = sample(int(tile))
         with_it, without = (
-            min(
-                sum(timed(spec, parameters, len(numbers), effects, most_draws=COST_DRAWS))
-                for _ in range(ROUNDS)
-            )
-            for effects in (names, tuple(n for n in names if n != name))
+            _seconds_of(spec, parameters, number, some)
+            for some in (effects, tuple(n for n in effects if n != name))
         )
         spent += max(with_it - without, 0.0)
         total += with_it
+        if total > COST_SECONDS:
+            break
     return spent / total
 
 
@@ -472,19 +530,22 @@ def _looks(study: FlightStudy) -> list[_Look]:
 
 def _flight_cost(study: FlightStudy, looks: Sequence[_Look], name: str) -> float:
     """Share of the time of shots that an effect takes, from cycles with it and without."""
-    flag, spent, total = np.uint32(1 << NAMES.index(name)), 0.0, 0.0
+    nothing, flag = np.uint32(0), np.uint32(1 << NAMES.index(name))
+    spent = total = 0.0
     there = [look for look in looks if (look.selected.flags & flag).any()]
     for look in _spread(there, COST_LOOKS):
         each = study.scanners[look.part.scanner].shots_a_cycle
         having = np.flatnonzero((look.selected.flags & flag).reshape(-1, each).any(axis=1))
-        cycles = np.array(_spread(having, -(-COST_POINTS // each)))
-        rows = (cycles[:, None] * each + np.arange(each)).ravel()
-        with_it, without = (
-            min(_seconds(study, look.some(rows, less=less)) for _ in range(ROUNDS))
-            for less in (np.uint32(0), flag)
-        )
+        for number in (1, -(-COST_POINTS // each)):
+            cycles = np.array(_spread(having, number))
+            with_it = _seconds(study, look, cycles, less=nothing)
+            if with_it > COST_SECONDS / 2:  # so few tell enough
+                break
+        without = _seconds(study, look, cycles, less=flag)
         spent += max(with_it - without, 0.0)
         total += with_it
+        if total > COST_SECONDS:
+            break
     return spent / total if total else math.nan
 
 
@@ -494,10 +555,17 @@ def _spread(items: Sequence[Any] | np.ndarray, most: int) -> list[Any]:
     return [items[k] for k in few]
 
 
-def _seconds(study: FlightStudy, look: _Look) -> float:
-    begun = time.process_time()
-    study.look(*look)
-    return time.process_time() - begun
+def _seconds(study: FlightStudy, look: _Look, cycles: np.ndarray, *, less: np.uint32) -> float:
+    """Time of some cycles [s] without the effects of some flags."""
+    each = study.scanners[look.part.scanner].shots_a_cycle
+    some = look.some((cycles[:, None] * each + np.arange(each)).ravel(), less=less)
+
+    def once() -> float:
+        begun = time.process_time()
+        study.look(*some)
+        return time.process_time() - begun
+
+    return _fastest(once)
 
 
 def _numbers(selection: EffectSelection, tile: int, most: int | None = None) -> np.ndarray:

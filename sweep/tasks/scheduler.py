@@ -81,8 +81,12 @@ class BlockQueue:
         return True
 
     def put_back(self, blocks: list[int]) -> None:
-        """Put blocks back whose answer was lost, by no fault of theirs, or that are begun."""
-        self._returned.extend(blocks)
+        """Put blocks back whose answer was lost, by no fault of theirs, or that are begun.
+
+        One that failed before stays a suspect, and is never out beside another.
+        """
+        for block in blocks:
+            (self._suspects if block in self.failed else self._returned).append(block)
 
 
 def _numbers(done: np.ndarray, stretch: int = 1 << 16) -> Iterator[int]:

@@ -163,6 +163,20 @@ def test_a_leaked_line_passes_the_filter_at_its_own_frequency(table_4_1):
     assert scale == pytest.approx(amplitude / 2 / np.sqrt(density), rel=1e-6)
 
 
+@pytest.mark.parametrize("at", [None, 200e6])
+def test_a_leaked_line_is_beside_the_noise_where_it_is_seen(table_4_1, at):
+    """At its own beat near DC, or where its skirts meet an echo; never at the echo's 280 MHz."""
+    scene = scene_of(table_4_1, 280e6)
+    scene |= {"instrument.telescope.leak_path": 3.0, "instrument.telescope.isolation": 1e6}
+    ((_, shots),) = shot.prepare(scene, (*EVERY, "circulator_leak"))
+    beat = 1e9 / 500e-6 * 3.0 / SPEED_OF_LIGHT
+    aliases = (at or beat) + RATE * np.arange(-4000, 4001)
+    density = (np.abs(poles(aliases)) ** 2).sum() * RATE / 8e8
+    scale, _ = line_of(shots, 0, 0, at)
+    amplitude = float(np.broadcast_to(shots.leak_amplitude, 1)[0])
+    assert scale == pytest.approx(amplitude / 2 / np.sqrt(density), rel=1e-4)
+
+
 def test_the_adc_sees_what_the_filter_leaves(table_4_1):
     """In the segment that passes best: the up-chirp, at the Doppler shift less the range's beat."""
     scene = scene_of(table_4_1, 50e6) | {"target.range": 2000.0}

@@ -158,6 +158,24 @@ def test_drawn_records_detect_and_alarm_as_often_as_the_closed_forms(table_4_1, 
         assert expected == pytest.approx(drawn, abs=0.04 * drawn + spread(drawn)), name
 
 
+@pytest.mark.parametrize(("tnr", "snr", "most"), [(2.5, 4.0, 0.03), (4.5, 8.0, 0.02)])
+def test_both_chirps_in_common_speckle_are_overrated_at_low_thresholds(table_4_1, tnr, snr, most):
+    """By no more than docs/physics.md says: noise in an echo's other bins counts as its fading."""
+    scene = table_4_1(
+        **NATURE, window="hamming", fft_size=256, beamlets=1, phases="incoherent", tnr=tnr,
+        range=2000.0, radial_velocity=3.0, leakage_floor=0.0,
+        acquisition_delay=500e-6 - 256 / 600e6,
+    )  # fmt: skip
+    effects = {*shot.CORE, "fading"}
+    faint = shot.evaluate(scene | {"instrument.laser.power": 1e-6}, effects)
+    scene["instrument.laser.power"] = snr / (1e6 * faint["snr_up"][0])
+    pd, _ = Instrument.of(scene, effects).drawn(seed=1)
+    outputs = shot.evaluate(scene, effects)
+    for name, drawn in zip(("up", "down"), pd, strict=False):
+        assert outputs[f"pd_{name}"][0] == pytest.approx(drawn, abs=0.005 + spread(drawn)), name
+    assert -spread(pd[2]) < outputs["pd_shot"][0] - pd[2] < most + spread(pd[2])
+
+
 @pytest.mark.parametrize(
     ("name", "place", "snr"),
     every(4, ["rectangular", "hann", "hamming"], [100.0, 100.25, 100.475], [40, 143, 1000]),

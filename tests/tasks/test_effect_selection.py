@@ -1,5 +1,8 @@
 """Plans of grids and flights: the same however a study is cut up, and true to the tolerance."""
 
+from pathlib import Path
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import zarr
@@ -7,6 +10,7 @@ from small import quiet, small
 from small_flights import small_scene
 
 from sweep.model.effects.catalogue import EFFECTS, NAMES, flag_attributes, flags_of, names_of
+from sweep.tasks import plan as planned
 from sweep.tasks.grid import (
     TILE_POINTS,
     EffectSelection,
@@ -206,3 +210,19 @@ def test_a_plan_tells_the_shares_of_points_that_the_store_has(kind, flight, tmp_
     table = effects_table(study_of(spec, store), costs=False)
     assert {row.name: row.share for row in table.rows} == pytest.approx(shares)
     assert len(set(shares.values())) > 1 and table.looked_at == 1
+
+
+def test_a_plan_measures_few_points_where_each_takes_long(monkeypatch):
+    """Points of a tenth of a second, as those of a measured sweep: 16 of them and 576 an effect."""
+    clock = SimpleNamespace(now=0.0, perf_counter=lambda: clock.now, process_time=lambda: clock.now)
+
+    def evaluated(_spec, _parameters, count, _effects):
+        clock.now += 0.1 * count
+        return {}
+
+    study = study_of(small(axes=WIDE), Path("nowhere.zarr"))
+    monkeypatch.setattr(planned, "evaluate_points", evaluated)
+    monkeypatch.setattr(planned, "time", clock)
+    assert planned.measured(study) == pytest.approx(0.1)
+    assert effects_table(study).rows
+    assert clock.now < 15

@@ -41,6 +41,18 @@ def test_a_failed_block_comes_back_once_and_alone():
     assert blocks.take(3) == [3, 4, 5]
 
 
+def test_a_block_that_failed_and_is_put_back_stays_a_suspect():
+    """Else it flew beside another suspect, and failed again as that killed their worker."""
+    blocks = BlockQueue(np.zeros(6, bool))
+    assert blocks.take(3) == [0, 1, 2]
+    assert blocks.again(1) and blocks.again(2)
+    assert blocks.take(1) == [1]
+    blocks.put_back([1, 0])
+    assert blocks.take(1, suspects=False) == [0]
+    assert blocks.take(1, suspects=False) == [3]
+    assert [blocks.take(1), blocks.take(1)] == [[2], [1]]
+
+
 def test_ten_million_blocks_are_handed_out_without_being_listed():
     done = np.zeros(10_000_000, dtype=bool)
     tracemalloc.start()

@@ -180,8 +180,11 @@ def _line(window: Window, fft_size: int, place: float, signed: bool) -> Line:
     return Line(terms, np.abs(terms).sum(axis=0), np.hypot(*np.abs(terms)))
 
 
-def line_of(shots: Shots, i: int, segment: int) -> tuple[float, Line]:
-    """Return half of the amplitude [V] of point i's line in a segment, and that line."""
+def line_of(shots: Shots, i: int, segment: int, at: float | None = None) -> tuple[float, Line]:
+    """Return half of the amplitude [V] of point i's line in a segment, and that line.
+
+    The amplitude is over the noise at the line; or at a frequency ``at`` [Hz], for skirts there.
+    """
     columns = (
         shots.leak_amplitude, shots.leak_delay, shots.chirp_rate, shots.sample_rate,
         shots.detector_bandwidth, shots.amplifier_bandwidth,
@@ -195,8 +198,7 @@ def line_of(shots: Shots, i: int, segment: int) -> tuple[float, Line]:
         np.array(beat), detector_bandwidth=np.array(detector),
         amplifier_bandwidth=np.array(amplifier), transimpedance=np.array(1.0),
     )  # fmt: skip
-    # Without an anti-alias filter the density near DC is within some dB of that at the echo.
-    whitened = shots.whitened(np.array(beat)) if shots.antialias else shots.whitening[segment]
+    whitened = shots.whitened(np.array(beat), None if at is None else np.array(at))
     own = float(np.broadcast_to(whitened, shots.size)[i])
     scale = 0.5 * amplitude * abs(complex(gain)) * own
     place = beat * shots.fft_size / sampled
@@ -275,7 +277,11 @@ def beside_leak(shots: Shots, runs: Any) -> Any:
         at = at % size if shots.complex_record else at
         (scale, line), peak = line_of(shots, int(runs.part[i]), s), runs.peak[s, i]
         masked, echo = scale * line.most >= MASKED_FROM * level[i], runs.exempt[stretch]
-        skirts = np.where(masked[at], 0.0, scale * line.rms[at])
+        echoes = float(
+            at[peak] / size * np.broadcast_to(shots.sample_rate, shots.size)[runs.part[i]]
+        )
+        beside, _ = line_of(shots, int(runs.part[i]), s, echoes)
+        skirts = np.where(masked[at], 0.0, beside * line.rms[at])
         seen = raised(
             runs.magnitudes[stretch], skirts, deviation=under[i], level=level[i],
             fades=shots.fading is not None,
