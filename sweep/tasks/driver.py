@@ -7,17 +7,18 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from sweep.spec import SceneSpec
 from sweep.storage.atomic_replace import beside, eyepoints_path, put, real, replaced_by, settle
 from sweep.storage.locations import PACKED, Location, located
 from sweep.storage.opening import read_attributes, study_id
 from sweep.tasks import studies, user_code
 from sweep.tasks.cluster import Pool, RunOptions
 from sweep.tasks.errors import BusyError, ClusterError, StoreError, told
-from sweep.tasks.eyepoint_study import EyepointStudy
+from sweep.tasks.eyepoint_study import EyepointStudy, world_of
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.journal import (
@@ -44,13 +45,8 @@ from sweep.tasks.store import (
     sync,
     under_way,
 )
-from sweep.tasks.studies import changed, refuse_unlike, what_is_there
+from sweep.tasks.studies import Declared, changed, refuse_unlike, what_is_there
 from sweep.tasks.verify import refuse_damaged
-
-if TYPE_CHECKING:
-    from sweep.spec import SceneSpec, Spec
-
-    Declared = Spec | SceneSpec
 
 #: Seconds between looks at rays that another run casts.
 WAITING = 0.5
@@ -258,9 +254,9 @@ def _into(
             refuse_other_study(new, begun, held.spec, asked)
             _refuse_unsound(new, begun, held)
             write_recipe(new, **read_recipe(new) | facts)
-        if isinstance(study, FlightStudy) and (anew or not there):
+        if isinstance(asked, SceneSpec) and (anew or not there):
             with working("building the scene", pool.told):
-                reports = study.reports
+                reports = world_of(asked).reports
             for line in reports:
                 pool.told.say(line)
 

@@ -500,11 +500,6 @@ class FlightStudy(GrowingStudy):
         """Return the studies that this one looks with."""
         return [self.caster(scanner) for scanner in self.scanners]
 
-    @property
-    def reports(self) -> tuple[str, ...]:
-        """Findings as the scene was loaded and mended, a line an object."""
-        return tuple(world_of(self.spec).reports)
-
 
 def _gaps(lacking: np.ndarray) -> Iterator[tuple[np.ndarray, slice]]:
     """Rows and stretches of draws that are lacking; rows that lack the same come together."""

@@ -313,7 +313,7 @@ def test_a_template_that_cannot_be_made_again_here_is_left_as_it_is(
     store = copied(undisturbed, tmp_path)
     flip(store / "range" / "c" / "0")
     before = everything(store)
-    monkeypatch.setattr("sweep.tasks.store.codecs", dict)
+    monkeypatch.setattr("sweep.tasks.store.CODECS", "auto")
     with pytest.raises(StoreError, match="can't be made again as it was on this machine"):
         verify(store, progress=False, repair=True)
     assert everything(store) == before
