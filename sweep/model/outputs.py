@@ -284,8 +284,8 @@ STATISTICS: dict[str, Output] = _over(("shot",), {
 })  # fmt: skip
 """Probabilities of each shot, before any draw.
 
-Where spectra are held against another detector than the fixed threshold, chances are nan.
-Where nothing is seen false alarms are those of the noise alone, and all else is nan; so is
+If spectra are held against another detector than the fixed threshold, probabilities are nan.
+If nothing is seen false alarms are those of the noise alone, and all else is nan; so is
 ``pd_doppler`` without a Doppler segment.
 """
 
