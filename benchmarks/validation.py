@@ -15,7 +15,7 @@ import sweep
 from sweep.analysis import labels, noise_only
 from sweep.analysis.figures import Study
 from sweep.analysis.shot_figure import chosen, simulated
-from sweep.analysis.tables import entries
+from sweep.analysis.tables import false_alarms
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.spec import load
 
@@ -117,12 +117,13 @@ def alarms(name, number):
     """One of Tables 4.3 to 4.5."""
     study = Study.of(results(name))
     (figure,) = [f for f in study.spec.figures if f.kind == "false_alarm_table"]
-    found = entries(study.points, study.spec, by=figure.by, printed=figure.printed)
+    found = false_alarms(study.points, study.spec, by=figure.by, printed=figure.printed)
     rows = [
-        [e.row, e.column, f"{e.reference.closed_form:.3e}", f"{e.mean:.3e}", f"{e.printed:.3e}",
-         f"{100 * (e.printed / e.mean - 1):+.1f} %", f"{100 * e.excess(e.printed):.2f} %",
-         f"{e.leakage.shot[1]:.1e}, {e.leakage.shot[0]:.1e}"]
-        for e in found
+        [r["setting"], r["cut"], f"{r['closed_form']:.3e}", f"{r['study_mean']:.3e}",
+         f"{r['printed']:.3e}", f"{100 * (r['printed'] / r['study_mean'] - 1):+.1f} %",
+         f"{100 * r['printed_variance_excess']:.2f} %",
+         f"{r['shot_with_leakage_median']:.1e}, {r['shot_with_leakage_mean']:.1e}"]
+        for r in found
     ]  # fmt: skip
     columns = ("setting", "cut", "closed form", "ours", "printed", "printed over ours",
                "noise it implies above the threshold's", "with leakage: median, mean")  # fmt: skip

@@ -62,6 +62,18 @@ def test_a_scene_is_planned_run_and_exported(here):
         assert sum(1 for _ in csv.DictReader(file)) == (flags > 0).sum()
 
 
+@pytest.mark.parametrize("command", [("plan",), ("run", "--scheduler", "none")])
+def test_a_flight_beneath_its_ground_is_warned_of(here, command):
+    """From 500 m to 100 m over ground at 300 m; to the ground itself there is nothing to say."""
+    sunk = "ground: {kind: plane, size: 3 km, height: 300 m, reflectance: 0.1}"
+    written = SCENE.replace("ground: {kind: plane, size: 3 km, reflectance: 0.1}", sunk)
+    (here / "sunk.yaml").write_text(written.replace("origin: ground", "origin: world"))
+    told = sweep(command[0], "sunk.yaml", *command[1:]).stderr
+    assert "warning: the platform is beneath ground from time 2." in told and "by 200 m" in told
+    (here / "landing.yaml").write_text(SCENE.replace("0 m, 100 m]", "0 m, 0 m]"))
+    assert "beneath" not in sweep(command[0], "landing.yaml", *command[1:]).stderr
+
+
 def test_a_second_study_of_the_same_geometry_says_that_no_ray_was_cast(here):
     sweep("run", "descent.yaml", "--scheduler", "none")
     (here / "weak.yaml").write_text(SCENE.replace("power: 1 W", "power: 10 mW"))
@@ -88,7 +100,7 @@ def test_mistakes_over_a_scene_end_in_plain_words_and_exit_code_2(here):
     refused(sweep("figures", eyepoints), "eyepoints")
     (here / "turned.yaml").write_text(SCENE.replace("22.5 deg", "20 deg"))
     told = sweep("run", "turned.yaml", "--store", "results/descent.zarr")
-    refused(told, "scanners.three.half_angle", "0.39269", "rad")
+    refused(told, "scanners.three.half_angle: 22.5 deg -> 20 deg")
 
 
 def test_a_file_that_changes_under_a_study_is_noticed(here):

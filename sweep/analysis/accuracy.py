@@ -11,10 +11,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Sheet
-from matplotlib.patheffects import withStroke
-from matplotlib.text import Annotation
 from matplotlib.ticker import FuncFormatter, LogLocator
-from matplotlib.transforms import Bbox
 
 from sweep.analysis import canvas, labels
 from sweep.analysis.opening import ACCURACY, read_attributes
@@ -404,16 +401,6 @@ MARKS = {
 }
 """Marker, colour and words of each kind."""
 
-HALO = [withStroke(linewidth=2.5, foreground="white")]
-"""Halo that keeps a name readable upon lines; marks are drawn upon it."""
-
-
-PLACES = ((6, 5), (-6, -10), (6, -10), (-6, 5), (6, 15), (-6, -20), (6, -20), (-6, 15))
-"""Places that a name may take: right of its mark and above it, or left and below [points]."""
-
-MARK_SIZE = 7
-"""Width of most marks [points]."""
-
 
 def sheet(dataset: xr.Dataset, settings: Sequence[Setting]) -> Sheet:
     """Return the figure of a store that `sweep accuracy` made."""
@@ -423,7 +410,6 @@ def sheet(dataset: xr.Dataset, settings: Sequence[Setting]) -> Sheet:
         *zip(*map(_place, front(drawn)), strict=True), where="post", color="0.35", linewidth=1.2,
         linestyle="--", zorder=1, label="front of the best",
     )  # fmt: skip
-    names: list[Annotation] = []
     for kind, (marker, colour, words) in MARKS.items():
         some = of_kinds(drawn, kind)
         for i, setting in enumerate(some):
@@ -431,12 +417,15 @@ def sheet(dataset: xr.Dataset, settings: Sequence[Setting]) -> Sheet:
         if kind in JOINED and some:
             line = zip(*map(_place, some), strict=True)
             axes.plot(*line, color=colour, linewidth=0.8, alpha=0.5, zorder=1)
-        names += _names(axes, some, above=kind not in BY_NUMBER)
+            some = some[:1] + some[1:][-1:]
+        for setting in some:
+            axes.annotate(
+                _short(setting), _place(setting), xytext=(6, 5), textcoords="offset points",
+                fontsize=7.5, color=colour,
+            )  # fmt: skip
     _finish(axes, min(setting.quantile(0.5) for setting in drawn))
     canvas.title(sheet, f"{dataset.attrs['title']}: what accuracy costs")
     canvas.caption(sheet, _note(dataset, drawn))
-    sheet.draw_without_rendering()
-    _keep_apart(axes, names, drawn)
     return sheet
 
 
@@ -449,7 +438,7 @@ def _mark(axes: Axes, setting: Setting, marker: str, colour: str, words: str) ->
         axes.plot([time], [most], marker="_", color=colour, markersize=7, zorder=2)
     if half > EXACT:
         axes.plot([time], [half], marker=".", color=colour, markersize=4, zorder=2)
-    size = 11 if marker == "*" else MARK_SIZE
+    size = 11 if marker == "*" else 7
     axes.plot(
         [time], [worst], marker=marker, color=colour, markersize=size, linestyle="",
         markeredgecolor="white", markeredgewidth=0.7, label=words or None, zorder=4,
@@ -459,64 +448,6 @@ def _mark(axes: Axes, setting: Setting, marker: str, colour: str, words: str) ->
 def _place(setting: Setting) -> tuple[float, float]:
     """Time [us] and error at which a setting is drawn."""
     return 1e6 * setting.seconds, max(setting.error, EXACT)
-
-
-def _names(axes: Axes, settings: Sequence[Setting], above: bool) -> list[Annotation]:
-    """Short names beside marks; settings whose marks are all but one have one name."""
-    found = []
-    for together in _clusters(settings):
-        ladder = [_short(setting) for setting in settings if setting in together]
-        names = list(dict.fromkeys(filter(None, ladder)))
-        if names:
-            words = names[0] if len(names) == 1 else f"{names[0]} … {names[-1]}"
-            beside = together[-1] if above else together[0]
-            name = axes.annotate(
-                words, _place(beside), xytext=PLACES[0], textcoords="offset points", fontsize=7.5,
-                color=MARKS[beside.kind][1], path_effects=HALO, zorder=3,
-            )  # fmt: skip
-            _put(name, PLACES[0 if above else 1])
-            found.append(name)
-    return found
-
-
-def _put(name: Annotation, place: tuple[float, float]) -> None:
-    """Draw a name so far to the right of its mark, and above it [points]."""
-    name.set_position(place)
-    name.set_horizontalalignment("left" if place[0] > 0 else "right")
-
-
-def _keep_apart(axes: Axes, names: Sequence[Annotation], settings: Sequence[Setting]) -> None:
-    """Move names off marks and off each other, where another place beside their marks is free."""
-    marks = [axes.transData.transform(_place(setting)) for setting in settings]
-    half = MARK_SIZE / 2 * canvas.DPI / 72
-    taken = [Bbox([mark - half, mark + half]) for mark in marks]
-    for name in names:
-        own = name.get_position()
-        for place in (own, *PLACES):
-            _put(name, place)
-            if not name.get_window_extent().count_overlaps(taken):
-                break
-        else:
-            _put(name, own)
-        taken.append(name.get_window_extent())
-
-
-def _clusters(settings: Sequence[Setting]) -> list[list[Setting]]:
-    """Group settings by time, if their marks are too close for names of their own."""
-    clusters: list[list[Setting]] = []
-    for setting in sorted(settings, key=lambda each: each.seconds):
-        near = (cluster for cluster in clusters if _alike(setting, cluster[-1]))
-        if (cluster := next(near, None)) is not None:
-            cluster.append(setting)
-        else:
-            clusters.append([setting])
-    return clusters
-
-
-def _alike(one: Setting, other: Setting) -> bool:
-    """Tell whether two marks are too close for a name each."""
-    apart = np.abs(np.log(_place(one)) - np.log(_place(other)))
-    return bool((apart < (0.25, 1.2)).all())
 
 
 def _short(setting: Setting) -> str:

@@ -33,7 +33,6 @@ from sweep.analysis.selection import (
     RANGE,
     Points,
     confined,
-    cuts,
     parameters_at,
 )
 from sweep.analysis.shot_figure import scene_shot_sheet, simulated_shot
@@ -189,23 +188,26 @@ def draw(
 
 
 def default_figures(spec: Spec) -> list[Figure]:
-    """Surfaces where two axes are long, slices where one is, else a table; none without axes."""
-    if not spec.axes:
-        return []
-    zipped = next((axis for axis in spec.axes if axis.zipped), None)
-    if zipped is not None:
-        return _along_zipped(spec, zipped)
-    numeric = [a for a in spec.axes if not labels.is_words(np.asarray(a.members[0].display))]
-    numeric.sort(key=lambda axis: -axis.size)
-    long = [axis for axis in numeric if axis.size >= LONG]
-    if len(long) >= 2:
+    """Surfaces where two axes are long; slices along a zipped or the longest axis; else tables."""
+    zipped = [axis for axis in spec.axes if axis.zipped][:1]
+    axes = zipped or sorted(spec.axes, key=lambda axis: -axis.size)
+    numeric = [
+        (axis, member.name)
+        for axis in axes
+        for member in axis.members
+        if not labels.is_words(np.asarray(member.display))
+    ]
+    long = [axis for axis, _ in numeric if axis.size >= LONG]
+    if not zipped and len(long) >= 2:
         x, y = _range_before_angle(long)
         return [Surface(kind="surface", variable=v, x=x, y=y) for v in VARIABLES]
     if numeric:
-        by = _lines(spec, numeric[0])
-        return [Slices(kind="slices", variable=v, x=numeric[0].name, **by) for v in VARIABLES]
-    rows = spec.axes[0].name
-    return [Table(kind="table", variable=v, rows=rows) for v in VARIABLES]
+        axis, x = numeric[0]
+        others = [a for a in spec.axes if a is not axis and not a.zipped]
+        by = next(({"by": a.name} for a in others if a.size <= charts.MOST_LINES), {})
+        return [Slices(kind="slices", variable=v, x=x, **by) for v in VARIABLES]
+    return [Table(kind="table", variable=v, rows=a.members[0].name)
+            for a in axes[:1] for v in VARIABLES]  # fmt: skip
 
 
 def _range_before_angle(long: list[Axis]) -> tuple[str, str]:
@@ -215,35 +217,6 @@ def _range_before_angle(long: list[Axis]) -> tuple[str, str]:
     if first[0].members[0].path == GRAZING_ANGLE:
         first.reverse()
     return first[0].name, first[1].name
-
-
-def _lines(spec: Spec, along: Axis) -> dict[str, str]:
-    """Coordinate that has a line for each value, the first with few, as `by`; none where none."""
-    others = [a for a in spec.axes if a is not along and not a.zipped]
-    return next(({"by": a.name} for a in others if a.size <= charts.MOST_LINES), {})
-
-
-def _along_zipped(spec: Spec, zipped: Axis) -> list[Figure]:
-    """Slices along each cut of range and angle, or along a zipped axis's first number."""
-    by = _lines(spec, zipped)
-    members = {member.name: member for member in zipped.members}
-    figures: list[Figure] = []
-    for i, cut in enumerate(cuts(spec)):
-        if cut.held in members and cut.along in members:
-            written = f"{cut.value!r} {members[cut.held].units}".strip()
-            figures.append(
-                Slices(
-                    kind="slices", name=f"pd_shot_{cut.along}_{i + 1}", variable="pd_shot",
-                    x=cut.along, **by, where={cut.held: written},
-                    title=f"Probability of detection at {cut.name}",
-                )
-            )  # fmt: skip
-    if figures:
-        return figures
-    numeric = [m.name for m in zipped.members if not labels.is_words(np.asarray(m.display))]
-    if not numeric:
-        return [Table(kind="table", variable=v, rows=zipped.members[0].name) for v in VARIABLES]
-    return [Slices(kind="slices", variable=v, x=numeric[0], **by) for v in VARIABLES]
 
 
 COLOURS = ("range", "radial_velocity")

@@ -199,26 +199,18 @@ def outputs_page(dataset: xr.Dataset) -> Page:
 MOST_ROWS = 100
 
 
-@dataclass(frozen=True)
-class Leakage:
-    """Mean and median of the leakage in a cut: of each chirp, and of a shot's alarms with it."""
-
-    up: tuple[float, float]
-    down: tuple[float, float]
-    shot: tuple[float, float]
-
-
-def leakage(groups: Sequence[Points]) -> list[Leakage]:
+def leakage(groups: Sequence[Points]) -> list[dict[str, Cell]]:
     """Mean and median of the leakage of points, and of noise or leakage in both chirps."""
     dataset = groups[0].dataset
-    with_shot = dataset.assign(shot=of_a_shot(dataset, leakage=True))
+    with_shot = dataset.assign(shot_with_leakage=of_a_shot(dataset, leakage=True))
     groups = [replace(group, dataset=with_shot) for group in groups]
-    found = []
-    for name in ("p_leakage_up", "p_leakage_down", "shot"):
+    found: list[dict[str, Cell]] = [{} for _ in groups]
+    for name in ("p_leakage_up", "p_leakage_down", "shot_with_leakage"):
         tallies = tallied(groups, name)
         middles = medians(groups, name, [tally.number for tally in tallies])
-        found.append([(t.mean, m) for t, m in zip(tallies, middles, strict=True)])
-    return [Leakage(*each) for each in zip(*found, strict=True)]
+        for own, tally, middle in zip(found, tallies, middles, strict=True):
+            own |= {f"{name}_mean": tally.mean, f"{name}_median": middle}
+    return found
 
 
 @dataclass(frozen=True)
@@ -230,25 +222,6 @@ class Reference:
     closed_form: float
     model: float
     model_bin: float
-
-
-@dataclass(frozen=True)
-class Entry:
-    """One row of one column: a setting of the instrument in one cut."""
-
-    row: str
-    column: str
-    points: int
-    reference: Reference
-    mean: float
-    printed: float
-    leakage: Leakage
-
-    def excess(self, probability: float) -> float:
-        """Noise variance above the threshold's that a false-alarm probability implies."""
-        return noise_only.variance_excess_of_shot(
-            probability, self.reference.tnr, self.reference.bins
-        )
 
 
 def reference(spec: Spec, setting: dict[str, Any]) -> Reference:
@@ -280,25 +253,36 @@ def settings(found: Points, spec: Spec, by: str) -> list[tuple[str, dict[str, An
     ]
 
 
-def entries(
+def false_alarms(
     found: Points, spec: Spec, *, by: str, printed: Sequence[Sequence[float]] = ()
-) -> list[Entry]:
-    """Every row and column of a table of false alarms."""
+) -> list[dict[str, Cell]]:
+    """Make a record of false alarms of each setting of the instrument in each cut."""
     settled = settings(found, spec, by)
     alone = [reference(spec, setting) for _, setting, _ in settled]
-    places = [(i, j) for i in range(len(settled)) for j in range(len(cuts(spec)))]
     groups = [
-        (beyond(cut.of(part), spec, NEAREST), cut) for _, _, part in settled for cut in cuts(spec)
+        (i, j, cut.name, beyond(cut.of(part), spec, NEAREST))
+        for i, (_, _, part) in enumerate(settled)
+        for j, cut in enumerate(cuts(spec))
     ]
-    means = [tally.mean for tally in tallied([points for points, _ in groups], "pfa_both_chirps")]
-    leaked = leakage([points for points, _ in groups])
-    return [
-        Entry(
-            settled[i][0], cut.name, points.size, alone[i], mean,
-            float(printed[i][j]) if i < len(printed) and j < len(printed[i]) else math.nan, leak,
+    tallies = tallied([points for *_, points in groups], "pfa_both_chirps")
+    leaked = leakage([points for *_, points in groups])
+    records: list[dict[str, Cell]] = []
+    for (i, j, cut, points), tally, leak in zip(groups, tallies, leaked, strict=True):
+        noise, figure = alone[i], _published(printed, i, j)
+        mean_excess, excess = (
+            noise_only.variance_excess_of_shot(p, noise.tnr, noise.bins)
+            for p in (tally.mean, figure)
         )
-        for (i, j), (points, cut), mean, leak in zip(places, groups, means, leaked, strict=True)
-    ]  # fmt: skip
+        records.append(
+            {
+                "setting": settled[i][0], "cut": cut, "points": points.size, "tnr": noise.tnr,
+                "bins": noise.bins, "closed_form": noise.closed_form, "noise_only": noise.model,
+                "study_mean": tally.mean, "study_variance_excess": mean_excess,
+                "printed": figure, "printed_over_closed_form": figure / noise.closed_form,
+                "printed_variance_excess": excess, **leak,
+            }
+        )  # fmt: skip
+    return records
 
 
 _FALSE_ALARMS = {
@@ -328,9 +312,8 @@ _THRESHOLDS = {
 
 def false_alarm_page(found: Points, spec: Spec, *, by: str, printed: Any = (), title: str) -> Page:
     """Tables 4.3 to 4.5: false alarms of a shot, a row for each value of a coordinate."""
-    every = entries(found, spec, by=by, printed=printed)
-    records = [_record(entry) for entry in every]
-    published = any(entry.printed == entry.printed for entry in every)
+    records = false_alarms(found, spec, by=by, printed=printed)
+    published = any(record["printed"] == record["printed"] for record in records)
     blocks = [
         _block(
             "Probability of a false alarm in both chirp segments, from noise",
@@ -340,7 +323,7 @@ def false_alarm_page(found: Points, spec: Spec, *, by: str, printed: Any = (), t
             "Leakage: extra groups raised by the signal's own sidelobes", _LEAKAGE, records
         ),
     ]  # fmt: skip
-    bins = ", ".join(labels.number(n) for n in sorted({entry.reference.bins for entry in every}))
+    bins = ", ".join(labels.number(n) for n in sorted({float(r["bins"]) for r in records}))
     notes = [
         f"closed form: (1 - (1 - p)^N)^2, p = exp(-(4 - pi)/4 TNR^2), N = {bins}.",
         *_COMMON_NOTES,
@@ -358,7 +341,7 @@ def threshold_page(found: Points, spec: Spec, *, by: str, printed: Any = (), tit
     for i, (name, setting, _) in enumerate(settled):
         alone = reference(spec, setting)
         closed = noise_only.bin_probability(alone.tnr)
-        published = float(printed[i]) if i < len(printed) else math.nan
+        published = _published(printed, i, 0)
         records.append(
             {
                 "setting": name,
@@ -398,27 +381,3 @@ def _written(value: Cell, form: str) -> Cell:
     if form.endswith("%"):
         return percent(float(value), form[:-1])
     return format(value, form) if value == value else "-"
-
-
-def _record(e: Entry) -> dict[str, Cell]:
-    """One line of the CSV file."""
-    return {
-        "setting": e.row,
-        "cut": e.column,
-        "points": e.points,
-        "tnr": e.reference.tnr,
-        "bins": e.reference.bins,
-        "closed_form": e.reference.closed_form,
-        "noise_only": e.reference.model,
-        "study_mean": e.mean,
-        "study_variance_excess": e.excess(e.mean),
-        "printed": e.printed,
-        "printed_over_closed_form": e.printed / e.reference.closed_form,
-        "printed_variance_excess": e.excess(e.printed),
-        "p_leakage_up_mean": e.leakage.up[0],
-        "p_leakage_up_median": e.leakage.up[1],
-        "p_leakage_down_mean": e.leakage.down[0],
-        "p_leakage_down_median": e.leakage.down[1],
-        "shot_with_leakage_mean": e.leakage.shot[0],
-        "shot_with_leakage_median": e.leakage.shot[1],
-    }

@@ -38,6 +38,7 @@ from sweep.cli.output import (
     warn_before,
     warn_of_alarms,
     warn_of_beam,
+    warn_of_path,
 )
 from sweep.storage.locations import Location
 
@@ -217,6 +218,7 @@ def plan(spec: Path, workers: int | None) -> None:
         click.echo(f"{name:>12}  {text}")
     tell_effects(effects)
     warn_of_beam(study)
+    warn_of_path(study)
     warn_of_alarms(study)
 
 

@@ -368,9 +368,19 @@ def warn_of_beam(study: Spec | SceneSpec) -> None:
         click.echo(f"warning: {told}", err=True)
 
 
+def warn_of_path(study: Spec | SceneSpec) -> None:
+    """Say where a flight is beneath its ground."""
+    from sweep.spec import SceneSpec
+    from sweep.tasks.eyepoint_study import beneath
+
+    if told := isinstance(study, SceneSpec) and beneath(study):
+        click.echo(f"warning: {told}", err=True)
+
+
 def warn_before(study: Spec | SceneSpec, store: Location) -> None:
-    """Before a run: false alarms in many shots, and effects that are forced off and matter."""
+    """Before a run: beam, path, false alarms in many shots, effects forced off that matter."""
     warn_of_beam(study)
+    warn_of_path(study)
     warn_of_alarms(study)
     if "off" in study.modes().values():
         warn(effects_of(study, store, costs=False))

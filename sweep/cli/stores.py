@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 from rich.filesize import decimal
@@ -199,39 +197,14 @@ def report(store: Location, output: Path | None) -> None:
       sweep report results/forest_scan.zarr -o forest.html
     """  # noqa: D301
     from sweep.report.writing import write
+    from sweep.tasks.progress import working
     from sweep.tasks.studies import read
 
     read(store)
     file = output or beside(store) / f"{store.name.removesuffix('.zarr')}-report.html"
-    with bar("opening the store") as say:
-        write(store, file, say)
+    with working("making the page"):
+        write(store, file)
     click.echo(f"{shown(file)}: {file.stat().st_size / 1e6:.1f} MB")
-
-
-@contextmanager
-def bar(begin: str) -> Iterator[Callable[[str], None]]:
-    """Show a bar on standard error while its block runs."""
-    from dask.callbacks import Callback
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
-
-    columns = SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        step = progress.add_task(begin, total=None)
-
-        def say(text: str) -> None:
-            nonlocal step
-            progress.remove_task(step)  # a task that has a total cannot lose it
-            step = progress.add_task(f"making: {text}", total=None)
-
-        def started(graph: Mapping[Any, Any], state: Mapping[str, Any]) -> None:
-            progress.reset(step, total=len(state["waiting"]) + len(state["ready"]))
-
-        def done(*of_task: Any) -> None:
-            progress.advance(step)
-
-        with Callback(start_state=started, posttask=done):
-            yield say
 
 
 @click.command()

@@ -29,6 +29,7 @@ from sweep.model.returns import Returns, draw_returns
 from sweep.model.sampling import SPECTRA
 from sweep.model.shot import prepare_cast
 from sweep.model.spectra_returns import is_fixed, spectra_returns, without_chances
+from sweep.model.waveform import STRONGEST
 
 STRETCH = 1 << 20
 """Numbers held at once beside the result: what a stretch of shots needs while it is computed."""
@@ -95,7 +96,7 @@ def cloud(
         shots, rays, found = _groups(seen, parameters, surfaces, returns, called)
         numbers = {"first_draw": first_draw, "draws": draws}
         if method == SPECTRA:
-            if not is_fixed(parameters):
+            if shots.peaks == STRONGEST or not is_fixed(parameters):
                 found = without_chances(found)
             drawn = spectra_returns(
                 shots, found, keys=keys[part], parameters=parameters, methods=methods, **numbers

@@ -13,9 +13,8 @@ the window:
 
 The tables are made of the window's own transform, so a noise-free lone tone is placed exactly (1e-6
 bins). Three things bias the estimate: other lines within the reach of the kernel, the tone's own
-image near DC and Nyquist, and a footprint that spreads over bins. Of a footprint the estimate is
-one of its centre. In the rectangular window noise biases it too, as it may turn the wrong neighbour
-into the larger one.
+image near DC and Nyquist, and a footprint that spreads over bins. A footprint's estimate is that of
+its centre. Noise biases it in the rectangular window, where the wrong neighbour may be larger.
 
 A footprint whose lines add as powers and spread by s [bins, standard deviation] about their mean
 broadens the peak, which moves the estimate by some multiple of s^2, tabulated as `widening`.

@@ -157,12 +157,11 @@ def rounding_variance(
 ) -> np.ndarray:
     """Variance lsb^2/12 [V^2] that rounding adds at the ADC, lsb = 2 V / 2^bits; 0 for 0 bits.
 
-    If the noise's deviation s spans a step or so the error is white and independent of the
-    signal [Widrow and Kollar, Quantization Noise, 2008, ch. 4, 9]: it departs from that by
-    exp(-2 pi^2 s^2 / lsb^2), 2.7e-9 for s = lsb and 0.7 % for s = lsb/2. Neither the receiver's
-    gain nor its noise figure acts on it. ``full_scale`` is the largest voltage V [V] to either
-    side; the effective number of bits, which need not be whole, makes the noise of a real ADC.
-    Two ADCs sample I and Q.
+    If the noise's deviation s spans a step or so the error is white and independent of the signal
+    [Widrow and Kollar, Quantization Noise, 2008, ch. 4, 9]: it departs from that by exp(-2 pi^2 s^2
+    / lsb^2), 2.7e-9 for s = lsb and 0.7 % for s = lsb/2. Neither the receiver's gain nor its noise
+    figure acts on it. ``full_scale`` is the largest voltage V [V] to either side; the effective
+    number of bits, which need not be whole, makes the noise of a real ADC. Two ADCs sample I and Q.
     """
     bits = np.asarray(bits, float)
     step = 2 * np.asarray(full_scale, float) * 2.0**-bits

@@ -4,8 +4,7 @@ This module prepares the least that any shot has. Everything else is an effect
 (:mod:`sweep.model.effects`), put to it one after the other by :mod:`sweep.model.shot`.
 
 Points that share their categories (architecture, window, law, sizes ...) are prepared together; a
-footprint's geometry is worked out once and serves every point that has it, whatever its
-radiometry.
+footprint's geometry is worked out once and serves every point that has it, whatever its radiometry.
 """
 
 import math

@@ -12,11 +12,10 @@ independently,
 
 Like the error itself it falls about as one over the number of rays. It knows nothing of what no ray
 has hit, and takes smooth ground for rougher than it is, for 19 rays most of all. It was checked on
-shots that are off by more than 1e-6, with powers that add, against 8,017 or 16,021 rays. There were
-1,000 or more of each of scan pattern comparison, gale crater descent, forest scan and square high
-descent. It is below half of the error for one in a thousand of the forest's shots, whatever the
-number of rays, and for no others. Its median is 7 to 60 times the error for 19 rays, 2 to 10 from
-61 on.
+shots off by more than 1e-6, powers adding, against 8,017 or 16,021 rays: 1,000 of each of scan
+pattern comparison, gale crater descent, forest scan and square high descent. It is below half of
+the error for one in a thousand of the forest's shots, whatever the number of rays, and for no
+others. Its median is 7 to 60 times the error for 19 rays, 2 to 10 from 61 on.
 """
 
 import math

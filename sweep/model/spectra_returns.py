@@ -39,6 +39,7 @@ from sweep.model.noisy_spectra import (
 from sweep.model.pairing import FALSE
 from sweep.model.preparation import Parameters, Shots
 from sweep.model.returns import Drawn, How, Returns, known_of, measured, put, report
+from sweep.model.waveform import STRONGEST
 
 
 class Peak(NamedTuple):
@@ -56,7 +57,7 @@ def is_fixed(parameters: Parameters) -> bool:
 
 
 def without_chances(found: Groups) -> Groups:
-    """Strip groups of the probabilities of a threshold that nothing is held against."""
+    """Strip groups of probabilities: they are those of crossing the threshold alone."""
     pd, leakage = (np.full_like(chances, np.nan) for chances in (found.pd, found.leakage))
     return found._replace(pd=pd, leakage=leakage)
 
@@ -87,7 +88,7 @@ def spectra_returns(
     how, tables = How.of(shots, first_draw, True), interpolator(shots.window, shots.fft_size)
     peaks, which = np.zeros((3, most + 1, 4)), np.empty((3, most + 1), np.int64)
     pairs, looks = np.empty((most + 1, 4), np.int64), math.sqrt(shots.looks.number)
-    zero = index_of_zero(shots)
+    zero, kept = index_of_zero(shots), 1 if shots.peaks == STRONGEST else most + 1
     rounded = math.sqrt(1 / 12) if str(p[ESTIMATOR + "kind"]) == PEAK_BIN else 0.0
     for i in range(shots.size):
         view = view_of(shots, i, p, keys[i], methods, found.bin[i])
@@ -99,7 +100,7 @@ def spectra_returns(
                 if signal is None:
                     continue
                 spectra = list(spectra_of(view, s, np.array([first_draw + d])))
-                power, listed = peaks_of(spectra, signal, echoes[s], view, most + 1)
+                power, listed = peaks_of(spectra, signal, echoes[s], view, kept)
                 bins = np.array([peak.bin for peak in listed], np.int64)
                 alike = [np.repeat(each, bins.size, axis=0) for each in spectra]
                 places = placed(alike, bins, view) if bins.size else np.empty(0)

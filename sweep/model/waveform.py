@@ -253,11 +253,10 @@ def resolve(
 
     Frequencies with signs (``signed``), of complex records, are read by :data:`SIGNED`. Without a
     Doppler segment, ``doppler=None``, others are read by :data:`FAR`, or by :data:`FAST` where a
-    fast target is ``assumed``. With it there are two
-    unknowns and three peaks: every reading (each peak as it stands or folded at Nyquist,
-    half sum or half difference being the Doppler frequency) predicts the third peak. The reading
-    that predicts it best is taken, a fold counting as :data:`FOLD_PENALTY` bins of mismatch. The
-    sign of down - up is the velocity's.
+    fast target is ``assumed``. With it there are two unknowns and three peaks: every reading (each
+    peak as it stands or folded at Nyquist, half sum or half difference being the Doppler frequency)
+    predicts the third peak. The reading that predicts it best is taken, a fold counting as
+    :data:`FOLD_PENALTY` bins of mismatch. The sign of down - up is the velocity's.
 
     PHYSICS section 2 gives the unfolded readings. Half sum and half difference belong to the
     carrier and to the range at mid-chirp; this is corrected here.

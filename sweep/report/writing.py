@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -51,11 +51,7 @@ OF_POINTS = (
 )  # fmt: skip
 
 
-Say = Callable[[str], None]
-"""Is told what is being made."""
-
-
-def write(store: str | Location, file: str | Path, say: Say = lambda text: None) -> Path:
+def write(store: str | Location, file: str | Path) -> Path:
     """Write the report of a study as one page that needs nothing else.
 
     Parameters
@@ -64,8 +60,6 @@ def write(store: str | Location, file: str | Path, say: Say = lambda text: None)
         Store of a grid of points or of a scene, complete or not.
     file
         The page to write; nothing is in its place before it is whole.
-    say
-        Is told what is being made, step by step.
 
     Raises
     ------
@@ -80,8 +74,7 @@ def write(store: str | Location, file: str | Path, say: Say = lambda text: None)
         raise NotAStoreError(f"{store} holds what accuracy costs: sweep figures {store}  draws it")
     if kind not in (GRID, SCENE):
         read_attributes(store, GRID)  # says what it holds instead
-    page = _scene_page(store, say) if kind == SCENE else _grid_page(store, say)
-    say("the page")
+    page = _scene_page(store) if kind == SCENE else _grid_page(store)
     text = rendered(page)
     with draft(file, replace=True) as made:
         made.write_text(text, encoding="utf-8")
@@ -93,22 +86,18 @@ Made = Chart | Item | None
 Declared = Spec | SceneSpec
 
 
-def _grid_page(store: Location, say: Say) -> Page:
+def _grid_page(store: Location) -> Page:
     study = Study.of(store)
     dataset, spec = study.dataset, study.spec
-    figures: list[Made] = list(_figures(study, say))
-    tables = list(_tables(study, say))
-    say("the maximum range")
+    figures: list[Made] = list(_figures(study))
+    tables = list(_tables(study))
     reach = detector.maximum_range(study)
     figures.append(reach)
-    say("the detector")
     found = detector.tracks(study)
     trades: list[Made] = [detector.noise_budget(study, *found)]
     if not spec.draws.whole_spectra:  # of what looks at those there are no closed forms
         trades = [detector.roc(study, *found), detector.false_alarms(study, *found), *trades]
-    say("effects and accuracy")
     asked = _asked(spec, [dataset["effects"]], dataset)
-    say("points")
     sizes = [f"{axis.size:,} {labels.coordinate(axis.name)}" for axis in spec.axes]
     facts = [("points", f"{dataset.attrs['points']:,}"),
              ("grid", " x ".join(sizes) or "a single point")]  # fmt: skip
@@ -184,12 +173,11 @@ def _page(
     )
 
 
-def _figures(study: Study, say: Say) -> Iterator[Made]:
+def _figures(study: Study) -> Iterator[Made]:
     """Charts of the surfaces and slices that a study asks for, or of a usual set."""
     wanted = [figure for figure in study.figures if isinstance(figure, Surface | Slices)]
     maps = sum(isinstance(figure, Surface) for figure in wanted)
     for figure in wanted:
-        say(figure.title or study.words(figure.variable))
         chart = study.chart(figure, replace(PAGE, cells=PAGE.cells / max(1, maps)))
         if chart is None:
             yield Text(figure.title, ["No point of the study is within its limits."], "")
@@ -199,13 +187,12 @@ def _figures(study: Study, say: Say) -> Iterator[Made]:
             )
 
 
-def _tables(study: Study, say: Say) -> Iterator[Table]:
+def _tables(study: Study) -> Iterator[Table]:
     """Return the tables that a study asks for; every output of a single point."""
     if not study.spec.axes:
         yield from _sheets(outputs_page(study.dataset), "outputs")
     for figure in study.figures:
         if not isinstance(figure, Surface | Slices):
-            say(figure.title or figure.stem)
             yield from _sheets(study.page(figure), figure.stem)
 
 
@@ -219,23 +206,19 @@ def _sheets(page: TablePage, stem: str) -> Iterator[Table]:
         yield Table(heading, notes, frame, f"{stem}_{number + 1}" if number else stem)
 
 
-def _scene_page(store: Location, say: Say) -> Page:
+def _scene_page(store: Location) -> Page:
     study = SceneStudy.of(store)
     spec, attributes = study.spec, study.tree.attrs
     seen, fewer = flights.recordings(study)
-    say("point clouds")
     cloud = flights.solid(study, seen, fewer)
-    say("the flight")
     flight: list[Made] = [
         flights.along(seen),
         flights.errors(seen),
         flights.navigation(spec, seen),
         flights.noise_budget(study, seen),
     ]
-    say("effects and accuracy")
     groups = [study.tree[name].to_dataset() for name in study.scanners]
     asked = _asked(spec, [g["effects"].chunk() for g in groups], groups[0])
-    say("points")
     facts = [("shots times draws", f"{attributes['points']:,}"),
              ("scanners", ", ".join(map(labels.coordinate, study.scanners)))]  # fmt: skip
     came_back = flights.returns(seen)

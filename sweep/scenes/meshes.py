@@ -99,10 +99,6 @@ class Report:
     duplicate: int = _count("{} duplicate faces dropped")  # in whatever winding
     merged: int = _count("{} coincident vertices merged")
     unreferenced: int = _count("{} unused vertices dropped")
-    open_edges: int = _count("{} open edges (not watertight)")  # a face on one side only
-    crowded_edges: int = _count("{} edges of more than two faces")
-    opposed_edges: int = _count("{} edges with one side's normal inverted")
-    inside_out: int = _count("closed, with normals pointing inwards")  # 1 where it is so
 
     def text(self) -> str:
         """One line for people: what was given, and of the rest what is not zero."""
@@ -116,9 +112,9 @@ def clean(vertices: ArrayLike, faces: ArrayLike, surface: ArrayLike) -> tuple[Me
     """Mesh fit to be cast at, and what was done to make it so.
 
     Faces without data, without area or given twice are dropped, coincident vertices merged,
-    unused ones dropped, and the rest centred. Holes, crowded edges and inverted normals change
-    nothing for rays, which see both sides of a face; they are counted. Faces (m, 3) keep their
-    order; vertices (n, 3) [m] are not finite where there is no data.
+    unused ones dropped, and the rest centred. Holes and inverted normals stay: rays see both sides
+    of a face. Faces (m, 3) keep their order; vertices (n, 3) [m] are not finite where there is no
+    data.
 
     ValueError where the arrays' shapes do not fit, a face names a vertex that does not exist,
     or no face is left.
@@ -149,7 +145,7 @@ def clean(vertices: ArrayLike, faces: ArrayLike, surface: ArrayLike) -> tuple[Me
         "merged": merged,
         "unreferenced": given["vertices"] - merged - len(kept),
     }
-    return mesh, Report(**given, **counts, **_edge_counts(mesh))
+    return mesh, Report(**given, **counts)
 
 
 def _require_faces(left: int, given: int) -> None:
@@ -178,25 +174,6 @@ def _have_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     exact, _ = normals(vertices[faces[doubtful]].transpose(1, 2, 0))
     has_area[doubtful] = exact.any(axis=0)
     return has_area
-
-
-def _edge_counts(mesh: Mesh) -> dict[str, int]:
-    """Return counts of `Report` that are about edges and winding."""
-    start, end = mesh.faces.ravel(), np.roll(mesh.faces, -1, axis=1).ravel()
-    low, high = np.minimum(start, end).astype(np.int64), np.maximum(start, end)
-    key = low * len(mesh.vertices) + high
-    order = np.argsort(key, kind="stable")
-    first = np.flatnonzero(np.diff(key[order], prepend=-1))
-    number = np.diff(first, append=len(key))
-    sense = np.add.reduceat(np.where(start < end, 1, -1)[order], first)
-    counts = {
-        "open_edges": int((number == 1).sum()),
-        "crowded_edges": int((number > 2).sum()),
-        "opposed_edges": int(((number == 2) & (sense != 0)).sum()),
-    }
-    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
-    inwards = np.einsum("ij,ij->", a, np.cross(b, c)) < 0.0  # six times the volume enclosed
-    return counts | {"inside_out": int(inwards and not any(counts.values()))}
 
 
 def read_mesh(

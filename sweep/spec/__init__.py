@@ -2,64 +2,17 @@
 
 from sweep.spec.axes import Axis, Member
 from sweep.spec.clusters import AnyCluster, cluster_of, load_cluster
-from sweep.spec.figures import (
-    FalseAlarmTable,
-    Figure,
-    Slices,
-    Surface,
-    Table,
-    ThresholdTable,
-)
+from sweep.spec.figures import FalseAlarmTable, Figure, Slices, Surface, Table, ThresholdTable
 from sweep.spec.identity import difference
-from sweep.spec.instrument import Chirp, Instrument, Laser, Processing, Receiver, Telescope
 from sweep.spec.loading import from_stored, load
 from sweep.spec.mistakes import Mistake, SpecError
 from sweep.spec.scene_spec import SceneSpec
 from sweep.spec.schema import json_schema
-from sweep.spec.sections import (
-    Accuracy,
-    Atmosphere,
-    Draws,
-    Effects,
-    Execution,
-    Footprint,
-    Storage,
-    Target,
-)
+from sweep.spec.sections import Draws
 from sweep.spec.study import Spec
 
 __all__ = [
-    "Accuracy",
-    "AnyCluster",
-    "Atmosphere",
-    "Axis",
-    "Chirp",
-    "Draws",
-    "Effects",
-    "Execution",
-    "FalseAlarmTable",
-    "Figure",
-    "Footprint",
-    "Instrument",
-    "Laser",
-    "Member",
-    "Mistake",
-    "Processing",
-    "Receiver",
-    "SceneSpec",
-    "Slices",
-    "Spec",
-    "SpecError",
-    "Storage",
-    "Surface",
-    "Table",
-    "Target",
-    "Telescope",
-    "ThresholdTable",
-    "cluster_of",
-    "difference",
-    "from_stored",
-    "json_schema",
-    "load",
-    "load_cluster",
-]
+    "AnyCluster", "Axis", "Draws", "FalseAlarmTable", "Figure", "Member", "Mistake", "SceneSpec",
+    "Slices", "Spec", "SpecError", "Surface", "Table", "ThresholdTable", "cluster_of",
+    "difference", "from_stored", "json_schema", "load", "load_cluster",
+]  # fmt: skip

@@ -6,7 +6,6 @@ The ``axes`` section of a spec is read here as a whole.
 from __future__ import annotations
 
 import re
-from collections import Counter
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -47,18 +46,6 @@ class Member:
     values: np.ndarray | tuple[str, ...]
     display: np.ndarray
     units: str
-
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, Member):
-            return NotImplemented
-        return (
-            (self.path, self.name, self.units) == (other.path, other.name, other.units)
-            and np.array_equal(np.asarray(self.values), np.asarray(other.values))
-            and np.array_equal(self.display, other.display)
-        )
-
-    def __hash__(self) -> int:
-        return hash((self.path, self.name, self.units, len(self.values)))
 
 
 @dataclass(frozen=True)
@@ -262,15 +249,9 @@ def _repeated(single: Values | str, number: int) -> list[Any]:
 def _named(axes: list[Axis]) -> list[Axis]:
     """Axes whose coordinates have the shortest names that tell them apart."""
     paths = [member.path for axis in axes for member in axis.members]
-    taken = Counter(map(short_name, paths))
     named = []
     for axis in axes:
-        members = tuple(
-            replace(member, name=_coordinate_name(member.path, paths))
-            if taken[member.name] > 1
-            else member
-            for member in axis.members
-        )
+        members = tuple(replace(m, name=_coordinate_name(m.path, paths)) for m in axis.members)
         plain = len(axis.members) == 1 and axis.name == axis.members[0].name
         named.append(Axis(members[0].name if plain else axis.name, members))
     return named
@@ -278,12 +259,11 @@ def _named(axes: list[Axis]) -> list[Axis]:
 
 def _coordinate_name(path: str, paths: list[str]) -> str:
     """Shortest dotted tail of a path that no other path ends with, joined by underscores."""
-    parts = path.split(".")
-    for length in range(1, len(parts) + 1):
-        tail = parts[-length:]
-        if sum(other.split(".")[-length:] == tail for other in set(paths)) == 1:
+    own, *others = (p.removesuffix(".kind").split(".") for p in (path, *set(paths) - {path}))
+    for length in range(1, len(own) + 1):
+        if not any(other[-length:] == own[-length:] for other in others):
             break
-    return "_".join(tail)
+    return "_".join(own[-length:])
 
 
 def _paths_set_twice(written: dict[Any, Any]) -> list[Finding]:

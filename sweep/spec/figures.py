@@ -6,7 +6,7 @@ They are held against the study that they draw: its coordinates, stored quantiti
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
@@ -110,6 +110,9 @@ def _variable() -> Any:
 class Drawing(Part):
     """Base of all figures."""
 
+    SHOWN: ClassVar[tuple[str, ...]] = ("kind",)
+    """Fields whose values make the file's name, and words between them."""
+
     name: str = of.text(
         "Stem of the picture's file name",
         "",
@@ -121,12 +124,8 @@ class Drawing(Part):
     @property
     def stem(self) -> str:
         """Stem of the picture's file name."""
-        return self.name or "_".join([*filter(None, self._shown), self.kind])  # type: ignore[attr-defined]
-
-    @property
-    def _shown(self) -> tuple[str | None, ...]:
-        """Contents of the figure, as parts of its file's name."""
-        return (getattr(self, "variable", self.kind),)  # type: ignore[attr-defined]
+        named = [getattr(self, part, part) for part in (*self.SHOWN, "kind")]
+        return self.name or "_".join(str(part) for part in named if part is not None)
 
 
 # Figures of grids
@@ -135,17 +134,11 @@ class Drawing(Part):
 class GridDrawing(Drawing):
     """Base of figures of grids."""
 
-    @property
-    def coordinates(self) -> dict[str, str]:
-        """Coordinates named, by the field that names them."""
-        named = {key: getattr(self, key, "") for key in ("x", "y", "by", "rows", "columns")}
-        where = {f"where.{name}": name for name in getattr(self, "where", {})}
-        return {key: name for key, name in (named | where).items() if name}
-
 
 class Surface(GridDrawing):
     """A quantity over two coordinates, seen from above."""
 
+    SHOWN = ("variable",)
     kind: Literal["surface"]
     variable: str = _variable()
     x: str = _coordinate()
@@ -156,6 +149,7 @@ class Surface(GridDrawing):
 class Slices(GridDrawing):
     """A quantity along one coordinate, a line for each value of another."""
 
+    SHOWN = ("variable",)
     kind: Literal["slices"]
     variable: str = _variable()
     x: str = _coordinate()
@@ -166,6 +160,7 @@ class Slices(GridDrawing):
 class Table(GridDrawing):
     """A quantity averaged over all but rows and columns."""
 
+    SHOWN = ("variable",)
     kind: Literal["table"]
     variable: str = _variable()
     rows: str = _coordinate()
@@ -280,18 +275,11 @@ class SceneDrawing(Drawing):
 
     where: dict[str, Selection] = _where()
 
-    @property
-    def named_scanners(self) -> dict[tuple[str | int, ...], str]:
-        """Scanners named, by where in the figure."""
-        scanner = getattr(self, "scanner", None)
-        listed = getattr(self, "scanners", None) or ()
-        named: dict[tuple[str | int, ...], str] = {("scanner",): scanner} if scanner else {}
-        return named | {("scanners", i): name for i, name in enumerate(listed)}
-
 
 class CloudFigure(SceneDrawing):
     """A point cloud."""
 
+    SHOWN = ("scanner", "colour")
     kind: Literal["cloud"]
     scanner: str | None = _scanner()
     colour: str = _quantity("What colours the points", "range")
@@ -306,14 +294,11 @@ class CloudFigure(SceneDrawing):
     dropouts: bool = of.flag("Whether to mark shots without a point", default=False)
     draw: int = _draw()
 
-    @property
-    def _shown(self) -> tuple[str | None, ...]:
-        return self.scanner, self.colour
-
 
 class Scatter(SceneDrawing):
     """A quantity of shots or points over another."""
 
+    SHOWN = ("scanner", "y", "over", "x")
     kind: Literal["scatter"]
     scanner: str | None = _scanner()
     x: str = _quantity("Quantity along x", "time")
@@ -323,14 +308,11 @@ class Scatter(SceneDrawing):
     time: Crop | None = _time()
     draw: int = _draw()
 
-    @property
-    def _shown(self) -> tuple[str | None, ...]:
-        return self.scanner, f"{self.y}_over_{self.x}"
-
 
 class ShotSpectra(SceneDrawing):
     """The three spectra of one shot, with threshold, noise and detections."""
 
+    SHOWN = ("scanner", "shot")
     kind: Literal["shot_spectra"]
     scanner: str | None = _scanner()
     shot: int | str = of.count(
@@ -339,14 +321,11 @@ class ShotSpectra(SceneDrawing):
     )  # fmt: skip
     draw: int = _draw()
 
-    @property
-    def _shown(self) -> tuple[str | None, ...]:
-        return self.scanner, str(self.shot)
-
 
 class _OfNavigation(SceneDrawing):
     """Base of figures and tables of navigation."""
 
+    SHOWN = ("quantity", "show")
     scanners: tuple[str, ...] | None = of.several(
         of.named("Scanner", "three"), 1, 10_000, None,
         about="Scanners; all by default", noun="names", distinct=True,
@@ -354,10 +333,6 @@ class _OfNavigation(SceneDrawing):
     quantity: str = of.choice("Velocity vector or altitude", ("velocity", "altitude"), "velocity")
     show: str = of.choice("Which statistics", ("all", "availability", "bias", "rmse"), "all")
     bins: int = of.count("Bins of altitude", "12", "1", "1000", default=12)
-
-    @property
-    def _shown(self) -> tuple[str | None, ...]:
-        return (f"{self.quantity}_{self.show}",)
 
 
 class NavigationFigure(_OfNavigation):
@@ -378,6 +353,9 @@ SceneFigure = Annotated[
 ]
 
 # What is wrong with figures
+
+_SIDES = ("x", "y", "by", "rows", "columns")
+"""Fields of a grid's figure that name a coordinate."""
 
 LEAST_BEAMS = 3
 """Shots of a cycle from which on there is navigation."""
@@ -405,7 +383,7 @@ def scene_figure_findings(
     scanners = scanners if isinstance(scanners, Mapping) else {}
     for at, figure in _readable(written, SceneFigure):
         yield from _scanner_findings(figure, scanners, at)
-        yield from () if axes is None else _where_findings(figure, axes, at)
+        yield from () if axes is None else _coordinate_findings(figure, axes, at)
         yield from _draw_findings(figure, written.get("draws"), at)
     yield from _name_findings(written, SceneFigure, "makes the same file as another")
 
@@ -427,31 +405,28 @@ def _name_findings(written: Mapping[str, Any], kind: Any, rule: str) -> Iterator
         stems.add(figure.stem)
 
 
-def _no_coordinate(name: str, known: list[str], at: Location) -> Finding:
-    remedy = f"the coordinates are {', '.join(known)}" if known else "this study has no axes"
-    suggestion = near_miss(name, known, otherwise=remedy)
-    return Finding(at, "is no coordinate of this study", suggestion, name)
-
-
-def _value_findings(path: str, values: Any, at: Location) -> Iterator[Finding]:
-    """Values that are none of a coordinate."""
-    for value in values if isinstance(values, tuple) else (values,):
-        try:
-            parameter_rules()[path].read(value)
-        except QuantityError as error:
-            yield Finding(at, error.rule, error.suggestion, value)
-
-
 def _coordinate_findings(figure: Any, axes: tuple[Axis, ...], at: Location) -> Iterator[Finding]:
-    """Coordinates that no axis has, and values that are none of a coordinate."""
+    """Coordinates that no axis has, and values that are none, or in a scene not one, of them."""
+    of_grid = isinstance(figure, GridDrawing)
+    named = {field: getattr(figure, field, "") for field in _SIDES} if of_grid else {}
+    where = getattr(figure, "where", {})
     paths = {member.name: member.path for axis in axes for member in axis.members}
-    known = list(dict.fromkeys([*paths, *(axis.name for axis in axes)]))
-    for field, name in figure.coordinates.items():
+    known = list(dict.fromkeys([*paths, *(axis.name for axis in axes if of_grid)]))
+    for field, name in (named | {f"where.{name}": name for name in where}).items():
         location: Location = (*at, *field.split("."))
-        if name not in known:
-            yield _no_coordinate(name, known, location)
-        elif field.startswith("where.") and name in paths:
-            yield from _value_findings(paths[name], figure.where[name], location)
+        values = where[name] if field.startswith("where.") else ()
+        if name and name not in known:
+            remedy = f"the coordinates are {', '.join(known)}" if known else "it has no axes"
+            suggestion = near_miss(name, known, otherwise=remedy)
+            yield Finding(location, "is no coordinate of this study", suggestion, name)
+        elif isinstance(values, tuple) and values and not of_grid:
+            yield Finding(location, "must be one value", "make a figure for each")
+        elif name in paths:
+            for value in values if isinstance(values, tuple) else (values,):
+                try:
+                    parameter_rules()[paths[name]].read(value)
+                except QuantityError as error:
+                    yield Finding(location, error.rule, error.suggestion, value)
 
 
 def _variable_findings(
@@ -489,7 +464,9 @@ def _spectra_findings(figure: Any, at: Location) -> Iterator[Finding]:
 
 def _scanner_findings(figure: Any, scanners: Mapping[str, Any], at: Location) -> Iterator[Finding]:
     """Scanners that the study lacks, or of too few beams for navigation."""
-    for place, name in figure.named_scanners.items():
+    one, several = getattr(figure, "scanner", None), getattr(figure, "scanners", None) or ()
+    named: dict[Location, str] = {("scanner",): one} if one else {}
+    for place, name in (named | {("scanners", i): name for i, name in enumerate(several)}).items():
         if name not in scanners:
             remedy = near_miss(name, scanners, otherwise=f"it has {', '.join(scanners)}")
             yield Finding((*at, *place), "is no scanner of this study", remedy, name)
@@ -511,19 +488,6 @@ def _navigates(written: object) -> bool:
         return scanner is None or shots_a_cycle(scanner.pattern()) >= LEAST_BEAMS
     except ValueError:
         return True
-
-
-def _where_findings(figure: Any, axes: tuple[Axis, ...], at: Location) -> Iterator[Finding]:
-    """Coordinates that no axis has, and values that are none, or not one, of a coordinate."""
-    paths = {member.name: member.path for axis in axes for member in axis.members}
-    for name, value in figure.where.items():
-        location = (*at, "where", name)
-        if name not in paths:
-            yield _no_coordinate(name, list(paths), location)
-        elif isinstance(value, tuple):
-            yield Finding(location, "must be one value", "make a figure for each")
-        else:
-            yield from _value_findings(paths[name], value, location)
 
 
 def _draw_findings(figure: Any, written: object, at: Location) -> Iterator[Finding]:

@@ -336,14 +336,7 @@ class RasterScan(Part):
 
     def pattern(self) -> Scanner:
         """Return the scan pattern."""
-        across, along = self.half_angles
-        return patterns.raster(
-            columns=self.columns,
-            rows=self.rows,
-            half_angles=(across, along),
-            rate=self.rate,
-            both_ways=self.both_ways,
-        )
+        return patterns.raster(**self.model_dump(exclude={"kind"}))
 
 
 class Line(Part):

@@ -74,6 +74,17 @@ def values_in(unit: Unit, si: np.ndarray) -> np.ndarray:
     return _rounded(np.array([(n * q - p * d) * b / (d * q * a) for n, d in ratios]))
 
 
+def in_units(rule: Numeric, written: object, units: str) -> float:
+    """Written value in the unit of choice."""
+    number, unit = rule.exact(written)
+    display = rule.exact(f"1 {units}" if units else 1)[1]
+    if unit.decibel != display.decibel:
+        return float(values_in(display, np.array([unit.to_si(number)]))[0])
+    if unit.decibel:
+        return float(number)
+    return float((unit.factor * number + unit.offset - display.offset) / display.factor)
+
+
 # Written values
 
 

@@ -72,7 +72,7 @@ class Grid:
     Parameters
     ----------
     values : mapping
-        SI values of the parameters off the axes by dotted path.
+        SI values of the parameters by dotted path; of those on axes, the value off the axis.
     axes : tuple of Axis
         The axes.
     modes : mapping
@@ -86,12 +86,9 @@ class Grid:
     @classmethod
     def of(cls, written: Mapping[str, Any], axes: tuple[Axis, ...]) -> Grid:
         """Grid of a spec as written."""
-        on_axes = {member.path for axis in axes for member in axis.members}
         values: dict[str, Any] = {}
         for path, rule in parameter_rules().items():
             found = at(written, path)
-            if path in on_axes:
-                continue
             with suppress(QuantityError):
                 value = default_of(path) if found is ABSENT else rule.read(found)
                 if value is not None:
@@ -576,10 +573,12 @@ def not_in_flights(grid: Grid, draws: SceneDraws) -> Iterator[Finding]:
             instead = ": beams wander by platform.jitter" if effect.turn is not None else ""
             yield _of_mode(effect.name, rule, f"leave it out{instead}")
     yield from spectra_findings(draws, grid)
-    for path in (waveform.SHOT_DETECTION, waveform.PEAKS):
-        if grid.has_point({path: partial(operator.ne, waveform.DEFAULTS[path])}):
-            remedy = f"leave it at {waveform.DEFAULTS[path]}, or study a flat target"
-            yield grid.finding(path, "is not known to flights, which pair peaks", remedy)
+    if grid.has_point({waveform.SHOT_DETECTION: _is(waveform.ANY_TWO)}):
+        rule, remedy = "is not known to flights, which pair peaks", "take both_chirps"
+        yield grid.finding(waveform.SHOT_DETECTION, rule, f"{remedy}, or study a flat target")
+    if not draws.whole_spectra and grid.has_point({waveform.PEAKS: _is(waveform.STRONGEST)}):
+        rule = f"is found in whole spectra, which draws.method {draws.method!r} does not draw"
+        yield grid.finding(waveform.PEAKS, rule, f"set draws.method: {SPECTRA}, or take all")
     voted = {looks.NUMBER: _several, looks.COMBINE: _is(looks.BINARY)}
     if grid.has_point(voted | {"footprint.speckle": _is("developed")}):
         rule = "counts records, and flights draw no powers of echoes that fade in several"

@@ -61,9 +61,7 @@ class Relief(Part):
             generator("relief", self.seed),
             shape=shape,
             spacing=spacing,
-            hurst=self.hurst,
-            rms_slope=self.rms_slope,
-            baseline=self.baseline,
+            **self.model_dump(include={"hurst", "rms_slope", "baseline"}),
         )
         return np.asarray(heights - heights.mean())
 
@@ -91,9 +89,7 @@ class Craters(Part):
             generator("craters", self.seed),
             lunar_craters(equilibrium_diameter=up_to),
             bounds=terrain.bounds,
-            smallest=self.smallest,
-            largest=self.largest,
-            least_fresh=self.least_fresh,
+            **self.model_dump(include={"smallest", "largest", "least_fresh"}),
         )
         return carve(terrain, craters)
 
@@ -230,10 +226,7 @@ class RasterGround(Ground):
         """Heights of the raster."""
         terrain = read_raster(
             files.path(self.file, raster_digest),
-            band=self.band,
-            window=self.window,  # type: ignore[arg-type]
-            metres_per_degree=self.metres_per_degree,  # type: ignore[arg-type]
-            pixel=self.pixel,
+            **self.model_dump(include={"band", "window", "metres_per_degree", "pixel"}),
         )
         return replace(terrain, heights=terrain.heights * self.scale)
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from fractions import Fraction
 from functools import cache
 from types import MappingProxyType
 from typing import Any, Protocol
@@ -13,12 +14,13 @@ import numpy as np
 from pydantic import BaseModel
 
 from sweep.spec.axes import Axis, Member
-from sweep.spec.fields import parameter_rules
+from sweep.spec.fields import SECTIONS
 from sweep.spec.flight import AnyScanner, Platform
 from sweep.spec.grounds import OPTICAL
-from sweep.spec.parts import Models, all_parts, fields_of, leaves, models_at, rule_of
-from sweep.spec.rules import File
+from sweep.spec.parts import Models, all_parts, fields_of, models_at, rule_of, values_of
+from sweep.spec.rules import Rule, rule_of_beam
 from sweep.spec.scene import ErrorFloor, Navigation, Scene, SceneDraws, SceneStorage
+from sweep.units import read_unit
 
 LISTED_VALUES = 64
 MOST_TOLD = 8
@@ -69,14 +71,6 @@ def digest(identity: Mapping[str, Any]) -> str:
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
 
-def leaf_values(part: BaseModel, digests: Mapping[str, str]) -> dict[str, Any]:
-    """SI values of a part by dotted path; of files, their digests."""
-    return {
-        ".".join(path): digests.get(value, value) if isinstance(rule, File) else value
-        for path, rule, value in leaves(part)
-    }
-
-
 def geometry_of(
     scene: Scene, platform: Platform, scanner: BaseModel, digests: Mapping[str, str]
 ) -> dict[str, Any]:
@@ -88,12 +82,12 @@ def geometry_of(
     places = {name: place for place, name in enumerate(scene.objects)}
     return {
         "objects": [
-            _object_geometry(leaf_values(thing, digests), places)
+            _object_geometry(values_of(thing, digests=digests), places)
             for thing in scene.objects.values()
         ],
         "origin": places.get(scene.origin, -1),
-        "platform": leaf_values(platform, digests),
-        "scanner": leaf_values(scanner, digests),
+        "platform": values_of(platform, digests=digests),
+        "scanner": values_of(scanner, digests=digests),
     }
 
 
@@ -104,11 +98,14 @@ def _object_geometry(values: Mapping[str, Any], places: Mapping[str, int]) -> di
 
 
 @cache
-def scene_units() -> MappingProxyType[str, str]:
-    """SI unit of every field of a scene by its name: one name has one unit wherever it stands."""
-    fields = [item for model in all_parts(*ROOTS) for item in fields_of(model).items()]
-    rules = {name: rule for name, field in fields if (rule := rule_of(field))}
-    return MappingProxyType({name: rule.units for name, rule in rules.items()})
+def field_rules() -> MappingProxyType[str, Rule]:
+    """Rule of every field by its name: one name has one unit wherever it stands."""
+    return MappingProxyType({
+        name: rule
+        for model in all_parts(*SECTIONS.values(), *ROOTS)
+        for name, field in fields_of(model).items()
+        if (rule := rule_of(field))
+    })  # fmt: skip
 
 
 class Identified(Protocol):
@@ -149,30 +146,46 @@ def _flat(identity: Mapping[str, Any]) -> dict[str, Any]:
 
 def _told(path: str, value: Any) -> str:
     """Format a leaf of an identity in words."""
-    rules = parameter_rules()
-    rule = rules.get(path) or next(
-        (rules[known] for known in rules if path.endswith("." + known)), None
-    )
-    unit = scene_units().get(path.rsplit(".", 1)[-1], "") if rule is None else rule.units
-    units = f" {unit}" if unit else ""
+    rule = field_rules().get(path.rsplit(".", 1)[-1])
     if value is None:
         return "(none)"
     if isinstance(value, str):
         return value if len(value) <= LONGEST_TOLD else f"{value[:LONGEST_TOLD]} ..."
     if path in ("axes", "objects"):
         return ", ".join(value) or "(none)"
-    if isinstance(value, list):
-        return f"[{', '.join(map(_number, value))}]{units}"
+    if isinstance(value, list) and path.endswith(".beams"):
+        return "[" + ", ".join(_listed(rule_of_beam(beam), beam) for beam in value) + "]"
     if isinstance(value, Mapping) and "values" in value:
-        values = [_number(each) for each in value["values"]]
-        if len(values) > MOST_TOLD:
-            values = [*values[:2], "...", values[-1], f"{len(values)} in all"]
-        return "[" + ", ".join(values) + "]" + units
+        return _listed(rule, value["values"])
     if isinstance(value, Mapping):
-        ends = f"{_number(value['first'])} to {_number(value['last'])}{units}"
+        first, last = (_number(rule, value[end]) for end in ("first", "last"))
+        ends = f"{first} to {last}{_units(rule)}"
         return f"{value['number']} values from {ends} (digest {value['digest'][:8]})"
-    return _number(value) + units
+    return _listed(rule, value) if isinstance(value, list) else _number(rule, value) + _units(rule)
 
 
-def _number(value: Any) -> str:
-    return repr(value) if isinstance(value, float) else str(value)
+def _listed(rule: Rule | None, values: Sequence[Any]) -> str:
+    """Values of a field in a row, the first and last where they are many."""
+    told = [_number(rule, each) for each in values]
+    if len(told) > MOST_TOLD:
+        told = [*told[:2], "...", told[-1], f"{len(told)} in all"]
+    return f"[{', '.join(told)}]{_units(rule)}"
+
+
+def _units(rule: Rule | None) -> str:
+    """Units that a field is told in, behind a space: of angles those of its example, else SI."""
+    units = "" if rule is None else rule.units
+    if rule is not None and units.startswith("rad"):
+        units = rule.example.split(",")[0].split()[-1].strip("]")
+    return f" {units}" if units else ""
+
+
+def _number(rule: Rule | None, value: Any) -> str:
+    """Value in SI as it is told: of an angle what reads back as it."""
+    units = _units(rule).strip()
+    if rule is None or units == rule.units or isinstance(value, str):
+        return repr(value) if isinstance(value, float) else str(value)
+    unit = read_unit(units, si_unit=rule.units, example=rule.example)
+    number = value / float(unit.factor)
+    told = f"{number:.15g}"
+    return told if unit.to_si(Fraction(told)) == value else repr(number)

@@ -3,10 +3,9 @@
 Values are SI inside; what users write carries units.
 """
 
-from typing import Self
+from typing import Any, Self
 
 from pydantic import model_validator
-from pydantic_core import PydanticCustomError
 
 import sweep.spec.declaring as of
 from sweep.model import waveform
@@ -16,7 +15,7 @@ from sweep.model.estimators import ESTIMATORS, PEAK_BIN
 from sweep.model.looks import COMBINED, COMMON, POWER, SPECKLES
 from sweep.model.threshold import PROCESSING, WAYS
 from sweep.spec.parts import Part, with_parameters
-from sweep.spec.rules import BROKEN_RULE, Method, Window
+from sweep.spec.rules import Method, Window, broken
 
 ARCHITECTURES = ("homodyne", "heterodyne", "direct")
 _WATTS = ("1e-18 W", "1e9 W")
@@ -212,12 +211,11 @@ class Estimator(Part):
     )
 
 
-def _looked_for(about: str, unit: str, example: str, *bounds: str) -> float | None:
+def _looked_for(about: str, *rule: str) -> Any:
     """Field of an end of the search band."""
     whole = f"{about}, as a segment starts; a search band has all four ends, and without them the "
     whole += "whole record is searched. What lies outside is neither detected nor a false alarm"
-    end: float | None = of.quantity(whole, unit, example, *bounds, default=None)
-    return end
+    return of.quantity(whole, *rule, default=None)
 
 
 class Search(Part):
@@ -233,11 +231,10 @@ class Search(Part):
     )
 
 
-def _design_pfa(where: str) -> float | None:
+def _design_pfa(where: str) -> Any:
     """Field of a probability of a false alarm that the threshold is set by."""
     about = f"Instead of tnr: probability that noise alone raises a false alarm in {where}"
-    rule: float | None = of.number(about, "1e-6", "1e-300", "0.99", default=None)
-    return rule
+    return of.number(about, "1e-6", "1e-300", "0.99", default=None)
 
 
 @with_parameters("instrument.processing")
@@ -281,7 +278,8 @@ class Processing(Part):
     )
     peaks: str = of.choice(
         "Peaks of a segment that are reported: all that cross the threshold; or the strongest "
-        "alone, which may be another than the echo's (p_wrong_range); in grids without draws",
+        "alone, which may be another than the echo's (p_wrong_range); in grids without draws, and "
+        "in flights that draw whole spectra",
         waveform.REPORTED_PEAKS,
         waveform.ALL,
     )
@@ -312,7 +310,7 @@ class Processing(Part):
                 f"sets the threshold by {' and by '.join(given)}" if given else "has no threshold"
             )
             remedy = "keep one of them" if given else f"write 'tnr: 10', or {', '.join(ways[1:])}"
-            raise PydanticCustomError(BROKEN_RULE, "{rule}", {"rule": rule, "suggestion": remedy})
+            raise broken(rule, remedy)
         return self
 
 

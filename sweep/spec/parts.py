@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any, NamedTuple, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError, create_model
@@ -200,16 +201,6 @@ def _adapter(kind: Any) -> TypeAdapter[Any]:
     return TypeAdapter(kind)
 
 
-def values_of(part: BaseModel, prefix: str) -> dict[str, Any]:
-    """Values of a model's fields and of its sections' fields, by dotted path."""
-    values: dict[str, Any] = {}
-    for name in type(part).model_fields:
-        value = getattr(part, name)
-        path = f"{prefix}.{name}" if prefix else name
-        values |= values_of(value, path) if isinstance(value, BaseModel) else {path: value}
-    return values
-
-
 def leaves(part: BaseModel, path: Key = ()) -> Iterator[tuple[Key, Rule, Any]]:
     """Every value of a part and of the parts in it that is there: its path, rule and SI value."""
     for name, field in type(part).model_fields.items():
@@ -222,6 +213,16 @@ def leaves(part: BaseModel, path: Key = ()) -> Iterator[tuple[Key, Rule, Any]]:
         elif isinstance(value, dict):
             for inner, below in value.items():
                 yield from leaves(below, (*key, inner))
+
+
+def values_of(
+    part: BaseModel, path: Key = (), digests: Mapping[str, str] = MappingProxyType({})
+) -> dict[str, Any]:
+    """SI values of a part at a path by dotted path; of files, their digests where known."""
+    return {
+        ".".join(key): digests.get(value, value) if isinstance(rule, File) else value
+        for key, rule, value in leaves(part, path)
+    }
 
 
 def fill(mapping: dict[str, Any], path: list[str], value: Any) -> bool:

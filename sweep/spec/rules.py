@@ -34,6 +34,11 @@ BROKEN_RULE = "broken_rule"
 Json = dict[str, Any]
 
 
+def broken(rule: str, suggestion: str) -> PydanticCustomError:
+    """Mistake in a value, or in a section as a whole, told in pydantic's way."""
+    return PydanticCustomError(BROKEN_RULE, "{rule}", {"rule": rule, "suggestion": suggestion})
+
+
 @dataclass(frozen=True, kw_only=True)
 class Rule:
     """Rule of what a field may hold.
@@ -85,8 +90,7 @@ class Rule:
         try:
             return self.read(written)
         except QuantityError as error:
-            context = {"rule": error.rule, "suggestion": error.suggestion}
-            raise PydanticCustomError(BROKEN_RULE, "{rule}", context) from None
+            raise broken(error.rule, error.suggestion) from None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -524,11 +528,11 @@ class Beams(Rule):
         example = "write e.g. [[22.5 deg, 0 deg], [0 deg, 0 deg]]"
         if not isinstance(written, list | tuple) or not 0 < len(written) <= MOST_BEAMS:
             raise QuantityError(f"must be a list of 1 to {MOST_BEAMS} beams", example)
-        return tuple(_read_element(_rule_of_beam(b), i, b) for i, b in enumerate(written))
+        return tuple(_read_element(rule_of_beam(b), i, b) for i, b in enumerate(written))
 
     def written(self, value: Any) -> Any:
         """Return lists that read back as exactly `value`."""
-        return [_rule_of_beam(beam).written(beam) for beam in value]
+        return [rule_of_beam(beam).written(beam) for beam in value]
 
     def schema(self) -> Json:
         """JSON Schema: a list of lists."""
@@ -537,7 +541,7 @@ class Beams(Rule):
         return {"description": self.about, "type": "array", "items": beam} | number
 
 
-def _rule_of_beam(beam: object) -> Several:
+def rule_of_beam(beam: object) -> Several:
     """Rule of a beam, by how many numbers it has."""
     return _POINTED if isinstance(beam, list | tuple) and len(beam) == 3 else STEERED
 

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, Annotated, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
-from pydantic_core import PydanticCustomError
 
 import sweep.spec.declaring as of
 from sweep.spec.flight import Motion, Turn
@@ -22,7 +21,7 @@ from sweep.spec.grounds import (
     generator,
 )
 from sweep.spec.parts import Files, Part
-from sweep.spec.rules import BROKEN_RULE
+from sweep.spec.rules import broken
 from sweep.spec.sections import SPECTRA, sunlight
 
 if TYPE_CHECKING:
@@ -174,9 +173,9 @@ class Boulders(Material):
             generator("boulders", self.seed),
             self.law.law(),
             ground,
+            bounds=bounds,
             smallest=self.smallest,
             largest=self.largest,
-            bounds=bounds,
             height_ratio=self.height_ratio,
             elongation=self.elongation,
             subdivisions=self.subdivisions,
@@ -329,11 +328,10 @@ class ErrorFloor(Part):
     )  # fmt: skip
 
 
-def _end(about: str, unit: str, example: str, *bounds: str) -> float | None:
+def _end(about: str, *rule: str) -> Any:
     """Field of an end of what a report can hold; none by default."""
     whole = f"{about}; what lies beyond is clipped and reported as invalid"
-    end: float | None = of.quantity(whole, unit, example, *bounds, default=None)
-    return end
+    return of.quantity(whole, *rule, default=None)
 
 
 class Interface(Part):
@@ -380,15 +378,11 @@ class Interface(Part):
             low, high = getattr(self, f"min_{name}"), getattr(self, f"max_{name}")
             if low is not None and high is not None and low >= high:
                 rule = f"has a min_{name} that is not below its max_{name}"
-                raise _broken(rule, f"write a lower min_{name}, or leave it out")
+                raise broken(rule, f"write a lower min_{name}, or leave it out")
         if self.rate is None and self.valid_shots > 1:
             rule = f"wants {self.valid_shots} valid_shots, and without a rate a report is one shot"
-            raise _broken(rule, "add e.g. 'rate: 20 Hz', or leave valid_shots out")
+            raise broken(rule, "add e.g. 'rate: 20 Hz', or leave valid_shots out")
         return self
-
-
-def _broken(rule: str, remedy: str) -> PydanticCustomError:
-    return PydanticCustomError(BROKEN_RULE, "{rule}", {"rule": rule, "suggestion": remedy})
 
 
 class SceneStorage(Part):

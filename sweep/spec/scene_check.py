@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from sweep.model.ground import pattern as pattern_of
 from sweep.model.outputs import CYCLES, NAVIGATION, POINTS, SHOTS, STATISTICS
 from sweep.model.resolution import PATTERN
 from sweep.scenes.files import SceneError
-from sweep.spec.axes import Axis
+from sweep.spec.fields import default_of
 from sweep.spec.flight import (
     AnyScanner,
     Motion,
@@ -27,6 +27,7 @@ from sweep.spec.flight import (
     WaypointPath,
     shots_a_cycle,
 )
+from sweep.spec.grid_rules import Grid
 from sweep.spec.grid_rules import at as written_at
 from sweep.spec.grounds import Craters, Ground, Jacksboro
 from sweep.spec.mistakes import Finding, Location, near_miss
@@ -294,6 +295,10 @@ STORED = frozenset(
 
 _OTHER = "make another study of it"
 _BEAMS = (beam.DIVERGENCE, beam.WAIST, beam.QUALITY, beam.FOCUS, beam.RECEIVED_WAIST, beam.COUPLING)
+_ARRANGED = (
+    PATTERN, "footprint.phases", beam.ARCHITECTURE, beam.COUPLING, beam.WAIST, beam.FOCUS
+)  # fmt: skip
+"""Parameters that say where beamlets go."""
 _MOVES = ("moves the beamlets, and a study casts its rays once", _OTHER)
 _REASONS = {
     "footprint.speckle": ("", ""),  # which moves no beamlet
@@ -308,67 +313,39 @@ def why_not(path: str) -> tuple[str, str]:
     return next((why for start, why in _REASONS.items() if path.startswith(start)), ("", ""))
 
 
-class Arrangement(NamedTuple):
-    """Words that say where beamlets go."""
-
-    pattern: str
-    phases: str
-    architecture: str
-    thesis: bool
-    """True where they go as far as divergence times range, whatever the wavelength."""
-
-    @property
-    def beamlets(self) -> str:
-        """Arrangement of the beamlets, as :func:`sweep.model.ground.pattern` has it."""
-        words = {PATTERN: self.pattern, "footprint.phases": self.phases}
-        return pattern_of(words | {beam.ARCHITECTURE: self.architecture})
-
-
 def parameter_findings(
-    arrangement: Arrangement, path: str, values: Iterable[Any], location: Location
+    p: Mapping[str, Any], path: str, values: Iterable[Any], location: Location
 ) -> list[Finding]:
-    """Mistakes in a parameter taking several values, which stand at a location."""
+    """Mistakes in one of the parameters taking several values, which stand at a location."""
     rule, remedy = why_not(path)
     if rule:
         return [Finding(location, rule, remedy)]
-    if path == beam.WAVELENGTH and not arrangement.thesis:
+    if path == beam.WAVELENGTH and not beam.is_thesis(p):
         rule = "moves the beamlets, as the beam's radius follows from it, and rays are cast once"
         return [Finding(location, rule, f"{_OTHER}, or take coupling: aperture")]
     if path != beam.ARCHITECTURE:
         return []
-    each = [arrangement, *(arrangement._replace(architecture=str(v)) for v in values)]
-    modes = {one.architecture == "direct" for one in each}
-    if len({one.beamlets for one in each}) > 1 or (len(modes) > 1 and not arrangement.thesis):
+    each = [p, *({**p, path: str(value)} for value in values)]
+    modes = {one[path] == "direct" for one in each}
+    if len(set(map(pattern_of, each))) > 1 or (
+        len(modes) > 1 and not all(map(beam.is_thesis, each))
+    ):
         rule = "moves the beamlets between direct detection and the others"
         remedy = f"{_OTHER}, or take coherent phases and coupling: aperture"
         return [Finding(location, rule, remedy)]
     return []
 
 
-def axis_findings(written: Mapping[str, Any], axes: tuple[Axis, ...]) -> Iterator[Finding]:
+def axis_findings(grid: Grid) -> Iterator[Finding]:
     """Axes of what can not vary on one geometry."""
-
-    def word(path: str, otherwise: str) -> str:
-        found = written_at(written, path, None)
-        return str(otherwise if found is None else found)
-
-    chosen = word(PATTERN, "auto")
-    thesis = word(beam.COUPLING, beam.SINGLE_MODE) == beam.APERTURE and {
-        word(path, "none") for path in (beam.WAIST, beam.FOCUS)
-    } == {"none"}
-    arrangement = Arrangement(
-        chosen,
-        word("footprint.phases", "incoherent"),
-        word(beam.ARCHITECTURE, "homodyne"),
-        thesis,
-    )
-    if chosen in ("line", "square"):
+    p = {path: default_of(path) for path in _ARRANGED} | dict(grid.values)
+    if p[PATTERN] in ("line", "square"):
         rule = "stands for a plane alone, and the ground of a scene is none"
-        yield Finding(("footprint", "pattern"), rule, "take hexagonal", chosen)
-    for axis in axes:
+        yield Finding(("footprint", "pattern"), rule, "take hexagonal", p[PATTERN])
+    for axis in grid.axes:
         for member in axis.members:
             at: Location = ("axes", axis.name if axis.zipped else member.path)
-            yield from parameter_findings(arrangement, member.path, member.values, at)
+            yield from parameter_findings(p, member.path, member.values, at)
         if axis.zipped and axis.name in STORED:
             rule = "bears the name of something stored"
             yield Finding(("axes", axis.name), rule, "take a word such as 'cut'")

@@ -13,17 +13,17 @@ from pydantic import Field, ValidationError
 
 from sweep.model import VERSION, beam
 from sweep.model.accuracy import Accuracy
-from sweep.model.resolution import BEAMLETS, PATTERN, is_open, rays_needed
+from sweep.model.ground import pattern as pattern_of
+from sweep.model.resolution import BEAMLETS, is_open, rays_needed
 from sweep.spec.figures import SceneFigure, scene_figure_findings
 from sweep.spec.flight import AnyScanner, Platform, shots_a_cycle
 from sweep.spec.grid_rules import Grid, is_method, not_in_flights
-from sweep.spec.identity import digest, geometry_of, leaf_values
+from sweep.spec.identity import digest, geometry_of
 from sweep.spec.mistakes import Finding, Location, SpecError
-from sweep.spec.parts import Files, leaves, named_files, read_as
+from sweep.spec.parts import Files, leaves, named_files, read_as, values_of
 from sweep.spec.reading import Document, findings_of
 from sweep.spec.scene import ErrorFloor, Interface, Navigation, Scene, SceneDraws, SceneStorage
 from sweep.spec.scene_check import (
-    Arrangement,
     axis_findings,
     parameter_findings,
     scene_findings,
@@ -75,7 +75,7 @@ class SceneSpec(Study):
         draws = read_as(SceneDraws, written.get("draws", {})) or SceneDraws()
         return [
             *scene_findings(written, base),
-            *axis_findings(written, grid.axes),
+            *axis_findings(grid),
             *not_in_flights(grid, draws),
             *scene_figure_findings(written, grid.axes if axes_are_whole else None),
         ]
@@ -87,7 +87,7 @@ class SceneSpec(Study):
 
     def unvaried(self, path: str, value: object, location: Location) -> list[Finding]:
         """Mistakes in a parameter taking a value without the geometry changing."""
-        return parameter_findings(self._arrangement, path, [value], location)
+        return parameter_findings(self.parameters(), path, [value], location)
 
     @property
     def base(self) -> Path:
@@ -160,14 +160,7 @@ class SceneSpec(Study):
     @property
     def pattern(self) -> str:
         """Arrangement of the beamlets, `sweep.model.footprint.beamlets`'s word."""
-        return self._arrangement.beamlets
-
-    @property
-    def _arrangement(self) -> Arrangement:
-        p = self.parameters()
-        paths = PATTERN, "footprint.phases", beam.ARCHITECTURE
-        pattern, phases, architecture = (str(p[path]) for path in paths)
-        return Arrangement(pattern, phases, architecture, beam.is_thesis(p))
+        return pattern_of(self.parameters())
 
     def footprint_angles(self) -> Callable[[np.ndarray], beam.Angles] | None:
         """Angles of the beam's footprint by range; None where its divergence says all."""
@@ -233,19 +226,11 @@ class SceneSpec(Study):
         return super().identity() | {
             "parameters": self.parameters_off_axes() | counted,
             "objects": list(self.scene.objects),
-            "scene": leaf_values(self.scene, digests),
-            "platform": leaf_values(self.platform, digests),
+            "scene": values_of(self.scene, digests=digests),
+            "platform": values_of(self.platform, digests=digests),
             "scanners": {
-                f"{name}.{path}": value
+                path: value
                 for name, scanner in self.scanners.items()
-                for path, value in leaf_values(scanner, digests).items()
+                for path, value in values_of(scanner, (name,), digests).items()
             },
         }
-
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, SceneSpec):
-            return NotImplemented
-        return self.to_json() == other.to_json()
-
-    def __hash__(self) -> int:
-        return hash(self.id)

@@ -22,7 +22,7 @@ from sweep.model.waveform import ENDS
 from sweep.spec.axes import Axis, Member, paths_on_axes, read_axes
 from sweep.spec.fields import SECTIONS, parameter_rules, parameter_suggestion, short_name
 from sweep.spec.figures import Figure, figure_findings
-from sweep.spec.generators import values_in
+from sweep.spec.generators import in_units
 from sweep.spec.grid_rules import (
     Condition,
     Grid,
@@ -170,13 +170,12 @@ class Study(Part):
             path: value
             for section in SECTIONS
             if section in type(self).model_fields
-            for path, value in values_of(getattr(self, section), section).items()
-            if value is not None
+            for path, value in values_of(getattr(self, section), (section,)).items()
         }
 
     def modes(self) -> dict[str, str]:
         """Mode of each effect by its name: `auto`, `on` or `off`."""
-        return values_of(self.effects, "")
+        return values_of(self.effects)
 
     def parameters_at(self, at: Mapping[str, object]) -> dict[str, float | int | str]:
         """Parameters with some set anew, written as in a spec.
@@ -245,13 +244,7 @@ class Study(Part):
         rule = parameter_rules()[member.path]
         if not isinstance(rule, Numeric):
             return str(rule.read(written))
-        number, unit = rule.exact(written)
-        display = rule.exact(f"1 {member.units}" if member.units else 1)[1]
-        if unit.decibel != display.decibel:
-            return float(values_in(display, np.array([unit.to_si(number)]))[0])
-        if unit.decibel:
-            return float(number)
-        return float((unit.factor * number + unit.offset - display.offset) / display.factor)
+        return in_units(rule, written, member.units)
 
     def identity(self) -> dict[str, Any]:
         """Content that makes the study this one, in SI values.
@@ -270,7 +263,7 @@ class Study(Part):
             "axes": [axis_identity(axis) for axis in self.axes],
             "effects": self.modes(),
             "seed": self.seed,
-        } | {name: values_of(getattr(self, name), "") for name in sections}
+        } | {name: values_of(getattr(self, name)) for name in sections}
 
     def parameters_off_axes(self) -> dict[str, float | int | str]:
         """SI values of the parameters that no axis overrides, by dotted path."""
@@ -281,6 +274,9 @@ class Study(Part):
     def id(self) -> str:
         """Hash of the identity, 32 hexadecimal digits."""
         return digest(self.identity())
+
+    def __eq__(self, other: object) -> bool:
+        return type(other) is type(self) and self.to_json() == other.to_json()  # type: ignore[attr-defined]
 
     def __hash__(self) -> int:
         return hash(self.id)

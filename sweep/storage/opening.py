@@ -13,17 +13,15 @@ import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import zarr
 from zarr.storage import LocalStore
 
 from sweep.storage.atomic_replace import settle, stamp
 from sweep.storage.locations import JOURNAL, Location, ObjectStoreError, zarr_store
 from sweep.storage.logs import read_lines
-
-if TYPE_CHECKING:
-    import zarr
 
 #: What a store is made of before there are results, and the digest of each object, in the journal.
 MANIFEST = "template.jsonl"
@@ -87,8 +85,6 @@ class NotAStoreError(StoreError, ValueError):
 
 def open_group(path: Location, mode: Any = "r") -> zarr.Group:
     """Open the arrays of a store by its checked document; raises as :func:`read_document`."""
-    import zarr
-
     read_document(path)
     return zarr.open_group(zarr_store(path), mode=mode, zarr_format=3, use_consolidated=True)
 

@@ -36,12 +36,16 @@ CAST_BEAMLETS = 1 << 18
 NODES = 256
 LEAST_NODES = 16
 
-#: Shots of each scanner that say where the flight looks, and the room left around what they see.
+#: Shots of each scanner that say where the flight looks, or times that say where it is; and the
+#: room left around what they see.
 SAMPLE = 512
 MARGIN = 0.08
 
 #: Distance above the scene from which it is seen for its map [m].
 ABOVE = 1.0
+
+#: Distance of the ground up to which a platform stands on it [m].
+ON_GROUND = 1e-6
 
 #: Size of an axis named by the model.
 SIZES = {"xyz": 3, "xyz_again": 3}
@@ -206,6 +210,27 @@ def altitude(world: World, position: np.ndarray, time: np.ndarray) -> np.ndarray
     """Height above what lies straight below positions (n, 3) at times (n,) [m]; inf for nothing."""
     down = np.broadcast_to([0.0, 0.0, -1.0], (len(position), 1, 3))
     return np.asarray(world.caster.bundle(position, down, poses=_poses(world, time)).range)
+
+
+def beneath(spec: SceneSpec) -> str:
+    """Warning of a flight that lies beneath its scene for a while; empty for one that does not."""
+    world, flight = world_of(spec), spec.flight()
+    time = np.linspace(flight.start, flight.stop, SAMPLE)
+    position = flight.state(time).position
+    up = np.broadcast_to([0.0, 0.0, 1.0], (len(position), 1, 3))
+    above = world.caster.bundle(position, up, poses=_poses(world, time))
+    # Whoever stands on the ground may be told, by rounding, that it lies above.
+    is_covered = np.isfinite(above.range) & (above.range > ON_GROUND)
+    is_low = is_covered & np.isinf(altitude(world, position, time))
+    if not is_low.any():
+        return ""
+    when, deep = time[is_low], np.where(is_low, above.range, 0.0)
+    surface = world.surfaces[above.surface[deep.argmax(), 0]].name
+    return (
+        f"the platform is beneath {surface} from time {when[0]:.4g} to {when[-1]:.4g} s, by "
+        f"{deep.max():.4g} m at the most, with nothing below it: raise its path, or let the "
+        "scene's origin be the ground"
+    )
 
 
 def _poses(world: World, time: float | np.ndarray, at: int | slice = slice(None)) -> list[Any]:

@@ -9,8 +9,8 @@ import socket
 import threading
 import time
 import uuid
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
@@ -140,7 +140,8 @@ class _FileClaim:
     def take(self, text: str, judge: Callable[[], None]) -> None:
         """Take it, unless `judge`, asked while no other process judges, raises."""
         self._path.parent.mkdir(exist_ok=True)
-        with _guard(self._path.with_name("lock.guard")):
+        with open(self._path.with_name("lock.guard"), "a") as guard:
+            fcntl.flock(guard, fcntl.LOCK_EX)  # one process at a time judges and takes
             judge()
             self._path.unlink(missing_ok=True)
             mine = self._path.with_name(f"lock.{uuid.uuid4().hex}")
@@ -157,14 +158,6 @@ class _FileClaim:
     def leave(self) -> None:
         """Give it up."""
         self._path.unlink(missing_ok=True)
-
-
-@contextmanager
-def _guard(path: Path) -> Iterator[None]:
-    """Only one process at a time judges whether a lock is dead and takes its place."""
-    with open(path, "a") as guard:
-        fcntl.flock(guard, fcntl.LOCK_EX)
-        yield
 
 
 class _ObjectClaim:

@@ -6,9 +6,10 @@ import math
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import zarr
 
 from sweep.storage import logs
 from sweep.storage.atomic_replace import draft
@@ -27,11 +28,8 @@ from sweep.storage.opening import open_group
 from sweep.tasks import store, studies
 from sweep.tasks.errors import StoreError, told
 from sweep.tasks.journal import LOGS, RECIPE, committed
-from sweep.tasks.progress import Late, Progress, chosen
+from sweep.tasks.progress import Progress, chosen
 from sweep.tasks.study import ArrayLayout, BlockGrid, Study
-
-if TYPE_CHECKING:
-    import zarr
 
 #: Bytes of a shard, before compression, as far as whole chunks allow; one a thread is in memory.
 SHARD_BYTES = 64 << 20
@@ -54,7 +52,7 @@ def pack(
         raise StoreError(f"{path} {why}")
     if output.exists():
         raise StoreError(f"{output} is there already: name another place")
-    shown = Late(chosen(progress))
+    shown = chosen(progress)
     with told(f"{output} can't be made"):
         if isinstance(output, Path):
             with draft(output) as aside:
@@ -102,8 +100,6 @@ def _pack(path: Location, output: Location, study: Study, shown: Progress) -> No
 
 def _pack_array(source: Any, output: Location) -> None:
     """Copy an array, shard by shard, and read each back."""
-    import zarr
-
     target = zarr.open_array(zarr_store(output), mode="r+").with_config(store.WRITTEN_WHOLE)
     dims = tuple(map(str, range(target.ndim)))
     files = BlockGrid(dims, target.shape, target.shards or target.chunks)

@@ -15,6 +15,7 @@ import psutil
 
 from sweep.model.effects.catalogue import EFFECTS, NAMES
 from sweep.model.outputs import SHOTS
+from sweep.scenes.eyepoint_arrays import from_arrays
 from sweep.storage.atomic_replace import eyepoints_path
 from sweep.storage.locations import Location
 from sweep.tasks import cluster
@@ -133,7 +134,7 @@ def measured(study: GridStudy) -> float:
         found = [_evaluate_some(study, int(block), rows) for block in blocks]
         taken = time.process_time() - begun
         points, left_out = (sum(each) for each in zip(*found, strict=True))
-        return Round(points, taken, (taken + left_out,))
+        return Round(points, (taken + left_out,))
 
     study.compile()
     enough = _enough(look, grid.points, MEASURING)
@@ -144,7 +145,6 @@ class Round(NamedTuple):
     """A look at some points."""
 
     points: int
-    seconds: float  # that it has taken
     parts: tuple[float, ...]  # time of each kind of work [s]
 
 
@@ -161,7 +161,7 @@ def _enough(look: Callable[[int], Round], points: int, seconds: float) -> Round:
         if compiled.buffer:  # a round that compiles tells nothing of those that do not
             begun = now
             continue
-        if found.points >= points or found.seconds > seconds / 4 or now - begun > seconds / 2:
+        if found.points >= points or now - begun > seconds / 3:
             return found
         amount *= 4
 
@@ -219,8 +219,6 @@ def timed(
 
 
 def _scanner(study: FlightStudy, eyepoints: EyepointStudy) -> ScannerPlan:
-    from sweep.scenes.eyepoint_arrays import from_arrays
-
     blocks = study.scanners[eyepoints.scanner]
     part = blocks.part(0)
 
@@ -232,7 +230,7 @@ def _scanner(study: FlightStudy, eyepoints: EyepointStudy) -> ScannerPlan:
         shots = from_arrays(seen, eyepoints.weight)
         study.look(part, seen, shots, study.select(part, shots, numbers), numbers)
         looked = time.process_time()
-        return Round(len(numbers), looked - begun, (cast - begun, looked - cast))
+        return Round(len(numbers), (cast - begun, looked - cast))
 
     found = _enough(look, eyepoints.points, MEASURING_SCANNER)
     casting, looking = found.parts
@@ -325,8 +323,6 @@ def _of_grid(study: GridStudy, costs: bool) -> EffectsTable:
 
 
 def _of_flight(study: FlightStudy, costs: bool) -> EffectsTable:
-    from sweep.scenes.eyepoint_arrays import from_arrays
-
     found, times, shots = [], [], 0
     axes = tuple(int(axis.size) for axis in study.spec.axes)
     places = list(np.ndindex(axes))
@@ -460,8 +456,6 @@ class _Look(NamedTuple):
 
 def _looks(study: FlightStudy) -> list[_Look]:
     """Cycles spread over each scanner's flight, at the ends of its axes, with few draws."""
-    from sweep.scenes.eyepoint_arrays import from_arrays
-
     ends = {tuple(k * (int(axis.size) - 1) for axis in study.spec.axes) for k in (0, 1)}
     found = []
     for eyepoints in study.eyepoint_studies():

@@ -128,33 +128,6 @@ class _Counting(Progress):
         }
 
 
-class Late(_Counting):
-    """Progress of what may be over before anybody looks: nothing is shown of the first seconds."""
-
-    def __init__(self, shown: Progress) -> None:
-        super().__init__()
-        self._shown, self._showing = shown, False
-
-    def advance(self, *, points: float, failed: int) -> None:
-        """Shown from the first time that it is late."""
-        super().advance(points=points, failed=failed)
-        if self._showing:
-            self._shown.advance(points=points, failed=failed)
-        elif time.monotonic() - self._begun > LATE:
-            self._showing = True
-            self._shown.begin(points=self._points, done=self._done, unit=self._unit)
-
-    def say(self, text: str) -> None:
-        """Shown at once."""
-        self._shown.say(text)
-
-    def end(self) -> None:
-        """End the run."""
-        if self._showing:
-            self._shown.end()
-        self._showing = False
-
-
 class Lines(_Counting):
     """One line at the start, every 30 s and at the end, for logs."""
 

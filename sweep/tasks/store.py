@@ -20,7 +20,11 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import google_crc32c
 import numpy as np
+import zarr
+from numcodecs.zstd import Zstd
+from zarr.codecs import Crc32cCodec, ZstdCodec
 
 from sweep.model import VERSION
 from sweep.spec import SceneSpec, Spec, difference
@@ -45,14 +49,17 @@ from sweep.tasks.lock import LOCK, Lock
 from sweep.tasks.study import CONVENTIONS, ArrayLayout, Content, Study
 
 if TYPE_CHECKING:
-    import zarr
-    from numcodecs.zstd import Zstd
     from zarr.core.array_spec import ArrayConfigLike
 
 ROOT = "zarr.json"
 
 #: Object that says that what lies at a place in an object store is a store half made or removed.
 UNFINISHED = "partial"
+
+#: Chunks are packed, and with a checksum.
+CODECS = [ZstdCodec(level=ZSTD_LEVEL), Crc32cCodec()]
+
+_ZSTD = Zstd(level=ZSTD_LEVEL)
 
 _libc = ctypes.CDLL(None, use_errno=True)
 
@@ -143,8 +150,6 @@ def build(
     shards: Callable[[ArrayLayout], tuple[int, ...] | None] = lambda layout: None,
 ) -> None:
     """Make a store without results; a file holds one chunk, or as many as `shards` has."""
-    import zarr
-
     group = zarr.create_group(path, zarr_format=3, attributes=attributes)
     for name, own in study.groups().items():
         group.create_group(name, attributes=own)
@@ -173,13 +178,6 @@ def list_objects(path: Location, attributes: dict[str, Any], digests: Mapping[st
     put_whole(path / JOURNAL / MANIFEST, b"".join(lines))
 
 
-def codecs() -> dict[str, Any]:
-    """Codecs of chunks: packed, and with a checksum."""
-    from zarr.codecs import Crc32cCodec, ZstdCodec
-
-    return {"compressors": [ZstdCodec(level=ZSTD_LEVEL), Crc32cCodec()]}
-
-
 def _add(group: zarr.Group, layout: ArrayLayout, shards: tuple[int, ...] | None) -> None:
     fill: dict[str, Any] = {} if layout.fill is None else {"fill_value": layout.fill}
     array = group.create_array(
@@ -191,7 +189,7 @@ def _add(group: zarr.Group, layout: ArrayLayout, shards: tuple[int, ...] | None)
         **fill,
         dimension_names=layout.dims,
         attributes=dict(layout.attributes),
-        **codecs(),
+        compressors=CODECS,
     )
     if layout.values is not None:
         array[...] = layout.values
@@ -219,23 +217,14 @@ def encoded(layout: ArrayLayout, values: np.ndarray) -> bytes:
     They are packed little-endian values in C order, and the crc32c of that. Zarr takes ten times as
     long, some 2 % of a second's work for a block of 26 arrays.
     """
-    from google_crc32c import value as crc32c
-
     dtype = np.dtype(layout.dtype).newbyteorder("<")
     if values.shape == layout.chunks:
         chunk = np.ascontiguousarray(values, dtype).reshape(layout.chunks)
     else:
         chunk = np.full(layout.chunks, layout.fill, dtype)
         chunk[tuple(slice(size) for size in values.shape)] = values
-    content: bytes = _zstd().encode(chunk)
-    return content + int(crc32c(content)).to_bytes(4, "little")
-
-
-@cache
-def _zstd() -> Zstd:
-    from numcodecs.zstd import Zstd
-
-    return Zstd(level=ZSTD_LEVEL)
+    content: bytes = _ZSTD.encode(chunk)
+    return content + google_crc32c.value(content).to_bytes(4, "little")
 
 
 class Written(NamedTuple):
@@ -371,16 +360,6 @@ def processor() -> str:
     return f"{platform.machine()} {name} {' '.join(found)}".strip()
 
 
-def _differences(recorded: dict[str, str]) -> list[str]:
-    """Lines that say where the software here differs from a recorded one."""
-    here = software()
-    return [
-        f"{name}: {recorded.get(name, 'none')} in the store, {here.get(name, 'none')} here"
-        for name in sorted(here.keys() | recorded.keys())
-        if here.get(name) != recorded.get(name)
-    ]
-
-
 def refuse_foreign(path: Location) -> None:
     """Refuse what no version of this program has made; a damaged store of ours passes."""
     if not any(any(read_lines(path / JOURNAL / name)) for name in (MANIFEST, *LOGS)):
@@ -427,12 +406,14 @@ def refuse_other_study(
 
 def refuse_other_versions(path: str | Location, attributes: dict[str, Any], *, where: str) -> None:
     """Refuse a store begun with another model or other software: the bits could differ."""
-    lines = _differences(attributes["software"])
-    written, here = attributes["model_version"], VERSION
-    if written != here:
-        lines.insert(0, f"model: {written} in the store, {here} here")
-    if lines:
-        listed = "\n".join(f"  {line}" for line in lines)
+    recorded = {"model": attributes["model_version"], **attributes["software"]}
+    here = {"model": VERSION, **software()}
+    if recorded != here:
+        listed = "\n".join(
+            f"  {name}: {recorded.get(name, 'none')} in the store, {here.get(name, 'none')} here"
+            for name in here | recorded
+            if here.get(name) != recorded.get(name)
+        )
         raise StoreError(
             f"{path} was begun with other versions than {where} has:\n{listed}\n"
             "Its results could not be told apart from new ones. Install those versions to resume "

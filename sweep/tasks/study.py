@@ -146,11 +146,7 @@ class BlockGrid:
         """Position of a block among the blocks; IndexError where there is no such block."""
         if not 0 <= block < self.n_blocks:
             raise IndexError(f"block {block} of {self.n_blocks}")
-        position: list[int] = []
-        for count in reversed(self.along):
-            block, at = divmod(block, count)
-            position.append(at)
-        return tuple(reversed(position))
+        return tuple(map(int, np.unravel_index(block, self.along)))
 
     def number(self, position: tuple[int, ...]) -> int:
         """Return the number of the block at a position."""
@@ -417,11 +413,8 @@ class GrowingStudy(Study):
         return sum(share.points.size for share in shares) * self.find(block)[0].each
 
 
-class Evaluate(Protocol):
-    """Computes a block in place of the study itself, with the same results."""
-
-    def __call__(self, study: Any, block: int) -> Results:
-        """Results of one block by name."""
+Evaluate = Callable[[Any, int], Results]
+"""Computes a block of a study in its place, with the same results by name."""
 
 
 class Found(NamedTuple):

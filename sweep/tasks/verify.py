@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,13 +28,13 @@ from sweep.storage.locations import (
     names_below,
     put_whole,
 )
-from sweep.storage.logs import damaged_lines, digest, read_lines, read_sealed
+from sweep.storage.logs import digest, digest_of, read_lines, read_sealed
 from sweep.storage.opening import MANIFEST
 from sweep.tasks import journal, lock, store, studies
 from sweep.tasks.errors import StoreError, told
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.journal import RECIPE, read_recipe
-from sweep.tasks.progress import Late, Progress, chosen
+from sweep.tasks.progress import Progress, chosen
 from sweep.tasks.studies import AnyStudy
 from sweep.tasks.study import Study
 
@@ -89,7 +89,7 @@ def verify(
     StoreError where there is no store of this program's, or one of another study than `spec`;
     where it can't be repaired.
     """
-    path, shown = located(path).absolute(), Late(chosen(progress))
+    path, shown = located(path).absolute(), chosen(progress)
     settle(path)
     study = _study(path, spec if repair else None)
     stores: dict[Location, AnyStudy | None] = {path: study}
@@ -146,25 +146,12 @@ def _of_logs(path: Location) -> list[Damage]:
     """Damaged lines of the journal; the last of a log that is being written may be unfinished."""
     holder = lock.holder(path)
     alive = holder is not None and lock.is_live(path, holder)
-    found = []
-    for name in (*journal.LOGS, RECIPE):
-        file = path / JOURNAL / name
-        unfinished = _unfinished(file) if alive else 0
-        found += [
-            Damage(f"{JOURNAL}/{name} line {number}", "is damaged or cut short")
-            for number in damaged_lines(file)
-            if number != unfinished
-        ]
-    return found
-
-
-def _unfinished(log: Location) -> int:
-    """Return the number of a log's last line where it has no end, else 0."""
-    number = 0
-    for number, (line, _) in enumerate(read_sealed(log), start=1):
-        if not line.endswith(b"\n"):
-            return number
-    return 0
+    return [
+        Damage(f"{JOURNAL}/{name} line {number}", "is damaged or cut short")
+        for name in (*journal.LOGS, RECIPE)
+        for number, (line, record) in enumerate(read_sealed(path / JOURNAL / name), start=1)
+        if record is None and not (alive and not line.endswith(b"\n"))
+    ]
 
 
 def _surplus(path: Location, study: AnyStudy | None) -> Iterator[Damage]:
@@ -187,6 +174,7 @@ def _of_blocks(path: Location, study: Study, shown: Progress) -> Iterator[Damage
     """Damages of the blocks that were committed."""
     committed = journal.digests(path, study.n_blocks)
     blocks = np.flatnonzero(committed != b"")
+    shown = shown if len(blocks) > BATCH else Progress()  # what is over soon shows nothing
     shown.begin(points=len(blocks), done=0, unit="blocks")
     try:
         with ThreadPoolExecutor(THREADS) as pool:
@@ -208,23 +196,29 @@ def _of_block(path: Location, study: Study, block: int, known: bytes) -> list[Da
             return []
     except OSError:
         pass  # told below, object by object
-    found = [Damage(name, what, block) for name in objects if (what := _wrong_chunk(path / name))]
+    found = [
+        Damage(name, what, block) for name in objects if (what := _wrong(path / name, _of_chunk))
+    ]
     count = f"one of its {len(objects)} chunks"
     return found or [Damage(count, "is whole but not the one that was committed", block)]
 
 
-def _wrong_chunk(chunk: Location) -> str:
+def _of_chunk(content: bytes) -> str:
     """Damage of a chunk in words, by the checksum that Zarr's codec put at its end."""
-    try:
-        content = chunk.read_bytes()
-    except (FileNotFoundError, NotADirectoryError):
-        return "is missing"
-    except OSError as error:
-        return f"can't be read: {error.strerror}"
     if not content:
         return "is empty"
     checksum = google_crc32c.value(content[:-4]).to_bytes(4, "little")
     return "" if content[-4:] == checksum else "fails its checksum"
+
+
+def _wrong(place: Location, damage_of: Callable[[bytes], str]) -> str:
+    """Damage of an object in words, by what it holds; empty where there is none."""
+    try:
+        return damage_of(place.read_bytes())
+    except (FileNotFoundError, NotADirectoryError):
+        return "is missing"
+    except OSError as error:
+        return f"can't be read: {error.strerror}"
 
 
 def _mark(path: Location, damages: list[Damage]) -> str:
@@ -255,7 +249,7 @@ def _made_with(path: Location) -> dict[str, Any]:
     if listed := opening.listed_attributes(path):
         return opening.recognised(path, listed)
     found = opening.read_attributes(path)
-    if any(_wrong(path, o, known) for o, known in digests(path).items() if o == "zarr.json"):
+    if (known := digests(path).get("zarr.json")) and _altered(path, "zarr.json", known):
         raise StoreError(f"{path / 'zarr.json'} is damaged{opening.remedy(path)}")
     return found
 
@@ -281,17 +275,17 @@ def damages(path: Location) -> list[Damage]:
     return found + [
         Damage(name, what, mended_by="repair")
         for name, known in digests(path).items()
-        if (what := _wrong(path, name, known))
+        if (what := _altered(path, name, known))
     ]
 
 
-def _wrong(path: Location, name: str, known: str) -> str:
-    try:
-        return "" if digest(path, [name]) == known else "is not as it was made"
-    except (FileNotFoundError, NotADirectoryError):
-        return "is missing"
-    except OSError as error:
-        return f"can't be read: {error.strerror}"
+def _altered(path: Location, name: str, known: str) -> str:
+    """Damage of an object of the template, whose digest is known."""
+
+    def damage_of(content: bytes) -> str:
+        return "" if digest_of([(name, content)]) == known else "is not as it was made"
+
+    return _wrong(path / name, damage_of)
 
 
 def refuse_damaged(path: Location) -> None:
@@ -323,8 +317,8 @@ def restore(path: Location, study: Study) -> list[str]:
         aside = Path(directory) / path.name
         store.build(aside, study, written or store.new_attributes(study))
         _refuse_different(path, aside)
-        names = sorted(names_below(aside))
-        wrong = [name for name in names if not _same(path / name, aside / name)]
+        made = {name: digest(aside, [name]) for name in sorted(names_below(aside))}
+        wrong = [name for name, known in made.items() if _altered(path, name, known)]
         if not (written or "zarr.json" in digests(path)):
             _refuse_unproven(path, study, aside, wrong)
         for name in wrong:
@@ -335,7 +329,7 @@ def restore(path: Location, study: Study) -> list[str]:
 def _refuse_different(path: Location, aside: Path) -> None:
     """Refuse to put back what an undamaged line of the list says is not what was there."""
     for name, known in digests(path).items():
-        if _wrong(aside, name, known):
+        if _altered(aside, name, known):
             raise StoreError(
                 f"{name} of {path} can't be made again as it was on this machine, or from this "
                 "spec: put it back from a copy, or run the study anew into another store"
@@ -355,10 +349,3 @@ def _refuse_unproven(path: Location, study: Study, aside: Path, wrong: list[str]
             (aside / name).unlink()
         if written.digest.encode() != committed[block]:
             raise StoreError(f"{path} holds another study: its block {block} has other results")
-
-
-def _same(one: Location, other: Path) -> bool:
-    try:
-        return one.read_bytes() == other.read_bytes()
-    except OSError:
-        return False

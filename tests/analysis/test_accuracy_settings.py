@@ -226,53 +226,6 @@ def test_marks_stand_at_times_and_errors(dataset):
     assert {"1e-1", "19", "2^12"} <= words
 
 
-def test_marks_that_lie_together_have_one_name_whatever_lies_between_in_time(dataset):
-    """As 0.1, 0.01 and 0.001 do here, with 1e-4 as fast as these and less far off."""
-    found = settings.settings_in(dataset)
-    like = next(setting for setting in found if setting.kind == "adaptive")
-    four = [
-        replace(
-            like, name=f"auto at {t:g}", tolerance=t, rounds=1e-6 * np.array([us]),
-            pd_error=np.full(3, error), log10_pfa_error=0.0, leakage_error=0.0, magnitude_error=0.0,
-        )
-        for t, us, error in (
-            (0.1, 8.0, 8e-5), (0.01, 8.2, 8e-5), (1e-4, 8.7, 1e-5), (1e-3, 8.8, 8e-5),
-        )
-    ]  # fmt: skip
-    others = [setting for setting in found if setting.kind != "adaptive"]
-    (axes,) = settings.sheet(dataset, [*four, *others]).axes
-    words = [t.get_text() for t in axes.texts]
-    assert "1e-1 … 1e-3" in words and "1e-4" in words and "1e-3" not in words
-
-
-def test_names_keep_off_marks_and_each_other(dataset):
-    """A ladder of beamlets right below one of tolerances, as in a landing."""
-    found = settings.settings_in(dataset)
-    adaptive, beamlets = found[2], found[4]
-    crowd = [
-        replace(like, name=name, tolerance=tolerance, rounds=1e-6 * np.array([us]), likely=1.0,
-                pd_error=np.full(3, error), log10_pfa_error=0.0, magnitude_error=0.0)
-        for like, name, tolerance, us, error in (
-            (adaptive, "auto at 0.01", 1e-2, 10.0, 3e-3), (adaptive, "", 1e-3, 13.5, 5e-4),
-            (beamlets, "61 beamlets", np.nan, 10.5, 3.2e-3),
-            (beamlets, "109 beamlets", np.nan, 13.6, 7e-4),
-            (beamlets, "223 beamlets", np.nan, 22.0, 9e-4),
-        )
-    ]  # fmt: skip
-    sheet = settings.sheet(dataset, [*found, *crowd])
-    (axes,) = sheet.axes
-    names = [text.get_window_extent() for text in axes.texts]
-    assert len(names) >= 8
-    marks = [
-        axes.transData.transform((line.get_xdata()[0], line.get_ydata()[0]))
-        for line in axes.lines
-        if line.get_marker() in "os^DPXvp*" and len(line.get_xdata()) == 1
-    ]
-    for i, name in enumerate(names):
-        assert not name.count_overlaps(names[:i]), axes.texts[i].get_text()
-        assert not any(name.contains(*mark) for mark in marks), axes.texts[i].get_text()
-
-
 def test_a_store_of_another_kind_is_refused(tmp_path):
     with pytest.raises(NotAStoreError, match="there is no store"):
         settings.opened(tmp_path / "none.zarr")

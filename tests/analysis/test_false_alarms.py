@@ -21,24 +21,24 @@ def power(tmp_path_factory):
 @pytest.fixture(scope="module")
 def entries(power):
     found, spec, _ = power
-    return tables.entries(found, spec, by="power", printed=PRINTED)
+    return tables.false_alarms(found, spec, by="power", printed=PRINTED)
 
 
 def test_rows_are_the_settings_and_columns_the_three_cuts(entries):
-    assert [(e.row, e.column) for e in entries[:4]] == [
+    assert [(e["setting"], e["cut"]) for e in entries[:4]] == [
         ("power 1 W", "15 deg"),
         ("power 1 W", "85 deg"),
         ("power 1 W", "3500 m"),
         ("power 3 W", "15 deg"),
     ]
-    assert [e.printed for e in entries] == [figure for row in PRINTED for figure in row]
+    assert [e["printed"] for e in entries] == [figure for row in PRINTED for figure in row]
 
 
 def test_noise_alone_is_the_closed_form_and_knows_nothing_of_power(entries):
     for entry in entries:
-        assert entry.reference.bins == 2**17
-        assert entry.reference.model == pytest.approx(entry.reference.closed_form, rel=1e-9)
-    assert len({entry.reference.model for entry in entries}) == 1
+        assert entry["bins"] == 2**17
+        assert entry["noise_only"] == pytest.approx(entry["closed_form"], rel=1e-9)
+    assert len({entry["noise_only"] for entry in entries}) == 1
 
 
 def test_noise_alone_follows_the_setting_of_its_row():
@@ -65,21 +65,21 @@ def test_means_leave_out_ranges_up_to_5_m_and_count_no_point_twice(power, entrie
     pfa = at_1_w.pfa_both_chirps.values[chosen.values]
     where = at_1_w.range.values[chosen.values]
     # 3500 m at 15 deg lies on two cuts
-    assert where.size == 19 and entries[0].points == 18
+    assert where.size == 19 and entries[0]["points"] == 18
     _, first = np.unique(where, return_index=True)
-    assert entries[0].mean == pytest.approx(pfa[first].mean(), rel=1e-14)
+    assert entries[0]["study_mean"] == pytest.approx(pfa[first].mean(), rel=1e-14)
 
 
 def test_the_echos_own_shot_noise_grows_with_power_and_is_all_that_the_mean_has_over_noise(entries):
-    excesses = [e.excess(e.mean) for e in entries if e.column == "85 deg"]
+    excesses = [e["study_variance_excess"] for e in entries if e["cut"] == "85 deg"]
     assert 0 < excesses[0] < excesses[1] < excesses[2]
     # shot noise is proportional to the light collected
     assert excesses[2] / excesses[0] == pytest.approx(5.0, rel=1e-3)
 
 
 def test_the_printed_figures_imply_an_excess_between_a_tenth_and_one_percent(entries):
-    assert all(0.001 < entry.excess(entry.printed) < 0.01 for entry in entries)
-    assert entries[0].excess(4.45e-9) == pytest.approx(0.0029, abs=1e-4)
+    assert all(0.001 < entry["printed_variance_excess"] < 0.01 for entry in entries)
+    assert entries[0]["printed_variance_excess"] == pytest.approx(0.0029, abs=1e-4)
 
 
 def leaked(ranges, up, down):
@@ -95,20 +95,24 @@ def leaked(ranges, up, down):
 
 def test_leakage_is_told_by_mean_and_median():
     result = leaked([5.0, 20.0, 300.0, 4000.0], [0.0, 0.0, 0.06, 0.02], [0.0, 0.0, 0.03, 0.0])
-    assert result.up == pytest.approx((0.02, 0.01))
-    assert result.down == pytest.approx((0.0075, 0.0))
+    assert result["p_leakage_up_mean"] == pytest.approx(0.02)
+    assert result["p_leakage_up_median"] == pytest.approx(0.01)
+    assert result["p_leakage_down_mean"] == pytest.approx(0.0075)
+    assert result["p_leakage_down_median"] == 0.0
 
 
 def test_a_shot_counts_noise_or_leakage_in_each_of_both_segments():
     result = leaked([5.0, 20.0], [0.5, 0.0], [0.1, 0.0])
     up, down = 1 - 0.5 * (1 - 1e-4), 1 - 0.9 * (1 - 2e-4)
-    assert result.shot[0] == pytest.approx((up * down + 1e-4 * 2e-4) / 2, rel=1e-12)
+    assert result["shot_with_leakage_mean"] == pytest.approx(
+        (up * down + 1e-4 * 2e-4) / 2, rel=1e-12
+    )
 
 
 def test_points_not_computed_have_no_leakage_to_tell():
     nothing = [np.nan, np.nan]
     result = leaked([5.0, 20.0], nothing, nothing)
-    assert np.isnan([*result.up, *result.down, *result.shot]).all()
+    assert len(result) == 6 and np.isnan(list(result.values())).all()
 
 
 def test_a_grid_is_cut_where_the_thesis_cuts_it_and_left_whole_without_range_and_angle():
@@ -159,9 +163,12 @@ def test_other_axes_than_range_and_angle_make_rows_of_their_own(tmp_path):
         "target.range": {"log": ["10 m", "1 km"], "number": 3},
     }
     found = Points.of(open_store(stored(tmp_path, axes)))
-    result = tables.entries(found, study(axes), by="power")
-    assert [e.row for e in result][:2] == ["power 1 W, FFT size 2^16", "power 1 W, FFT size 2^17"]
-    assert [e.reference.bins for e in result] == [2**16, 2**17] * 2
+    result = tables.false_alarms(found, study(axes), by="power")
+    assert [e["setting"] for e in result][:2] == [
+        "power 1 W, FFT size 2^16",
+        "power 1 W, FFT size 2^17",
+    ]
+    assert [e["bins"] for e in result] == [2**16, 2**17] * 2
 
 
 def test_surfaces_of_the_same_study_agree_with_the_whole(tmp_path):

@@ -82,7 +82,7 @@ def test_a_figure_of_values_that_are_not_in_the_grid_says_so(tmp_path, monkeypat
     [
         (SURFACE, ["surface", "surface"]),
         ({"target.range": ["1 km", "2 km"], "instrument.laser.power": ["1 W"]}, ["slices"] * 2),
-        (POWERS, ["slices"] * 3),
+        (POWERS, ["slices"] * 2),
         ({"instrument.processing.window": ["hann", "hamming"]}, ["table"] * 2),
         ({}, []),
     ],

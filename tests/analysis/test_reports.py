@@ -119,6 +119,8 @@ def test_the_last_is_the_last_valid_shot_of_the_period():
         assert found["shots"][row] == len(there) and found["valid"][row] == bool(there)
         wanted = shots["range"][there[-1]] if there else np.nan
         assert np.array_equal(found["range"][row], wanted, equal_nan=True)
+        if not there:  # the middle of the period
+            assert found["time"][row] == pytest.approx(shots["time"][0] + (period + 0.5) * 50e-3)
 
 
 def test_a_report_needs_its_number_of_valid_shots():

@@ -169,3 +169,14 @@ def test_the_adc_sees_what_the_filter_leaves(table_4_1):
     beat = 50e6 - 1e9 / 500e-6 * 2 * 2000.0 / SPEED_OF_LIGHT
     plain, narrow = (beat_amplitude(prepared(p))[0] for p in (scene, scene | filtered(10e6, 3)))
     assert narrow / plain == pytest.approx(abs(butterworth([beat], 10e6, 3)[0]), rel=1e-5)
+
+
+def test_the_adc_sees_no_segment_that_the_waveform_lacks(table_4_1):
+    """A Doppler beat at DC would pass a filter whole that the chirps' 16 MHz do not."""
+    scene = table_4_1(**NATURE, radial_velocity=0.0) | {"target.range": 1200.0}
+    scene |= filtered(10e6, 3)
+    chirps = scene | {"instrument.chirp.segments": "up down"}
+    with_doppler, without = (beat_amplitude(prepared(p))[0] for p in (scene, chirps))
+    beat = 1e9 / 500e-6 * 2 * 1200.0 / SPEED_OF_LIGHT
+    passed = abs(butterworth([beat], 10e6, 3)[0] * poles(beat))
+    assert without / with_doppler == pytest.approx(passed, rel=1e-5)

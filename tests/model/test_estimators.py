@@ -48,6 +48,25 @@ def test_a_tone_without_noise_is_placed_within_the_estimators_bias(name, shape, 
     assert np.abs(found - BIN - delta).max() <= BIASES[name]
 
 
+@pytest.mark.parametrize("shift", [0, 1, 511])  # a peak in the last bin, the first, the middle
+@pytest.mark.parametrize("name", sorted(ESTIMATORS))
+def test_a_complex_spectrum_has_no_ends(name, shift):
+    """A record turned by whole bins has its spectrum rolled, and its tone so many bins on."""
+    size, rng = 1024, np.random.default_rng(8)
+    setting = Setting(
+        fft_size=size, sample_rate=600e6, window=window("hann", size), noise_power=1.0,
+        threshold=1.0, training=32, guard=8, rank=24, pfa=1e-4, complex_record=True,
+    )  # fmt: skip
+    noise = 0.1 * (rng.normal(size=size) + 1j * rng.normal(size=size))
+    record = np.exp(2j * np.pi * (size - 1 + 0.3) * np.arange(size) / size) + noise
+    spectrum = np.fft.fft(taper(setting.window) * record)[None]
+    (whole,) = ESTIMATORS[name](np.roll(spectrum, 512, 1), np.array([511]), setting)
+    (found,) = ESTIMATORS[name](
+        np.roll(spectrum, shift, 1), np.array([(shift - 1) % size]), setting
+    )
+    assert (found - shift) % size == pytest.approx((whole - 512) % size, abs=1e-6)
+
+
 def test_every_estimator_is_looked_at():
     assert set(BIASES) == set(ESTIMATORS)
 

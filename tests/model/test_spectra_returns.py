@@ -9,13 +9,20 @@ from sweep.model.clouds import cloud
 from sweep.model.estimators import DETECTOR, ESTIMATOR
 from sweep.model.geometry.mesh import Surface
 from sweep.model.noisy_spectra import Methods
-from sweep.model.pairing import FALSE_ALARM, TRUE, UNCONFIRMED
+from sweep.model.pairing import FALSE_ALARM, MISREAD, TRUE, UNCONFIRMED
 from sweep.model.sampling import simulate
+from sweep.model.shot import evaluate
+from sweep.model.waveform import PEAKS, STRONGEST
 
 EFFECTS = ("footprint", "doppler")
 RECORD = "instrument.receiver.record"
 HEIGHT, CLOSING = 412.0, 20.0
 NUMBER = 600
+TARGET = {
+    "target.range": np.array([HEIGHT]), "target.radial_velocity": CLOSING,
+    "target.grazing_angle": np.pi / 2, "target.reflectance": 0.1,
+    "target.reflectance_law": "lambert",
+}  # fmt: skip
 
 
 def _given(table_4_1, tnr=10.0, power=1.6e-3, **methods):
@@ -38,13 +45,8 @@ def _flown(parameters, *, first=1000, draws=NUMBER, bodies=None, x=0.0, **given)
 
 def _grid(parameters, methods=None):
     """A flat target of the same range, velocity and reflectance, with other draws."""
-    target = {
-        "target.range": np.array([HEIGHT]), "target.radial_velocity": CLOSING,
-        "target.grazing_angle": np.pi / 2, "target.reflectance": 0.1,
-        "target.reflectance_law": "lambert",
-    }  # fmt: skip
     return simulate(
-        parameters | target, EFFECTS, keys=keys(1), batch_sizes=[NUMBER], method="spectra",
+        parameters | TARGET, EFFECTS, keys=keys(1), batch_sizes=[NUMBER], method="spectra",
         **({} if methods is None else {"methods": methods}),
     )  # fmt: skip
 
@@ -93,6 +95,23 @@ def test_a_detector_detects_as_often_as_in_a_grid(table_4_1, way):
     assert np.isfinite(got["pd_shot"]).all() == (kind == "fixed")
     if kind == "fixed":
         assert got["pd_shot"][0] == pytest.approx(pd, abs=5 * np.sqrt(pd * (1 - pd) / NUMBER))
+
+
+@pytest.mark.parametrize("record", ["real", "complex"])
+def test_the_strongest_peak_is_as_often_wrong_as_the_closed_form_of_a_grid_says(table_4_1, record):
+    """A return of both right peaks may be misread for want of a Doppler peak."""
+    changes = {PEAKS: STRONGEST, RECORD: record}
+    parameters = _given(table_4_1, tnr=3.0, power=1e-2, **changes)
+    got = _flown(parameters, draws=4000)
+    grid = evaluate(parameters | TARGET, EFFECTS)
+    flags = got["flags"][0]
+    assert not flags[:, 1:].any()  # a shot has one return
+    right = ((flags[:, 0] & (TRUE | MISREAD)) > 0).mean()
+    pd, wrong = grid["pd_shot"][0], grid["p_wrong_range_shot"][0]
+    assert 0.2 < pd < 0.8 and wrong > 0.05
+    for found, told in ((right, pd), ((flags[:, 0] > 0).mean() - right, wrong)):
+        assert found == pytest.approx(told, abs=0.006 + 5 * np.sqrt(told * (1 - told) / 4000))
+    assert np.isnan(got["pd_shot"]).all()
 
 
 def test_functions_of_ones_own_see_every_draw_alone(table_4_1):

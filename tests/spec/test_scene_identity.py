@@ -2,6 +2,7 @@
 
 import copy
 import json
+import math
 import pickle
 import shutil
 
@@ -12,8 +13,9 @@ from written_scenes import BOULDERS, RELIEF, RICH, with_object, written
 
 from sweep.scenes.files import SceneError
 from sweep.spec import SceneSpec, difference, from_stored
+from sweep.spec.fields import SECTIONS
 from sweep.spec.grounds import OPTICAL
-from sweep.spec.identity import ROOTS, scene_units
+from sweep.spec.identity import ROOTS, field_rules
 from sweep.spec.parts import all_parts, fields_of, leaves, rule_of
 
 
@@ -299,6 +301,12 @@ def test_differences_are_told_with_units():
     assert difference(spec_of(RICH), there) == ["scene.objects.ground.size: 100 m -> 120 m"]
     there = changed("platform.lever_arm", ["1 m", "0 m", "2 m"])
     assert difference(spec_of(RICH), there) == ["platform.lever_arm: [1, 0, 0] m -> [1, 0, 2] m"]
+    there = changed("scanners.three.half_angle", "7.3 deg")
+    assert difference(spec_of(RICH), there) == ["scanners.three.half_angle: 20 deg -> 7.3 deg"]
+    pointed = {"scanners": {"two.beams": [[math.radians(22.5), 0.0], [0.0, 0.6, -0.8]]}}
+    assert difference({}, pointed) == [
+        "scanners.two.beams: (none) -> [[22.5, 0] deg, [0, 0.6, -0.8]]"
+    ]
     lines = difference(spec_of(RICH), spec_of(written()))
     assert "objects: ground, forest, rocks, ball, crate -> ground" in lines
     assert "scene.objects.ball.radius: 1 m -> (none)" in lines
@@ -306,11 +314,11 @@ def test_differences_are_told_with_units():
 
 
 def test_a_name_has_one_unit_wherever_it_stands():
-    for model in all_parts(*ROOTS):
+    for model in all_parts(*SECTIONS.values(), *ROOTS):
         for name, field in fields_of(model).items():
             rule = rule_of(field)
-            assert rule is None or scene_units()[name] == rule.units, name
-    assert scene_units()["half_angle"] == "rad" and len(all_parts(*ROOTS)) > 30
+            assert rule is None or field_rules()[name].units == rule.units, name
+    assert field_rules()["half_angle"].units == "rad" and len(all_parts(*ROOTS)) > 30
 
 
 def test_random_things_of_one_seed_share_no_numbers():

@@ -59,6 +59,7 @@ FIELDS = [
     ("scanners.s", {"kind": "corners", "angle": "1 deg", "rate": "10 s"}, "unit like Hz"),
     ("footprint.pattern", "line", "stands for a plane alone"),
     ("draws.batch", 3, "is no field; the fields here are number, method, returns"),
+    ("instrument.processing.peaks", "strongest", "set draws.method: spectra, or take all"),
     ("interface.rate", "none", "write e.g. '20 Hz'"),
     ("interface", {"min_range": "9 m", "max_range": "9 m"}, "write a lower min_range"),
     ("interface", {"valid_shots": 2}, "add e.g. 'rate: 20 Hz'"),

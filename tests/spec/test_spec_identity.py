@@ -6,7 +6,7 @@ import sys
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from written_specs import written
+from written_specs import content, written
 
 import sweep.spec.study
 from sweep.model.threshold import PFA_BIN, PFA_SEGMENT, PFA_SHOT, TNR, WAYS
@@ -242,6 +242,16 @@ def test_difference_tells_each_change_with_its_unit():
     assert difference(a, a.identity()) == []
 
 
+def test_differences_tell_angles_as_users_write_them():
+    angle, divergence = "target.grazing_angle", "instrument.laser.beam_divergence"
+    a = spec({angle: "7.3 deg", divergence: "50 urad"})
+    assert difference(a, spec({angle: "11.25 deg", divergence: "0.3 mrad"})) == [
+        f"{divergence}: 50 urad -> 300 urad", f"{angle}: 7.3 deg -> 11.25 deg",
+    ]  # fmt: skip
+    turned = spec({divergence: "50 urad"}, axes={angle: ["22.5 deg", "45 deg"]})
+    assert f"axes.grazing_angle.{angle}: (none) -> [22.5, 45] deg" in difference(a, turned)
+
+
 def test_an_axis_added_is_told():
     lines = difference(spec(), spec(axes={"target.range": ["1 m"]}))
     assert lines == ["target.range: 2000 m -> (none)", "axes: (none) -> range",
@@ -260,7 +270,9 @@ def test_a_stored_spec_comes_back_the_same():
     again = Spec.from_stored(text)
     assert again == original and hash(again) == hash(original)
     assert again.id == original.id
-    assert again.axes == original.axes
+    for one, other in zip(again.axes, original.axes, strict=True):
+        assert one.name == other.name
+        assert list(map(content, one.members)) == list(map(content, other.members))
     assert again.figures == original.figures
     assert again.parameters() == original.parameters()
     assert again.to_json() == text

@@ -3,6 +3,8 @@
 import copy
 from typing import Any
 
+import numpy as np
+
 BASE: dict[str, Any] = {
     "title": "A study",
     "instrument": {
@@ -38,3 +40,11 @@ def written(changes: dict[str, Any] | None = None, **sections: Any) -> dict[str,
         else:
             part[name] = value
     return mapping
+
+
+def content(member: Any) -> tuple[Any, ...]:
+    """All that a parameter along an axis holds."""
+    return (
+        member.path, member.name, member.units, np.asarray(member.values).tolist(),
+        member.display.tolist(),
+    )  # fmt: skip

@@ -7,7 +7,7 @@ import pytest
 import zarr
 
 from sweep.storage import locations
-from sweep.tasks.store import WRITTEN_WHOLE, codecs, encoded
+from sweep.tasks.store import CODECS, WRITTEN_WHOLE, encoded
 from sweep.tasks.study import ArrayLayout
 
 TYPES = ["float64", "float32", "int64", "uint8", "uint64", "int16", "bool"]
@@ -15,7 +15,7 @@ TYPES = ["float64", "float32", "int64", "uint8", "uint64", "int16", "bool"]
 
 def array_at(path, shape, chunk, dtype, fill):
     made = zarr.create_array(
-        path, shape=shape, chunks=chunk, dtype=dtype, fill_value=fill, **codecs()
+        path, shape=shape, chunks=chunk, dtype=dtype, fill_value=fill, compressors=CODECS
     )
     return made.with_config(WRITTEN_WHOLE)
 

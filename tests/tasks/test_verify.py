@@ -409,6 +409,5 @@ def test_what_takes_long_shows_how_far_it_is(undisturbed, monkeypatch):
     verify(undisturbed, progress=Watching())
     assert told == []
     monkeypatch.setattr("sweep.tasks.verify.BATCH", 5)
-    monkeypatch.setattr("sweep.tasks.progress.LATE", 0.0)
     verify(undisturbed, progress=Watching())
-    assert told == [(12, 5, "blocks"), 5, 2, "end"]
+    assert told == [(12, 0, "blocks"), 5, 5, 2, "end"]

@@ -10,6 +10,7 @@ import xarray as xr
 
 from sweep.spec import SceneSpec, Spec, from_stored
 from sweep.spec.fields import parameter_rules
+from sweep.spec.generators import in_units
 from sweep.spec.rules import Numeric
 from sweep.units import QuantityError, read_quantity
 
@@ -60,16 +61,10 @@ def shown(array: xr.DataArray, written: object) -> float | str:
         return float(written)
     if not isinstance(rule, Numeric):
         return str(written)
-    units = array.attrs.get("units", "")
     try:
-        number, unit = rule.exact(written)
-        display = rule.exact(f"1 {units}" if units else 1)[1]
+        return in_units(rule, written, array.attrs.get("units", ""))
     except QuantityError as error:
         raise ValueError(f"{array.name} {error}") from None
-    if unit.decibel or display.decibel:
-        ratio = unit.to_si(number)
-        return float(10 * np.log10(ratio)) if display.decibel else ratio / float(display.factor)
-    return float((unit.factor * number + unit.offset - display.offset) / display.factor)
 
 
 def si(array: xr.DataArray) -> xr.DataArray:

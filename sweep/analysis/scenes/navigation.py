@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -27,9 +26,8 @@ STRETCH = 65_536
 class Tally:
     """Errors of a vector of m components, by bin of altitude; parts add up to the whole.
 
-    Solutions asked for, and those that there were (bins,); their mean error (bins, m), sums of
-    products of deviations from it (bins, m, m), and mean of the covariances that they came
-    with.
+    Solutions asked for, and those that there were (bins,); their mean error, the sum of squares of
+    deviations from it, and the mean of the variances that they came with (bins, m).
     """
 
     attempts: np.ndarray
@@ -43,13 +41,13 @@ class Tally:
         count = self.count + other.count
         share = (other.count / np.maximum(count, 1))[..., None]
         apart = other.mean - self.mean
-        between = (self.count[..., None] * share * apart)[..., None] * apart[..., None, :]
+        between = self.count[..., None] * share * apart * apart
         return Tally(
             self.attempts + other.attempts,
             count,
             self.mean + share * apart,
             self.deviation + other.deviation + between,
-            self.predicted + share[..., None] * (other.predicted - self.predicted),
+            self.predicted + share * (other.predicted - self.predicted),
         )
 
     @property
@@ -65,18 +63,17 @@ class Tally:
     @property
     def rmse(self) -> np.ndarray:
         """Root mean square error of each component (..., m), bias included; nan without any."""
-        square = np.diagonal(self.deviation, axis1=-2, axis2=-1)
-        return np.sqrt(_over(square, self.count[..., None]) + self.mean**2)
+        return np.sqrt(_over(self.deviation, self.count[..., None]) + self.mean**2)
 
     @property
-    def covariance(self) -> np.ndarray:
-        """Unbiased covariance of the errors (..., m, m); nan with fewer than two solutions."""
-        return _over(self.deviation, self.count[..., None, None] - 1)
+    def variance(self) -> np.ndarray:
+        """Unbiased variance of the errors (..., m); nan with fewer than two solutions."""
+        return _over(self.deviation, self.count[..., None] - 1)
 
     @property
-    def predicted_covariance(self) -> np.ndarray:
-        """Mean covariance that the solutions stated (..., m, m); nan without any."""
-        return np.where(self.count[..., None, None] > 0, self.predicted, np.nan)
+    def stated(self) -> np.ndarray:
+        """Mean variance that the solutions stated (..., m); nan without any."""
+        return np.where(self.count[..., None] > 0, self.predicted, np.nan)
 
 
 @dataclass(frozen=True)
@@ -101,8 +98,7 @@ class Curve:
     @property
     def bias_error(self) -> np.ndarray:
         """Standard error of the bias (bins, m); nan with fewer than two solutions."""
-        variance = np.diagonal(self.tally.covariance, axis1=-2, axis2=-1)
-        return np.sqrt(variance / np.maximum(self.tally.count, 1)[:, None])
+        return np.sqrt(self.tally.variance / np.maximum(self.tally.count, 1)[:, None])
 
     @property
     def rmse(self) -> np.ndarray:
@@ -112,8 +108,7 @@ class Curve:
     @property
     def predicted(self) -> np.ndarray:
         """Standard deviation that solutions state of themselves, as `rmse`: root of the mean."""
-        variance = np.diagonal(self.tally.predicted_covariance, axis1=-2, axis2=-1)
-        return _with_length(np.sqrt(variance))
+        return _with_length(np.sqrt(self.tally.stated))
 
 
 def _with_length(parts: np.ndarray) -> np.ndarray:
@@ -163,43 +158,44 @@ def _tallies(dataset: xr.Dataset, quantity: str, edges: np.ndarray) -> Iterator[
     cycles = stretches(status, "cycle", max(1, STRETCH // draws_a_chunk))
     for cycle, draw in product(cycles, draws):
         part = dataset.isel(cycle=cycle, draw=draw)
-        solved, error, covariance = _errors(part, quantity)
+        solved, error, variance = _errors(part, quantity)
         altitude = np.broadcast_to(np.asarray(part["true_altitude"].values)[:, None], solved.shape)
         computed = np.asarray(part[f"{quantity}_status"].values).ravel() >= SOLVED
         cell = np.digitize(np.nan_to_num(altitude.ravel(), nan=-np.inf), edges) - 1
         cell = np.where(computed, cell, -1)
-        yield tally(error, covariance, solved.ravel(), cell, edges.size - 1)
+        yield tally(error, variance, solved.ravel(), cell, edges.size - 1)
 
 
 def _errors(part: xr.Dataset, quantity: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mask of solutions (cycles, draws), their errors (n, m) and covariances (n, m, m)."""
+    """Mask of solutions (cycles, draws), their errors and variances (n, m)."""
     status = np.asarray(part[f"{quantity}_status"].values)
     solved = (status >= SOLVED) & (status <= EXCLUDED)
     found, true = (np.asarray(part[n].values) for n in (quantity, f"true_{quantity}"))
     error = found - true[:, None]
-    stated = "velocity_covariance" if quantity == VELOCITY else "altitude_variance"
-    size = 3 if quantity == VELOCITY else 1
-    return solved, error.reshape(-1, size), np.asarray(part[stated].values).reshape(-1, size, size)
+    if quantity == ALTITUDE:
+        return solved, error.reshape(-1, 1), np.asarray(part["altitude_variance"]).reshape(-1, 1)
+    variance = np.diagonal(np.asarray(part["velocity_covariance"]), axis1=-2, axis2=-1)
+    return solved, error.reshape(-1, 3), variance.reshape(-1, 3)
 
 
 def tally(
-    error: np.ndarray, covariance: np.ndarray, available: np.ndarray, cell: np.ndarray, cells: int
+    error: np.ndarray, variance: np.ndarray, available: np.ndarray, cell: np.ndarray, cells: int
 ) -> Tally:
     """Tally of n solutions by cell, in two passes for the digits' sake.
 
-    Of each its error (n, m), the covariance that it states (n, m, m), and its cell.
+    Of each its error and the variance that it states (n, m), and its cell.
     """
     inside = (cell >= 0) & (cell < cells)
     attempts = np.bincount(cell[inside], minlength=cells)
     held = inside & available
-    error, covariance, cell = error[held], covariance[held], cell[held]
+    error, variance, cell = error[held], variance[held], cell[held]
     count = np.bincount(cell, minlength=cells)
-    some = np.maximum(count, 1)
-    mean = _add_up(error, cell, cells) / some[:, None]
+    some = np.maximum(count, 1)[:, None]
+    mean = _add_up(error, cell, cells) / some
     apart = error - mean[cell]
-    rest = _add_up(apart, cell, cells) / some[:, None]  # what rounding left in the mean
-    deviation = _add_up(apart[:, :, None] * apart[:, None, :], cell, cells)
-    predicted = _add_up(covariance, cell, cells) / some[:, None, None]
+    rest = _add_up(apart, cell, cells) / some  # what rounding left in the mean
+    deviation = _add_up(apart * apart, cell, cells)
+    predicted = _add_up(variance, cell, cells) / some
     return Tally(attempts, count, mean + rest, deviation, predicted)
 
 
@@ -215,10 +211,8 @@ def merge(tallies: Sequence[Tally]) -> Tally:
 
 
 def _add_up(values: np.ndarray, cell: np.ndarray, size: int) -> np.ndarray:
-    """Return sums of values (n, ...) by cell (size, ...), each in the order of the rows."""
-    columns = values.reshape(len(values), math.prod(values.shape[1:])).T
-    sums = [np.bincount(cell, weights=column, minlength=size) for column in columns]
-    return np.stack(sums, axis=-1).reshape(size, *values.shape[1:])
+    """Return sums of values (n, m) by cell (size, m), each in the order of the rows."""
+    return np.stack([np.bincount(cell, column, size) for column in values.T], axis=-1)
 
 
 def _over(total: np.ndarray, number: np.ndarray) -> np.ndarray:

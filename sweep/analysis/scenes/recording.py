@@ -347,21 +347,11 @@ def place(spec: SceneSpec, where: Mapping[str, object]) -> Place:
         several = list(written) if isinstance(written, tuple | list) else [written]
         try:
             axis, found = _fitting(spec, name, several)
+            fits[axis] &= found
+            if not fits[axis].any():
+                raise QuantityError("is no value of this study", _values(spec, name))
         except QuantityError as error:
             mistakes.append(Mistake(f"where.{name}", error.rule, f"{written}", error.suggestion))
-            continue
-        except KeyError:
-            known = [member.name for axis in spec.axes for member in axis.members]
-            otherwise = f"the coordinates are {', '.join(known)}" if known else "it has no axes"
-            remedy = near_miss(name, known, otherwise=otherwise)
-            mistakes.append(
-                Mistake(f"where.{name}", "is no coordinate of this study", f"{written}", remedy)
-            )
-            continue
-        fits[axis] &= found
-        if not fits[axis].any():
-            rule, remedy = "is no value of this study", _values(spec, name)
-            mistakes.append(Mistake(f"where.{name}", rule, f"{written}", remedy))
     if mistakes:
         raise SpecError(mistakes)
     index = {name: int(np.argmax(found)) for name, found in fits.items()}
@@ -383,7 +373,11 @@ def _fitting(spec: SceneSpec, name: str, several: list[object]) -> tuple[str, np
             return axis.name, is_any(np.asarray(spec.member(name).display), wanted)
         if name == axis.name:
             return axis.name, np.isin(np.arange(axis.size), [int(str(v)) for v in several])
-    raise KeyError(name)
+    known = [member.name for axis in spec.axes for member in axis.members]
+    otherwise = f"the coordinates are {', '.join(known)}" if known else "it has no axes"
+    raise QuantityError(
+        "is no coordinate of this study", near_miss(name, known, otherwise=otherwise)
+    )
 
 
 def _values(spec: SceneSpec, name: str) -> str:

@@ -306,8 +306,7 @@ def scatter_back(shots: Shots, scene: Scene) -> Shots:
     """Shot noise of the light that the air sends back.
 
     Its beat with the local oscillator, from ever new grains, is spread over the bins from the
-    nearest range to the target's and is left out; [T 3.3.1] counts backscatter among the noise
-    likewise.
+    nearest range to the target's and is left out; [T 3.3.1] counts it among the noise too.
     """
     p = scene.parameters
     air = profile_of(p)

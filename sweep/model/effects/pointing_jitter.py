@@ -1,8 +1,7 @@
 """Pointing jitter over a plane: a random turn of the beam, draw by draw.
 
 The beam is thrown off by two independent normal angles of deviation sigma, a in the plane of
-incidence (towards grazing) and b across it. From the same height over the same plane it then
-meets
+incidence (towards grazing) and b across it. From the same height over the same plane it then meets
 
     sin(grazing') = sin(grazing) cos(t) - a cos(grazing) sin(t)/t,     t^2 = a^2 + b^2
     range' = range sin(grazing) / sin(grazing'),

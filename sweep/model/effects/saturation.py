@@ -137,14 +137,16 @@ def act(shots: Shots, scene: Scene) -> Shots:
 def beat_amplitude(shots: Shots) -> np.ndarray:
     """Amplitude at the ADC [V] of a sine with the power of all lines, (n,).
 
-    In the segment that passes the receiver best: at its lowest frequency.
+    In the segment that passes the receiver best, of those that there are: at its lowest frequency.
     """
     shape = {
         "chirp_rate": shots.chirp_rate, "range": shots.range,
         "radial_velocity": np.asarray(shots.beta * SPEED_OF_LIGHT / 2),
     }  # fmt: skip
-    chirps = zip(shots.slopes, shots.carriers, strict=True)
-    beats = [waveform.beat_frequency(sign, carrier=carrier, **shape) for sign, carrier in chirps]
+    beats = [
+        waveform.beat_frequency(shots.slopes[s], carrier=shots.carriers[s], **shape)
+        for s in np.flatnonzero(shots.segments)
+    ]
     lowest = np.min(np.abs(beats), axis=0)
     gain = link.transfer(
         lowest, transimpedance=np.ones(1),

@@ -12,9 +12,8 @@ for any strength.
 The beam goes there and back. On the way out a plane wave twinkles on the target, averaged over the
 footprint. On the way back a spherical wave twinkles in the receiver's aperture. The two are
 independent. Their product multiplies the power of the whole echo, so its root the amplitudes, alike
-in all segments of a shot (milliseconds). Three things are left out: that both pass the same eddies
-(a small rough target next to the axis shows this as enhanced backscatter), the spreading of the
-beam, and the loss of mixing.
+in all segments of a shot (milliseconds). Eddies that both pass (enhanced backscatter of small rough
+targets near the axis), the spreading of the beam and the loss of mixing are left out.
 """
 
 import math

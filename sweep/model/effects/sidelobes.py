@@ -72,8 +72,7 @@ def _beside(points: Points) -> np.ndarray:
     """Change of leakage by images that add as powers: of a bin at the threshold, or of all bins.
 
     These cross with probabilities of y e^-y a^2 / 2 where a is small, y = b^2 / 2. Images fall no
-    slower than 1 / k from ``apart`` on, so that all bins have ``apart`` times the a^2 of the
-    nearest.
+    slower than 1 / k from ``apart`` on, so all bins have ``apart`` times the nearest's a^2.
     """
     image = points.level * points.footprint.gain * points.lobe.tail(points.apart)
     square, b = np.minimum(image, _HUGE) ** 2, points.threshold

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -11,10 +10,9 @@ from typing import Any
 from sweep.model.effects.catalogue import EFFECTS, NAMES
 from sweep.model.effects.segment_motion import SEGMENT_MOTION
 from sweep.model.ground import powers_add
-from sweep.spec import SceneSpec, Spec
+from sweep.spec import SceneSpec
 from sweep.spec.parts import OFF
-
-Declared = Spec | SceneSpec
+from sweep.tasks.studies import Declared, changed
 
 WRITTEN, ADAPTIVE, ALL_ON, FIXED, BEAMLETS, IN_A_LINE = (
     "as written", "adaptive", "all on", "fixed effects", "beamlets", "in a line"
@@ -100,16 +98,7 @@ class Rung:
 
     def of(self, spec: Declared) -> Declared:
         """Return the spec with the overrides put onto it; SpecError where it is no study then."""
-        if not self.overrides:
-            return spec
-        written = copy.deepcopy(spec.to_yaml_mapping())
-        for path, value in self.overrides.items():
-            *sections, name = path.split(".")
-            place = written
-            for section in sections:
-                place = place.setdefault(section, {})
-            place[name] = value
-        return type(spec).from_mapping(written, base=getattr(spec, "base", "."))
+        return changed(spec, self.overrides) if self.overrides else spec
 
 
 @dataclass(frozen=True)

@@ -105,8 +105,7 @@ def gale():
 def closed():
     """A bumpy sphere: vertices, faces and caster."""
     vertices, faces = bumpy_sphere(4)
-    mesh, report = clean(vertices, faces, 0)
-    assert not (report.open_edges or report.crowded_edges)
+    mesh, _ = clean(vertices, faces, 0)
     return vertices, faces, Caster(mesh)
 
 
