@@ -1,7 +1,7 @@
 """The physics of FMCW Doppler lidar: arrays in, arrays out; SI and radians throughout.
 
-Compiled code takes no liberties with the order of sums (no reassociation, no contraction). How
-often a function is optimised depends on what was compiled before and what came from a cache; with
+Compiled code takes no liberties with the order of sums (no reassociation, no contraction). The
+number of optimisation passes depends on what was compiled before and what came from a cache; with
 liberties, so would its last bits. They would buy 5 % of speed.
 """
 

@@ -1,7 +1,7 @@
 """Every knob of accuracy: what it does, its default, and what turning it costs.
 
-The first six are a study's (``accuracy`` and ``draws.interval`` in a spec); the rest share the
-tolerance out among what may err, or bound what it may call for, and are the same for every study.
+The first six are a study's (``accuracy`` and ``draws.interval`` in a spec); the others divide the
+tolerance among the sources of error, or limit the work. They are the same for every study.
 
     tolerance ─┬─ 0.80 or 0.55   effects that are left out (0.55 where beamlets are counted by it)
                ├─ 0.25           number of beamlets
@@ -11,18 +11,18 @@ tolerance out among what may err, or bound what it may call for, and are the sam
 Try ``tolerance`` first: everything else follows from it.
 
 Below are intervals of a probability that draws estimate, as counts or as means of conditional
-probabilities. What is promised is how far the estimate may be off: :func:`half_width` is the
+probabilities. The promise bounds the error of the estimate: :func:`half_width` is the
 distance from it to the farther end of its interval. Near 0 and 1, where intervals lie to one side
 of the estimate, that is up to twice half their length.
 
 Of counts: Wilson's score interval [J. Am. Stat. Assoc. 22, 209, 1927], right on the average over
 probabilities, and Clopper and Pearson's [Biometrika 26, 404, 1934], at least right at every one.
 
-Of a mean m of n values within 0..1 with the variance s^2 of their own: nothing limits from below
-what rare values might add that no draw has shown yet, and s^2 = 0 after n equal values proves
-nothing. But a mean that lies d above m by rare values between m and 1 has a variance that is larger
-as well, by at most (1 - m) d; one that lies d below, by values down to 0, by at most m d. The
-interval holds all means that such a variance makes likely, as the score interval does:
+Of a mean m of n values within 0..1 with the variance s^2 of their own, rare values that no draw has
+shown may add any amount; s^2 = 0 after n equal values proves nothing. But a mean that lies d above
+m by rare values between m and 1 has a variance that is larger too, by at most (1 - m) d. One that
+lies d below, by values down to 0, by at most m d. The interval holds all means that such a variance
+makes likely, as the score interval does:
 
     n d^2 = z^2 (s^2 + q d),    q = 1 - m above, m below,
     d = (q z^2 / 2 + sqrt(n s^2 z^2 + q^2 z^4 / 4)) / n.
@@ -50,7 +50,7 @@ class Accuracy:
 
     tolerance: ArrayLike = 1e-3
     """Largest error of a probability of detection, of log10 of one of false alarm, or of a relative
-    magnitude. Where a point is drawn until it is known, the half-width of its interval. 0 leaves
+    magnitude. If a point is drawn until it is known, the half-width of its interval. 0 leaves
     nothing out. A tenth of it rarely doubles the time of a point; where draws decide, it takes a
     hundred times as many."""
 
@@ -63,7 +63,7 @@ class Accuracy:
     `lines_share` of the tolerance. A smaller one takes more lines a segment, slowly."""
 
     leakage_error: ArrayLike = AUTOMATIC
-    """Chance of leakage, of all bins far from the lines, that is not looked for. By default
+    """Probability of leakage, of all bins far from the lines, that is not looked for. By default
     `leakage_share` of the tolerance. A smaller one looks at more bins."""
 
     leakage_floor: ArrayLike = AUTOMATIC
@@ -140,7 +140,7 @@ class Accuracy:
 
     @property
     def for_leakage(self) -> np.ndarray:
-        """Chance of leakage that need not be looked for."""
+        """Probability of leakage that need not be looked for."""
         return self._or_share(self.leakage_error, self.leakage_share)
 
     @property

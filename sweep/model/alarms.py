@@ -1,19 +1,20 @@
 """Noise of a segment's bins: how alike neighbours are, and how often any of many crosses.
 
-The bins' noise is the transform of white noise times the window w, so that bins y apart (in bins
-of fs/L) are correlated as W2(y) / W2(0), W2 the transform of w^2. Of n adjacent bins the alarms are
-taken as a Markov chain of first order. With p the chance that a bin crosses a threshold of b sigma,
+The bins' noise is the transform of white noise times the window w, so that bins y apart (in bins of
+fs/L) are correlated as W2(y) / W2(0), W2 the transform of w^2. Of n adjacent bins the alarms are
+taken as a Markov chain of first order. With p the probability that a bin crosses a threshold of b
+sigma,
 
     P(none) = (1 - p) (1 - h)^(n - 1),    h = (p - p11) / (1 - p),
 
-h the chance that a bin crosses after one that does not. p11, that both do, is the joint tail of two
-Rayleigh magnitudes [Simon and Alouini, Digital Communication over Fading Channels, 6.1.2]; with
-rho^2 = |W2/W2(0)|^2 of neighbours
+h the probability that a bin crosses after one that does not. p11, that both do, is the joint tail
+of two Rayleigh magnitudes [Simon and Alouini, Digital Communication over Fading Channels, 6.1.2].
+With rho^2 = |W2/W2(0)|^2 of neighbours
 
     p - p11 = p (Q_1(s b, s rho b) - Q_1(s rho b, s b)),    s^2 = 1 / (1 - rho^2).
 
-A real record's noise is real at DC and Nyquist and nearly so beside them, where it alarms far more
-often (7,550 times in bin 0 at TNR 10): bins whose noise is not circular are not searched for them.
+A real record's noise is real at DC and Nyquist and nearly so next to them, where it alarms far more
+often (7,550 times in bin 0 at TNR 10). Bins whose noise is not circular are not searched for them.
 
 So n bins alarm as 1 + (n - 1) ln(1 - h) / ln(1 - p) independent ones do: everything that is known
 of independent bins serves, in logarithms too. At TNR 6 it is within 2 % of drawn noise for
@@ -107,7 +108,7 @@ def _share(level: np.ndarray, correlation: float, looks: Looks) -> np.ndarray:
 
 @lru_cache(maxsize=64)
 def pair_nodes(correlation: float) -> np.ndarray:
-    """Rule for the joint chance of two normal numbers (:func:`sweep.model.detection.any_pair`).
+    """Rule for the joint tail of two normal numbers (:func:`sweep.model.detection.any_pair`).
 
     Twelve Gauss points u in 0 .. asin(correlation): sin u, weights, 1 / (2 cos^2 u), (3, 12); or
     none, (3, 0), for independent numbers.
@@ -129,7 +130,7 @@ def noise_filter(window: Window, fft_size: int, bins: int) -> tuple[np.ndarray, 
     """Weights that make the noise of adjacent bins of independent numbers, one each fs/L.
 
     The noise of a bin at y [bins of fs/L] is sum_j W(y - j) z_j, as the transform of a record is
-    that of its own bins; in phase with the middle of a line's main lobe W is real.
+    that of its own bins. In phase with the middle of a line's main lobe W is real.
 
     Returns
     -------

@@ -181,7 +181,7 @@ def is_thesis(p: Parameters) -> bool:
 def dimming(p: Parameters, range: ArrayLike | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Coefficients (b, c) of 1 + b x + c x^2, by which a place at R (1 + x) has less than one at R.
 
-    What the aperture collects falls by (1 + x)^2; of one mode, w_T^2 + w_L^2 says how far.
+    The light in the aperture falls by (1 + x)^2; of one mode, w_T^2 + w_L^2 says how far.
     """
     if not is_single_mode(p):
         return np.asarray(2.0), np.asarray(1.0)
@@ -253,7 +253,7 @@ _NEAREST = 60.0
 def truncation(fill: ArrayLike, defocus: ArrayLike = 0.0) -> np.ndarray:
     """Echo of a beam that its aperture cuts off, sent and received, over that of the whole beam.
 
-    What is cut off is lost, and what is left spreads: far away, or in focus, 0.63 of the echo is
+    The light cut off is lost, and the rest spreads. Far away, or in focus, 0.63 of the echo is
     left at w_a = 0.8 a, which makes 0.40 A / R^2, the most that any Gaussian beam has (Rye and
     Frehlich, Appl. Opt. 31, 1992, 2891). Near the telescope the beam's middle is as it was. Beams
     of unequal radii take the geometric mean of two. `fill` is w_a / a, 1/e^2 radius over the

@@ -30,7 +30,7 @@ _EXPONENTIAL = tuple((-1) ** n / math.factorial(n) for n in range(12))
 
 @njit(cache=True, error_model="numpy")
 def crossing_series(beta, series):
-    """c_n y^n / n! over the chance that noise alone stays below ``beta``, into ``series``.
+    """c_n y^n / n! over the probability that noise alone stays below ``beta``, into ``series``.
 
     As many as any amplitude below the threshold asks for; none above :data:`LARGEST_SERIES`.
     """
@@ -55,7 +55,7 @@ def _terms(x, y):
 
 @njit(cache=True, error_model="numpy")
 def added_crossings(x, count, beta, series, out):
-    """Chances (Q_1 - e^-y) / (1 - e^-y) of ``count`` bins, 0..1, into ``out``, (>= count + 7,).
+    """Probabilities (Q_1 - e^-y) / (1 - e^-y) of bins, 0..1, into ``out``, (>= count + 7,).
 
     ``x`` is a^2/2 of each bin, below y; used up, and so are up to seven elements more. ``beta``:
     threshold over the noise per quadrature; ``series``: :func:`crossing_series` of it.
@@ -117,7 +117,7 @@ def _polynomial(x, inverse, series, terms, scale, halvings, out):
 
 @njit(cache=True, error_model="numpy")
 def any_crossing(chances, first, last):
-    """1 - prod(1 - chance) over chances first .. last - 1, with all its digits."""
+    """1 - prod(1 - probability) over probabilities first .. last - 1, with all its digits."""
     a, b, c, d = 0.0, 0.0, 0.0, 0.0
     i = first
     while i + 3 < last:  # four at a time, as each waits for the one before
@@ -137,7 +137,7 @@ def any_crossing(chances, first, last):
 
 @njit(cache=True, error_model="numpy")
 def silence(chance):
-    """-ln(1 - chance): what adds up over bins."""
+    """-ln(1 - probability): what adds up over bins."""
     if chance < 1e-4:
         return chance * (1.0 + chance * (0.5 + chance * (1.0 / 3.0 + 0.25 * chance)))
     return -math.log1p(-chance)
@@ -145,7 +145,7 @@ def silence(chance):
 
 @njit(cache=True, error_model="numpy")
 def weighted_silence(chances, weights):
-    """Sum of the weighted -ln(1 - chance)."""
+    """Sum of the weighted -ln(1 - probability)."""
     a, b, c, d = 0.0, 0.0, 0.0, 0.0
     i = 0
     while i + 3 < chances.size:  # four at a time, as each sum waits for the one before

@@ -22,7 +22,7 @@ def threshold(*, tnr: np.ndarray, bin_deviation: np.ndarray) -> np.ndarray:
 
 
 def quiet_below(*, chance: np.ndarray, level: np.ndarray, bins: int) -> np.ndarray:
-    """Signal [sigma] below which bins may count as noise alone, at the price of a chance, (n,).
+    """Signal [sigma] below which bins may count as noise alone, (n,).
 
     With x = a^2/2 and y = b^2/2 a bin of a sigma leaks with no more than
 
@@ -59,7 +59,8 @@ class Fading(NamedTuple):
         """Numbers by which three standard normal amplitudes mix, (6, n).
 
         Segment by segment z_0, m z_0 + sqrt(1 - m^2) z_1 and o z_0 + c z_1 + d z_2, with phases
-        turned away where they do not matter: m, its complement, o, the two parts of c, and d.
+        turned away where they do not matter. Result: m, its complement, o, the two parts of c, and
+        d.
         """
         near, far, last = (np.minimum(np.abs(one), 1.0) for one in self)
         turned = last * np.exp(1j * np.angle(self.next * self.last * np.conj(self.over)))
@@ -73,7 +74,7 @@ class Fading(NamedTuple):
 def fading_together(
     one: np.ndarray, other: np.ndarray, level: np.ndarray, alike: np.ndarray
 ) -> np.ndarray:
-    """Chance that two segments in developed speckle are both detected.
+    """Probability that two segments in developed speckle are both detected.
 
     Two correlated Rayleigh magnitudes [Schwartz, Bennett and Stein, Communication Systems and
     Techniques, 1966, appendix A]. With A, B = Th^2 over the mean powers and r the square of the
@@ -87,7 +88,7 @@ def fading_together(
     Parameters
     ----------
     one, other : ndarray
-        Chances e^-A and e^-B that either is detected, 0..1.
+        Probabilities e^-A and e^-B that either is detected, 0..1.
     level : ndarray
         Threshold over the noise per quadrature.
     alike : ndarray
@@ -110,12 +111,12 @@ def fading_together(
 
 
 def any_two(chances: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Chance that at least two of three independent events happen.
+    """Probability that at least two of three independent events happen.
 
     Parameters
     ----------
     chances, others : (3, ...) ndarray
-        Chances of each, and of its contrary.
+        Probabilities of each, and of its contrary.
 
     Examples
     --------
@@ -130,10 +131,10 @@ def any_two(chances: np.ndarray, others: np.ndarray) -> np.ndarray:
 def mark(magnitude, count, level, exempt, beside):
     """Find the detection in a run of bins, and mark the bins that can't raise a false alarm.
 
-    Adjacent bins at or above the threshold form a group; its largest bin is the detection. The
-    bins of a group and the two beside it can't raise a false alarm, nor can the strongest bin
-    and its neighbours, group or not. Where any bin of the echo detects, bins within a main lobe of
-    one that has half of the largest magnitude can't either.
+    Adjacent bins at or above the threshold form a group; its largest bin is the detection. The bins
+    of a group and the two next to it can't raise a false alarm, nor can the strongest bin and its
+    neighbours, group or not. If any bin of the echo detects, bins within a main lobe of one that
+    has half of the largest magnitude can't either.
 
     Parameters
     ----------
@@ -184,9 +185,9 @@ def is_end(bin_, ends):
 
 @njit(cache=True, error_model="numpy")
 def crossing_pair(a, b, real):
-    """Chances that a bin of signal a [sigma] reaches a threshold b, and that it does not.
+    """Probabilities that a bin of signal a [sigma] reaches a threshold b, and that it does not.
 
-    Q_1(a, b) and its complement. Where the noise is real it has the power of both quadratures in
+    Q_1(a, b) and its complement. If the noise is real it has the power of both quadratures in
     one, a variance of 2 sigma^2: |a + n| >= b.
     """
     if not real:
@@ -199,7 +200,7 @@ def crossing_pair(a, b, real):
 
 @njit(cache=True, error_model="numpy")
 def found_pair(magnitude, echo, peak, low, rule, levels):
-    """Chances that an echo is detected, and that it is missed.
+    """Probabilities that an echo is detected, and that it is missed.
 
     By any of its bins (:func:`any_pair`), or by the peak of a run alone where half of a main lobe
     is 0. ``rule`` is :attr:`sweep.model.preparation.Shots.echo_rule`; ``levels`` are the noise per
@@ -219,11 +220,11 @@ def found_pair(magnitude, echo, peak, low, rule, levels):
 
 @njit(cache=True, error_model="numpy")
 def any_pair(magnitude, echo, low, ends, deviation, level, pairs):
-    """Chances that any bin of an echo reaches the threshold, and that none does.
+    """Probabilities that any bin of an echo reaches the threshold, and that none does.
 
     Each bin by itself crosses with :func:`crossing_pair`. Neighbours' noise is correlated, and in
-    phase with a signal that is in step from bin to bin, as in a line's main lobe: of each pair
-    the joint chance is that of normal numbers with the bins' own chances, which add
+    phase with a signal that is in step from bin to bin, as in a line's main lobe. Of each pair the
+    joint probability is that of normal numbers with the bins' own probabilities, which add
 
         1 / (2 pi) int_0^{asin rho} exp(-(s^2 + t^2 - 2 s t sin u) / (2 cos^2 u)) du
 
@@ -266,13 +267,13 @@ def any_pair(magnitude, echo, low, ends, deviation, level, pairs):
 
 @njit(cache=True, error_model="numpy")
 def any_faded(magnitude, echo, beside, levels, correlation):
-    """Chances that any bin of an echo in developed speckle reaches the threshold, and that none.
+    """Probabilities that any, and that no, bin of an echo in developed speckle crosses.
 
-    Signal and noise of a bin are circular complex Gaussian: it crosses with Swerling's first
-    chance, exp(-Th^2 / (2 sigma^2 (1 + SNR))), and neighbours as two correlated Rayleigh
+    Signal and noise of a bin are circular complex Gaussian. It crosses with Swerling's first
+    probability, exp(-Th^2 / (2 sigma^2 (1 + SNR))), and neighbours as two correlated Rayleigh
     magnitudes; bins are a Markov chain of first order. ``correlation`` is that of neighbours'
     noise. Their signals have 1 where one line makes them, and that of noise where many far apart
-    do; between, for Gaussian windows and echoes of variance v [bins^2], ln m = ln rho (1 - v_1/v)
+    do. Between, for Gaussian windows and echoes of variance v [bins^2], ln m = ln rho (1 - v_1/v)
     with v_1 = 1 / (-8 ln rho) of one line. The variance is that of bins of half the largest
     magnitude with half of a main lobe (``beside``) on either side: sidelobes of one line, which may
     cross too, fade with it. It is within 0.02 of drawn echoes of any width; for rectangular

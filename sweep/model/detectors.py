@@ -2,8 +2,8 @@
 
 All look at the power |X|^2 of every bin (a square-law detector). A constant-false-alarm-rate (CFAR)
 detector holds each bin against ``factor`` times a level that it takes from *training* cells, half
-of them on either side, with *guard* cells between that are left out so that the signal does not
-train its own threshold:
+of them on either side, with *guard* cells between. Guard cells are left out so that the signal does
+not train its own threshold:
 
 - ``ca_cfar``, cell averaging: the mean of all training cells [Finn and Johnson, RCA Review 29, 414,
   1968].
@@ -19,7 +19,7 @@ FFT makes the noise of neighbouring bins alike: fewer independent cells stand be
 more false alarms come than by design (docs/detectors.md has how many).
 
 The same forms give the probability of detection of a signal that fluctuates as speckle does
-(Swerling 1): a cell whose mean is 1 + snr times the noise's crosses as noise does a factor smaller
+(Swerling 1). A cell whose mean is 1 + snr times the noise's crosses as noise does a factor smaller
 by 1 + snr.
 
 The spectrum of a white record has no ends: training cells beyond DC are those below Nyquist, and

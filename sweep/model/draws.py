@@ -2,9 +2,9 @@
 
 Two ways that agree in the mean. ``probabilities`` is [T 3.3.2]'s: uniform numbers against pd and
 the probability of a false alarm (noise and leakage together). ``noise`` adds complex Gaussian
-noise to the bins of the echo, alike as window and padding make it, and looks; over the other bins,
+noise to the bins of the echo, alike as window and padding make it, and looks. Over the other bins,
 which hold noise alone, the largest magnitude is drawn from the order statistic of as many
-independent ones as alarm as often. Where effects are random, each draw has a spectrum and
+independent ones as alarm as often. If effects are random, each draw has a spectrum and
 probabilities of its own, and its noise with them: see :mod:`sweep.model.sampling`, which also says
 when to stop. Echoes in developed speckle fade by factors that the segments have partly in common.
 
@@ -31,14 +31,14 @@ from sweep.model.preparation import Shots
 from sweep.model.segments import runs_of
 
 BOTH = "pd_both_chirps"
-"""Chance of a detection in both chirps, beside the outputs where any two segments detect."""
+"""Probability of a detection in both chirps, beside the outputs where any two segments detect."""
 
 _AT_ONCE = 256
 """Draws of a row whose random numbers are made together."""
 
 
 class Rows(NamedTuple):
-    """Spectra, (m,) each, that a stretch of draws is taken of."""
+    """Spectra, (m,) each, of a run of draws."""
 
     point: np.ndarray
     """int64: the point whose counts they add to."""
@@ -126,7 +126,7 @@ def _chances(outputs: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def down_given_up(up: np.ndarray, down: np.ndarray, both: np.ndarray) -> np.ndarray:
-    """Chances of a detection in the down segment without and with one in the up segment, (2, ...).
+    """Probabilities of a detection in the down segment, without and with one in up, (2, ...).
 
     From those of either segment and of both.
     """
@@ -309,7 +309,7 @@ def fading_factors(key, draw, group, mixing):
 
 @njit(cache=True, error_model="numpy")
 def _happen(address, stream, chances, given, words, found):
-    """Mark the draws (key, first, number) in which something happens, by two chances.
+    """Mark the draws (key, first, number) in which something happens, by two probabilities.
 
     The second is that of draws that are ``given``. These may be the ones that are marked.
     """
@@ -388,7 +388,7 @@ def _cross(address, stream, index, line, words, found):
 
 @njit(cache=True, error_model="numpy")
 def largest_of(number, chance, looks):
-    """|X| / sigma that the largest of so many bins of noise exceeds with the given chance.
+    """|X| / sigma that the largest of so many bins of noise exceeds with the given probability.
 
     The root of the mean power of some looks.
     """
@@ -402,7 +402,7 @@ def largest_of(number, chance, looks):
 
 @njit(cache=True, error_model="numpy")
 def gamma_exceeded(order, chance):
-    """Return the number that a Gamma variable of whole order exceeds: x of Q(n, x) = chance."""
+    """Return x of Q(n, x) = `chance`, which a Gamma variable of whole order exceeds."""
     low, high = 0.0, 2.0 * (order + 40.0 - math.log(max(chance, 1e-300)))
     for _ in range(60):
         x = 0.5 * (low + high)
@@ -422,8 +422,8 @@ def faded_ratio(ratio, levels, chances, looks, apart):
     """|X| / sigma of a detected bin that fades: of some looks the root of their mean power.
 
     ``ratio`` is |X| / sigma without noise; ``levels`` are the threshold and the noise of bins that
-    hold lines, over sigma; ``chances`` the share of detections in which the power is as large,
-    uniform, and the chance of a detection. ``apart``: each look has its own speckle.
+    hold lines, over sigma.  ``chances`` the share of detections in which the power is as large,
+    uniform, and the probability of a detection. ``apart``: each look has its own speckle.
     """
     noise = 2.0 * levels[1] * levels[1]
     if looks > 1 and apart:

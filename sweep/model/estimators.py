@@ -1,10 +1,10 @@
 """Estimators of a peak's frequency from the complex spectrum around it, and their bounds.
 
-All take spectra of records, windowed and transformed, and give places by index: frequencies in
-bins of a real record, with N/2 added of a complex one, whose last bin is beside its first. Where a
-window matters, what they need of it comes from its own samples, so that any window and any padding
-will do. With Z_j the bins about the peak, turned so that a lone tone's are real and even in its
-distance (the phase of half a record a bin taken off):
+All take spectra of records, windowed and transformed, and give places by index. These are
+frequencies in bins of a real record; for a complex one N/2 is added, and its last bin is a
+neighbour of its first. If a window matters, what they need of it comes from its own samples, so
+that any window and any padding will do. With Z_j the bins about the peak, turned so that a lone
+tone's are real and even in its distance (the phase of half a record a bin taken off):
 
 - ``peak_bin``: the largest bin, off by up to half a bin.
 - ``parabolic``, ``parabolic_log``: the vertex of a parabola through three magnitudes, or through
@@ -22,20 +22,20 @@ distance (the phase of half a record a bin taken off):
   chirp-z transform [Rabiner, Schafer and Rader, Bell Syst. Tech. J. 48, 1249, 1969], and a
   parabola; it reaches :func:`windowed_deviation`.
 - ``maximum_likelihood``: the window is divided out of the record again, and the largest value of
-  the unwindowed spectrum found by Newton's method, once more without the tone's image at negative
-  frequency: for a lone tone in white noise the most likely one [Rife and Boorstyn, IEEE Trans.
-  Inf. Theory 20, 591, 1974], which reaches the Cramer-Rao bound.
+  the unwindowed spectrum found by Newton's method. This is repeated without the tone's image at
+  negative frequency. For a lone tone in white noise the result is the most likely one [Rife and
+  Boorstyn, IEEE Trans. Inf. Theory 20, 591, 1974], which reaches the Cramer-Rao bound.
 
 The Cramer-Rao bound is the least error of any unbiased estimate of a beat, a range, a velocity. For
 a tone A cos(2 pi f n / fs + phi) in L samples with white Gaussian noise of variance s^2, all of A,
-f and phi unknown: with cnr = A^2 / (2 s^2), the tone's power over the noise's before the FFT,
+f and phi are unknown. With cnr = A^2 / (2 s^2), the tone's power over the noise's before the FFT,
 
     var(f) >= 12 / (cnr L (L^2 - 1)) (fs / 2 pi)^2
 
 [Rife and Boorstyn, IEEE Trans. Inf. Theory 20, 591, 1974; Kay, Fundamentals of Statistical Signal
 Processing: Estimation Theory, 1993, section 3.11]. For a tone some bins away from DC and Nyquist,
 where the bound does not depend on its phase. Of a complex tone of power cnr over the noise's, I and
-Q together, it is half as much. It is that of the whole record: a window throws away
+Q together, it is half as much. It is that of the whole record. A window throws away
 what it tapers off, and the largest value of a windowed spectrum knows the tone less well
 (:func:`windowed_deviation`), unless the window is taken back first.
 

@@ -2,20 +2,20 @@
 
 A Gaussian beam of full divergence Theta (between the 1/e^2 intensity points) has the standard
 deviation Theta/4 on each axis. A pattern of points in a circle is weighted by the beam, then
-mapped linearly so that its mean and covariance are the beam's own exactly: the beam keeps its
+mapped linearly so that its mean and covariance are the beam's own exactly. The beam keeps its
 pointing, its size and its power whatever the number of beamlets.
 
-Two patterns. Where beamlets add as powers, a hexagonal lattice is the better quadrature. Where
-they add as amplitudes with the phases of a smooth plane, a lattice cancels: off normal incidence
-its phases step evenly from row to row, and the sum is nearly nothing but at grating lobes. A
-sunflower has no rows; its sum fades like the random one that rough ground would give, which is
-what [T 4.2] describes (first dips of Pd at some 4 km).
+Two patterns. If beamlets add as powers, a hexagonal lattice is the better quadrature. If they add
+as amplitudes with the phases of a smooth plane, a lattice cancels. Off normal incidence its phases
+step evenly from row to row, and the sum is nearly nothing but at grating lobes. A sunflower has no
+rows; its sum fades like the random one that rough ground would give, which is what [T 4.2]
+describes (first dips of Pd at some 4 km).
 
-Moments of a plane's lines: with u the angle of a beamlet along the slope times cot(grazing), (1 +
-d)/(1 + u) is R_b/R_0 and ((1 + u)/|d|)^m its echo over that on the axis, d its direction, whose
-length on the axis is 1, and m = 2 for laws that are even in all directions, 3 for Lambert's. The
-pattern has exactly the beam's covariance, so that u has the mean 0 and the rms q = (divergence/4)
-cot(grazing). Where a beamlet may pass over the horizon moments are infinite.
+Moments of a plane's lines: let u be the angle of a beamlet along the slope times cot(grazing), and
+d its direction, whose length on the axis is 1. Then (1 + d)/(1 + u) is R_b/R_0, and ((1 + u)/|d|)^m
+is its echo over that on the axis, with m = 2 for laws that are even in all directions, 3 for
+Lambert's. The pattern has exactly the beam's covariance, so that u has the mean 0 and the rms q =
+(divergence/4) cot(grazing). If a beamlet may pass over the horizon moments are infinite.
 """
 
 import math
@@ -280,6 +280,6 @@ def plane_echo_ratio(
 def velocity_to_bins(
     *, range: ArrayLike, carrier: ArrayLike, chirp_rate: ArrayLike, bin_width: ArrayLike
 ) -> np.ndarray:
-    """Bins for 1 m/s: 2/c times the carrier, and the range's beat that beta stretches."""
+    """Bins for 1 m/s: 2/c times the carrier, and the range's beat that beta scales."""
     beat = np.asarray(chirp_rate, float) * (4 / SPEED_OF_LIGHT) * np.asarray(range, float)
     return np.asarray((2 / SPEED_OF_LIGHT) * (np.asarray(carrier) + beat) / np.asarray(bin_width))

@@ -1,7 +1,7 @@
 """Ground that a beam meets: a flat plane, or whatever rays have found; as one line or as beamlets.
 
 Reflectance laws: a surface of bidirectional reflectance f [1/sr] that fills a beam of power P at
-incidence i sends the intensity f P cos(i) [W/sr] back along it: the beam spreads over 1/cos(i) of
+incidence i sends the intensity f P cos(i) [W/sr] back along it. The beam spreads over 1/cos(i) of
 its cross-section and the patch, seen from the beam, shrinks to cos(i) of itself again. So Lambert's
 f = rho/pi gives rho cos(i)/pi.
 
@@ -12,7 +12,7 @@ scattered once outshines all other [Hapke 1981; 2012, ch. 10]:
 
 with the single-scattering albedo w, the phase function p and the opposition surge B of shadows
 that hide behind their grains. A lidar looks at the phase angle g = 0 and i = e, where f cos(i) is
-w p(0) (1 + B(0)) / (8 pi) whatever the incidence: a ball of it shines as evenly as the full Moon.
+w p(0) (1 + B(0)) / (8 pi) whatever the incidence. A ball of it shines as evenly as the full Moon.
 """
 
 import math
@@ -33,7 +33,7 @@ def backscatter(law: str, cos_incidence: np.ndarray) -> np.ndarray:
     """Backscattered fraction per steradian of a surface of reflectance 1 [1/sr].
 
     ``thesis`` is the diffuse law of [T 4.4], 1/(2 pi) whatever the incidence, ``lambert``
-    cos(incidence)/pi, ``lommel_seeliger`` 1/pi whatever the incidence; its reflectance is the
+    cos(incidence)/pi, ``lommel_seeliger`` 1/pi whatever the incidence. Its reflectance is the
     normal albedo w p(0) (1 + B(0)) / 8 (single-scattering albedo, phase function, opposition
     surge), which at normal incidence is what Lambert's law means by it.
     """
@@ -60,7 +60,7 @@ class Footprints(NamedTuple):
 class Plane:
     """A flat plane, for `size` points of one category, parameters as arrays.
 
-    Where beamlets see no velocities of their own (`moving`), points that differ in velocity alone
+    If beamlets see no velocities of their own (`moving`), points that differ in velocity alone
     share their rows.
     """
 
@@ -82,7 +82,7 @@ class Plane:
 
         ``turn`` [cycles per beta] is (n,) or a scalar. To second order a beamlet x across and y
         along the slope, in standard deviations, has the phase t y + c (x^2 + y^2), and its echo
-        goes as 1 + k y, so that with Gaussian x and y the mean is
+        goes as 1 + k y. With Gaussian x and y the mean is
 
             (1 + i k t / (1 - 2 i c)) exp(-t^2 / 2 / (1 - 2 i c)) / (1 - 2 i c)
         """
@@ -162,7 +162,7 @@ def _rows(row: np.ndarray, size: int) -> np.ndarray:
 
 
 class Extent(NamedTuple):
-    """A footprint beside the line on its axis, by point."""
+    """A footprint and the line on its axis, by point."""
 
     echo: np.ndarray
     """Of the bare line, for a reflectance of 1 [1/sr]."""

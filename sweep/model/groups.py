@@ -20,7 +20,7 @@ class Groups(NamedTuple):
     """Groups of adjacent bins at or above the threshold in noiseless spectra: up, Doppler, down.
 
     Each is a target or a strong one's sidelobe. Strongest first; bin -1 and nan where there is
-    none. Where no bin crosses the threshold the strongest is listed, as noise may lift it.
+    none. If no bin crosses the threshold the strongest is listed, as noise may lift it.
     """
 
     bin: np.ndarray

@@ -1,20 +1,20 @@
 """Position of a tone between bins, from the magnitudes of the largest bin and its two neighbours.
 
-With the window's transform W at the spacing of the bins, a lone tone delta bins past the centre
-bin has the magnitudes |W(-1 - delta)|, |W(-delta)|, |W(1 - delta)|. How they are turned back into
-delta depends on the window:
+With the window's transform W at the spacing of the bins, a lone tone delta bins past the centre bin
+has the magnitudes |W(-1 - delta)|, |W(-delta)|, |W(1 - delta)|. The way back to delta depends on
+the window:
 
-- Where the neighbours of a tone on a bin still stand high (Hann, Hamming and all wider ones), the
-  measure (above - below) / (below + 2 centre + above) is inverted by a table (for Hann it is
-  delta / 2), and one step of least squares, weighted by the noise's covariance between the three
-  bins, follows: the least error that three magnitudes allow.
-- Where the neighbours vanish (rectangular) the larger of them says the side, and the measure is
+- If the neighbours of a tone on a bin still stand high (Hann, Hamming, wider ones), the measure
+  (above - below) / (below + 2 centre + above) is inverted by a table (for Hann it is delta / 2).
+  One step of least squares follows, weighted by the noise's covariance between the three bins: the
+  least error that three magnitudes allow.
+- If the neighbours vanish (rectangular) the larger of them says the side, and the measure is
   larger / (centre + larger), for the rectangular window delta itself.
 
-The tables are made of the window's own transform, so a noise-free lone tone is placed exactly
-(1e-6 bins). What biases the estimate: other lines within the reach of the kernel, the tone's own
-image near DC and Nyquist, a footprint that spreads over bins (the estimate is then one of its
-centre), and in the rectangular window noise that turns the wrong neighbour into the larger one.
+The tables are made of the window's own transform, so a noise-free lone tone is placed exactly (1e-6
+bins). Three things bias the estimate: other lines within the reach of the kernel, the tone's own
+image near DC and Nyquist, and a footprint that spreads over bins. A footprint's estimate is that of
+its centre. Noise biases it in the rectangular window, where the wrong neighbour may be larger.
 
 A footprint whose lines add as powers and spread by s [bins, standard deviation] about their mean
 broadens the peak, which moves the estimate by some multiple of s^2, tabulated as `widening`.
@@ -224,7 +224,7 @@ def sub_bin_error(delta, ratio, tables):
 def spread_error(delta, spread, power, tables):
     """Error [bins] of :func:`sub_bin` for lines of that standard deviation [bins] about its place.
 
-    Where they do not add as powers, they may cancel so that the place is anywhere among them.
+    If they do not add as powers, they may cancel so that the place is anywhere among them.
     """
     if not power:
         return spread

@@ -2,15 +2,15 @@
 
 Bins within a run around the lines are evaluated one by one: all that may cross the threshold, and
 as many as it takes for what leaks to become smooth. Beyond it, down to DC and up to Nyquist, the
-chances that leaked signal adds are summed as an integral, to better than 1e-6 of the leakage; or
-left out, where the shape's envelope says that they come to no more than the accuracy asked for.
-What this leaves of that may do for the bins within the run as well.
+probabilities that leaked signal adds are summed as an integral, to better than 1e-6 of the leakage.
+They are left out where the shape's envelope says that they come to no more than the accuracy asked
+for. The rest may serve for the bins within the run too.
 
-The integral: without padding e^{i pi k} is a sign, so |X| far from the lines is a smooth function
-of k, and a sum over bins an integral and corrections at its near end (Euler's and Maclaurin's, in
-central differences). As |X|^2 is even about DC and about Nyquist, there is none at the far end but
-half the value there. In v = cot(pi q / N), q the distance from the lines, the integrand is nearly
-a polynomial: some thirty Gauss points stand for sixty thousand bins.
+Without padding e^{i pi k} is a sign. So |X| far from the lines is a smooth function of k, and a sum
+over bins is an integral and corrections at its near end (Euler's and Maclaurin's, in central
+differences). As |X|^2 is even about DC and about Nyquist, there is none at the far end but half the
+value there. In v = cot(pi q / N), q the distance from the lines, the integrand is nearly a
+polynomial: some thirty Gauss points stand for sixty thousand bins.
 """
 
 import math
@@ -74,7 +74,8 @@ def inspect(origin, lines, noise, table, form, sizes, tangent, room, exempt, ser
     """Run of bins, detection and leakage of a segment's lines; all bins are accounted for.
 
     Arguments and results as of :func:`sweep.model.spectrum.detect`, and the leakage last.
-    ``noise``: sigma per quadrature; threshold; chance of leakage that may be left out. ``series``:
+    ``noise``: sigma per quadrature; threshold; probability of leakage that may be left out.
+    ``series``:
     :func:`sweep.model.crossings.crossing_series` of the threshold.
     """
     n, lowest, highest, total, faint = lines
@@ -130,7 +131,7 @@ def of_bins(count, noise, floor, room, exempt, series):
 
 @njit(cache=True, error_model="numpy")
 def _all_beyond(weight, first, mirror, noise, form):
-    """Bound on the chance that any bin ``first`` or more bins from the lines adds to leakage.
+    """Bound on the probability that any bin ``first`` or more bins from the lines adds to leakage.
 
     With x = a^2/2, y = b^2/2 and z = a b a bin's own is at most
 
@@ -167,7 +168,7 @@ def _envelope_beyond(first, form):
 
 @njit(cache=True, error_model="numpy")
 def _at_most(count, noise, exempt, room):
-    """Bound on the chance that any bin of a run adds to leakage; infinite where it is large.
+    """Bound on the probability that any bin of a run adds to leakage; infinite where it is large.
 
     With x and y as of :func:`_all_beyond`, Q_1 is convex in x up to y - 2, as I_2(z) / I_1(z) is at
     least z / (2 + sqrt(z^2 + 4)); there each bin adds no more than in proportion to the largest of

@@ -8,7 +8,7 @@ share one shape. With x = -1 .. 1 over the record of L samples, r = L/N, and y b
 whose phase counts from the middle of the record. G is kept in three forms:
 
 - **A table** of G, or of |G|^2 where lines add as powers, at cells of 1/2 (1/4) bin out to some
-  bins on either side. Lines are shared out among the fourteen cells beside them, by a kernel that
+  bins on either side. Lines are shared out among the fourteen cells around them, by a kernel that
   all but vanishes beyond; the table has divided out what that does. It is a Kaiser-Bessel kernel,
   as of non-uniform FFTs [Fessler and Sutton 2003], and right to 1e-12 of the peak.
 - **Beyond the table** by the record's two ends alone. With c = cot(pi y / N),
@@ -306,8 +306,8 @@ def find_modes(phase, matrix, centre, found, number):
     """Take phase errors apart.
 
     ``phase`` (segments, n, nodes) [cycles] is at :func:`record_places`, ``matrix`` is
-    :func:`to_modes`. Results: ``centre`` (segments, n), shift of the line [bins of fs/L]; ``found``
-    (segments, n, 2, >= nodes // 2), real and imaginary parts of the modes; ``number`` (segments,
+    :func:`to_modes`. Results: ``centre`` (segments, n), shift of the line [bins of fs/L]. ``found``
+    (segments, n, 2, >= nodes // 2), real and imaginary parts of the modes. ``number`` (segments,
     n), modes that count, 0 where half as many as there are nodes are too few.
     """
     nodes = matrix.shape[0]
@@ -341,8 +341,9 @@ def build(segment, numbers, parts, shapes, table, form):
     ``numbers``: the shape's, and that of the one that stands in the results, or -1. ``parts``:
     modes (segments, shapes, 2, modes) second, and third how many count (segments, shapes).
     ``shapes``: tables to build from. Results: ``table`` (2, cells * columns), G, or |G|^2 in the
-    first row; ``form`` (7, >= m), in rows 1 and 2 the most that |G| comes to from each of m
-    distances on, and the integral of its square; in the others A and B of DERIVATIVES + 2 terms.
+    first row. ``form`` (7, >= m), in rows 1 and 2 the most that |G| comes to from each of m
+    distances on, and the integral of its square. The other rows have A and B of DERIVATIVES + 2
+    terms.
     """
     sizes, modes, edges, mode_ends, reach = shapes[0], shapes[1], shapes[2], shapes[3], shapes[4]
     which, before = numbers

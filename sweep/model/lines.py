@@ -1,11 +1,11 @@
 """The lines of one segment: where each beamlet's beat lies, how strong, in what phase.
 
-A beamlet's beat is a tone of nu bins of fs/N. It is seen at nu less whole FFT lengths, within
--N/2 .. N/2; a real record shows the line and its image at the opposite frequency. Close lines are
-replaced by few: as a function of a line's place the spectrum is band-limited, so lines within +-h
-bins are equivalent to J lines at Chebyshev nodes, J = 8 + some 1.3 pi h. What a series of J terms
-leaves out of a sample of the record at t, -1 .. 1, is some 2 J_J(pi h t): next to nothing but at
-the record's ends, where most windows are small; the window weighs it.
+A beamlet's beat is a tone of nu bins of fs/N. It is seen at nu less whole FFT lengths, within -N/2
+.. N/2; a real record shows the line and its image at the opposite frequency. Close lines are
+replaced by few. As a function of a line's place the spectrum is band-limited, so lines within +-h
+bins are equivalent to J lines at Chebyshev nodes, J = 8 + some 1.3 pi h. The error of a series of J
+terms in a sample of the record at t, -1 .. 1, is some 2 J_J(pi h t): next to nothing but at the
+record's ends, where most windows are small; the window weighs it.
 """
 
 import math
@@ -230,7 +230,7 @@ def relative_error(total, squares, n, power, window_sum, allowed, level):
 
     ``total`` and ``squares`` are of :func:`survey`; ``allowed`` is the error of a bin, ``level``
     the threshold. Powers of bins at the threshold, or of half the largest there can be where that
-    is less, are as far off as makes this much of the bin: those of larger bins may be further off,
+    is less, are as far off as makes this much of the bin. Those of larger bins may be further off,
     and in smaller ones nothing is decided.
     """
     in_phase = math.sqrt(n)

@@ -1,4 +1,4 @@
-"""Link budget and receiver: the echo's beat in the photocurrent, and the noise beside it."""
+"""Link budget and receiver: the echo's beat and the noise in the photocurrent."""
 
 import math
 from collections.abc import Mapping
@@ -52,7 +52,7 @@ def beat_scale(
     each dB of light.
 
     [T 2.22] takes 2 Re^2 P^2 as the mean square current, which is the peak of a fully modulated
-    echo; with P the mean echo power the mean square is m^2 Re^2 P^2 / 2, a quarter of it.
+    echo. With P the mean echo power the mean square is m^2 Re^2 P^2 / 2, a quarter of it.
     """
     if architecture == "direct":
         return modulation_index * apd_gain * responsivity * echo_power_scale
@@ -109,17 +109,17 @@ def receiver_noise(
 
     The local oscillator's shot noise, the detector's own (M Re NEP)^2 B_e, the amplifier's rms
     current squared. Direct detection has no local oscillator and adds its load's thermal noise
-    4 k T B_e / R_L [T 2.22]. What light from outside adds are effects.
+    4 k T B_e / R_L [T 2.22]. Noise of light from outside is added by effects.
 
     A heterodyne receiver mixes an IF down: noise from both sides of the IF lands in the record,
-    which makes the shot-limited SNR Re P / (2 q B_e) [T 2.23], half the homodyne's; its RF noise
+    which makes the shot-limited SNR Re P / (2 q B_e) [T 2.23], half the homodyne's. Its RF noise
     figure multiplies all of it.
 
     ``in_quadrature``: of two receivers that sample I and Q, as the noise of a bin of a real record.
     A 90 degree hybrid gives each of them half of echo and local oscillator. The bins of I + iQ then
     show a line as those of a real record do. Shot noise of half the light each is the same
-    altogether, each one's own noise twice as much, and that of currents which go with the light,
-    a quarter of the variance each, half as much.
+    altogether, each one's own noise twice as much. Noise of currents which go with the light, a
+    quarter of the variance each, is half as much.
     """
     noise = _noise(architecture, values)
     if not in_quadrature:
@@ -157,12 +157,11 @@ def rounding_variance(
 ) -> np.ndarray:
     """Variance lsb^2/12 [V^2] that rounding adds at the ADC, lsb = 2 V / 2^bits; 0 for 0 bits.
 
-    Where the noise's deviation s spans a step or so the error is white and independent of the
-    signal [Widrow and Kollar, Quantization Noise, 2008, ch. 4, 9]: it departs from that by
-    exp(-2 pi^2 s^2 / lsb^2), 2.7e-9 for s = lsb and 0.7 % for s = lsb/2. Neither the receiver's
-    gain nor its noise figure acts on it. ``full_scale`` is the largest voltage V [V] to either
-    side; the effective number of bits, which need not be whole, makes the noise of a real ADC.
-    Two ADCs sample I and Q.
+    If the noise's deviation s spans a step or so the error is white and independent of the signal
+    [Widrow and Kollar, Quantization Noise, 2008, ch. 4, 9]: it departs from that by exp(-2 pi^2 s^2
+    / lsb^2), 2.7e-9 for s = lsb and 0.7 % for s = lsb/2. Neither the receiver's gain nor its noise
+    figure acts on it. ``full_scale`` is the largest voltage V [V] to either side; the effective
+    number of bits, which need not be whole, makes the noise of a real ADC. Two ADCs sample I and Q.
     """
     bits = np.asarray(bits, float)
     step = 2 * np.asarray(full_scale, float) * 2.0**-bits

@@ -4,14 +4,14 @@ A shot is its waveform N times over, without a pause. Of a bin, with a and the t
 noise per quadrature of one record,
 
 - ``power``: the N periodograms |X|^2 are averaged, and their root is held against the threshold.
-  The sum of powers is a noncentral chi square of 2 N degrees of freedom: it crosses with
+  The sum of powers is a noncentral chi square of 2 N degrees of freedom. It crosses with
   ``Q_N(sqrt(N) a, sqrt(N) b)``, Marcum's Q of order N, and noise alone, a Gamma(N), with
   ``Q(N, N b^2 / 2)``, the regularised incomplete Gamma function [Marcum, IRE Trans. Inf. Theory 6,
   59, 1960].
 - ``binary``: each record is held against the threshold, and M of them must cross in the bin.
 - ``coherent``: records are added, with the phase between them that a steady velocity makes taken
-  off, and are then one record of N times less noise. What a laser's walking phase and an
-  acceleration leave of their sum stands in :func:`coherent_gain`.
+  off, and are then one record of N times less noise. The part of their sum that a laser's walking
+  phase and an acceleration leave is in :func:`coherent_gain`.
 
 An echo in developed speckle fades. Looks follow one another at once, so that by default all have
 one speckle; where the beam moves on by its own width from look to look each has its own
@@ -108,7 +108,7 @@ class Looks(NamedTuple):
     def steady(
         self, signal: np.ndarray, level: np.ndarray, real: np.ndarray | bool = False
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Chances that a bin of a steady signal is detected, and that it is not.
+        """Probabilities that a bin of a steady signal is detected, and that it is not.
 
         Parameters
         ----------
@@ -173,7 +173,7 @@ class Looks(NamedTuple):
     def faded_together(
         self, one: np.ndarray, other: np.ndarray, level: np.ndarray, alike: np.ndarray
     ) -> np.ndarray:
-        """Chance that two segments in developed speckle are both detected.
+        """Probability that two segments in developed speckle are both detected.
 
         Parameters
         ----------
@@ -188,8 +188,8 @@ class Looks(NamedTuple):
         -----
         Looks of their own speckle are summed over that of the first segment: given it, the second's
         are a noncentral chi square. In one speckle of all, both segments see it: the mean over it
-        of the product. Where they share but a part of it, what they have in common is that share
-        of it which two Rayleigh magnitudes of the same chances have.
+        of the product. If they share but a part of it, what they have in common is that share
+        of it which two Rayleigh magnitudes of the same probabilities have.
         """
         from scipy import stats
 
@@ -234,10 +234,10 @@ class Looks(NamedTuple):
         )
 
     def log_alarm(self, level: np.ndarray) -> np.ndarray:
-        """Natural logarithm of the chance that a bin of noise alone is detected.
+        """Natural logarithm of the probability that a bin of noise alone is detected.
 
         ``level`` is the threshold over the noise per quadrature of one record. It keeps its digits
-        where the chance itself leaves float64's range.
+        where the probability itself leaves float64's range.
 
         Examples
         --------
@@ -280,7 +280,7 @@ class Looks(NamedTuple):
         return np.sqrt(np.mean(np.square(magnitudes), axis=0))
 
     def fresh(self, level: np.ndarray, correlation: float) -> np.ndarray:
-        """Chance that a bin of noise is not detected where its neighbour is, by the threshold.
+        """Probability that a bin of noise is not detected where its neighbour is, by the threshold.
 
         ``correlation`` is that of their noise, 0..1. Of sums of powers by the Gamma distribution of
         two variables [Kibble, Sankhya 5, 137, 1941]: with r = correlation^2, both cross with
@@ -312,10 +312,10 @@ class Looks(NamedTuple):
             j = j + j.size
 
     def votes_of_one(self, p: np.ndarray, q: np.ndarray, both: np.ndarray) -> np.ndarray:
-        """Chance that the first of two bins has enough records, and the second has not.
+        """Probability that the first of two bins has enough records, and the second has not.
 
-        ``p``, ``q`` and ``both`` are the chances that a record crosses in the first, in the second
-        and in both.
+        ``p``, ``q`` and ``both`` are the probabilities that a record crosses in the first, in the
+        second and in both.
         """
         from scipy import stats
 
@@ -346,7 +346,7 @@ class Looks(NamedTuple):
         return np.exp(np.where(below, excess[0] + 2 * (place - nodes[0]), found))
 
     def quiet_below(self, *, chance: np.ndarray, level: np.ndarray, bins: int) -> np.ndarray:
-        """As of :func:`sweep.model.detection.quiet_below`, by the chances of several records."""
+        """As of :func:`sweep.model.detection.quiet_below`, for several records."""
         # Where tables begin chances rise as the signal's square.
         least = np.array([self.excess(np.array([1e-3]), b)[0] for b in np.ravel(level)]) / 1e-6
         with np.errstate(divide="ignore"):
@@ -354,7 +354,7 @@ class Looks(NamedTuple):
         return np.asarray(np.minimum(quiet, 1 / (self.number * level)))
 
     def _votes(self, crosses: np.ndarray, stays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Chances that enough records cross, and that they do not."""
+        """Probabilities that enough records cross, and that they do not."""
         enough, rest = self.votes, self.number - self.votes + 1
         return special.betainc(enough, rest, crosses), special.betainc(rest, enough, stays)
 
@@ -427,7 +427,7 @@ def level_of(log_pfa: np.ndarray, law: Callable[[np.ndarray], np.ndarray]) -> np
 def fading_any_two(
     pd: np.ndarray, miss: np.ndarray, level: np.ndarray, alike: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Chances that at least two of three segments in developed speckle are detected, and not.
+    """Probabilities that at least two of three segments in developed speckle are detected, and not.
 
     The amplitude of each segment, signal and noise, is normal, of the part l_i z of one common
     amplitude z and a rest of its own. With A_i = Th^2 over the mean power, u = |z|^2 exponential,
@@ -436,10 +436,10 @@ def fading_any_two(
 
     and given u the segments are independent. The correlations, those of
     :func:`sweep.model.detection.fading_together`, give l_i = sqrt(rho_ij rho_ik / rho_jk): exact
-    for segments that share their speckle, or each have their own. Where speckle moves on between
+    for segments that share their speckle, or each have their own. If speckle moves on between
     them one l_k may come out above 1. It is then 1, z is that segment's own amplitude, and of the
     others a covariance
-    kappa = rho_ij - rho_ik rho_jk is left, which adds to the chance of both
+    kappa = rho_ij - rho_ik rho_jk is left, which adds to the probability of both
 
         kappa P_i' P_j' / 2 + kappa^2 (A_i A_j + B_i B_j) / 16,    A, B = P'' +- P' / r
 
@@ -449,7 +449,7 @@ def fading_any_two(
     Parameters
     ----------
     pd, miss : (3, n) ndarray
-        Chances of up, Doppler and down segment.
+        Probabilities of up, Doppler and down segment.
     level : (n,) ndarray
         Threshold over the noise per quadrature.
     alike : (3, n) ndarray

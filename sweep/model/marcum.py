@@ -1,18 +1,18 @@
-"""Chances that bins cross the threshold: Marcum's Q of one bin, and at least one among many.
+"""Probabilities that bins cross the threshold: Marcum's Q of one bin, and at least one among many.
 
 ``Q1(a, b)`` is the probability that a Rice-distributed magnitude of amplitude ``a`` (in units of
 the noise per quadrature) exceeds ``b``: the detection probability [T 3.3]; ``Q1(0, b)`` is the
 false alarm probability [T 3.4]. Both tails are computed as sums of positive terms, each from the
 side on which it is small, and the other as its complement, so neither loses digits.
 
-Below ``ab = 30`` the series of Bessel functions is summed by backward recurrence (Miller), from
-there on the integral over the imaginary axis is summed by the midpoint rule with the residue of
-its pole put back. Arguments are (a, b), not their squares, which could not tell a from b when
-both are large.
+Below ``ab = 30`` the series of Bessel functions is summed by backward recurrence (Miller). From
+there on the integral over the imaginary axis is summed by the midpoint rule with the residue of its
+pole put back. Arguments are (a, b), not their squares, which could not tell a from b when both are
+large.
 
-A false alarm somewhere among 1e5 bins, each with a chance of 1e-21 or 1e-2000 [T 3.7]: neither
+A false alarm somewhere among 1e5 bins, each with a probability of 1e-21 or 1e-2000 [T 3.7]: neither
 the naive ``1 - (1-p)^n``, which is 0 below p = 1e-16, nor float64's range will do. Hence
-log1p/expm1 for chances, and a form that takes and returns natural logarithms.
+log1p/expm1 for probabilities, and a form that takes and returns natural logarithms.
 """
 
 import math
@@ -124,9 +124,9 @@ def marcum_q1_pair(a, b):
 
 @njit(cache=True, error_model="numpy")
 def excess_crossing(a, b):
-    """Q1(a, b) - Q1(0, b): what a bin's own signal adds to its chance to cross; nan outside.
+    """Q1(a, b) - Q1(0, b): what a bin's own signal adds to its probability to cross; nan outside.
 
-    Where the sum is short (a <= 2 and ab <= 8; a leaking bin), with x = a^2/2 and y = b^2/2,
+    If the sum is short (a <= 2 and ab <= 8; a leaking bin), with x = a^2/2 and y = b^2/2,
 
         exp(-x-y) sum_{m>=1} (x y)^m / m!^2  M(1, m+1, x),
 
@@ -175,7 +175,7 @@ def log_at_least_one(log_p: ArrayLike, n: ArrayLike) -> np.ndarray:
     """Natural logarithm of 1 - (1-p)^n, from ln p <= 0 and n, 0..1e240; -inf where p or n is 0.
 
     Relative error at most 1e-15 while n p < 1, at any ln p. Near certainty the result is minus the
-    chance (1-p)^n of none; the rounding of ln p alone moves that by up to n p / (1-p) parts in
+    probability (1-p)^n of none. The rounding of ln p alone moves that by up to n p / (1-p) parts in
     1e16, and the error stays within 2 + n p / (1-p) parts in 2e15.
     """
     log_p, n = np.asarray(log_p, float), np.asarray(n, float)

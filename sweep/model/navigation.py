@@ -12,18 +12,18 @@ is there to find them. A point whose standard error is not a number is left out;
 millionth of a bin counts as that, to which the interpolation itself is good.
 
 The instrument is taken to know, from inertial sensors, how it is turned and how its place and
-velocity have changed within a cycle: so the altitude is that at the cycle's first shot, over the
+velocity have changed within a cycle. So the altitude is that at the cycle's first shot, over the
 ground straight below it, and the velocity the mean over the cycle's shots, in the world's axes.
 
 Of pointing jitter it knows the standard deviation. To first order a beam thrown off by sigma in
-each of the two angles across it adds sigma |v_perp| to the standard error of its radial velocity,
-v_perp the velocity across it (by a first solution without jitter), and sigma R tan(angle from
-nadir) to that of its range, on level ground.
+each of the two angles across it adds sigma |v_perp| to the standard error of its radial velocity.
+Here v_perp is the velocity across it (by a first solution without jitter). It adds sigma R
+tan(angle from nadir) to that of its range, on level ground.
 
 Of the floor of its errors (:mod:`sweep.model.error_floor`) it knows the standard deviations too.
 Those of pointing and vibration are independent from beam to beam: they weigh, and they show in the
-residuals. Clock and wavelength scale all beams alike, which no residual shows: they are taken out
-of the weights, and of a relative error of s the solution's covariance has s^2 v v^T more, the
+residuals. Clock and wavelength scale all beams alike, which no residual shows. They are taken out
+of the weights. Of a relative error of s the solution's covariance has s^2 v v^T more, the
 altitude's variance s^2 h^2. The altitude is that of the points where pointing has put them, and its
 variance counts the pointing as it counts jitter.
 """

@@ -1,17 +1,18 @@
 """Complex spectra of a shot with noise in every bin, and what is found in them, draw by draw.
 
 Noise is drawn as the receiver makes it: white Gaussian in the record, which is windowed, padded and
-transformed; so bins are alike as far as window and padding make them, and DC and Nyquist are what
+transformed. So bins are alike as far as window and padding make them, and DC and Nyquist are what
 they are. Every sample is addressed by point, draw, segment and place (:mod:`sweep.model.philox`).
 
 A real record has bins 0..N/2. A complex one, of I and Q, has N: bin k stands at index k + N/2, and
-the last is beside the first. Indices that name an echo's bins may go on below 0 and beyond N - 1.
+the last is a neighbour of the first. Indices that name an echo's bins may go on below 0 and beyond
+N - 1.
 
 The signal has the magnitudes that :func:`sweep.model.segments.spectrum` gives, with all
-effects. Where beamlets add as powers these are root mean squares, and have no phases: the signal
+effects. If beamlets add as powers these are root mean squares, and have no phases: the signal
 is then given those of a lone tone at its place, bin by bin. For footprints of less than a bin that
 is what the spectrum is; in wider ones estimators see a smoother peak than speckle would make. In
-developed speckle all bins of a draw fade together. Where a shot of a flight has several echoes,
+developed speckle all bins of a draw fade together. If a shot of a flight has several echoes,
 each has the phases of a tone of its own, and its own fading.
 A phase common to all bins makes no difference to circular noise and is left out.
 
@@ -24,10 +25,10 @@ its noise, its walk, and the speckle that all have, or its own. Flags are those 
 
 A detector and an estimator of frequency look at each segment's spectrum. The detector flags bins of
 |X|^2. A segment is detected where it flags any bin that the signal occupies (``peak_bin``: the
-strongest or one of the two beside it); adjacent flagged bins form a group, and a group outside the
+strongest or one of its two neighbours); adjacent flagged bins form a group. A group outside the
 bins that the signal occupies is a false alarm. The estimator is given the spectrum and the largest
-bin of the detected group. Where all segments are detected, their frequencies are resolved into
-range and radial velocity.
+bin of the detected group. If all segments are detected, their frequencies are resolved into range
+and radial velocity.
 """
 
 import math
@@ -168,7 +169,7 @@ def unrolled(shots: Shots, values: np.ndarray, middle: int) -> np.ndarray:
     """Values of bins (..., bins) without a seam near one of them.
 
     Those of a complex record are turned until index ``middle`` stands in the middle, with a 0 put
-    at either end as if it were DC and Nyquist of a real one; those of a real one are as they are.
+    at either end as if it were DC and Nyquist of a real one. Those of a real one are as they are.
     """
     if not shots.complex_record:
         return values

@@ -284,10 +284,9 @@ STATISTICS: dict[str, Output] = _over(("shot",), {
 })  # fmt: skip
 """Probabilities of each shot, before any draw.
 
-Where spectra are held against another detector than the fixed threshold, or the strongest peak of
-a segment is reported alone, chances are nan.
-Where nothing is seen false alarms are those of the noise alone, and all else is nan; so is
-``pd_doppler`` without a Doppler segment.
+If spectra are held against another detector than the fixed threshold, or the strongest peak of a
+segment is reported alone, probabilities are nan. If nothing is seen false alarms are those of the
+noise alone, and all else is nan; so is ``pd_doppler`` without a Doppler segment.
 """
 
 SIMULATED: dict[str, Output] = _over(("shot",), {

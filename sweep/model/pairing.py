@@ -2,17 +2,17 @@
 
 Each surface in a footprint leaves a peak in all three segments, and which belong together is not
 written on them. A pair of an up and a down peak has 16 readings (each of the three peaks as it
-stands or folded at Nyquist, half sum or half difference being the Doppler frequency), and each
-reading predicts a Doppler peak; a pair is *confirmed* by a peak within the tolerance of that
-prediction. Of all ways to pair up and down peaks one to one, that with the most confirmed pairs
-is taken, and among those the least sum of mismatches, a fold counting as
+stands or folded at Nyquist, half sum or half difference being the Doppler frequency). Each reading
+predicts a Doppler peak. A pair is *confirmed* by a peak within the tolerance of that prediction. Of
+all ways to pair up and down peaks one to one, that with the most confirmed pairs is taken, and
+among those the least sum of mismatches, a fold counting as
 :data:`sweep.model.waveform.FOLD_PENALTY` bins. A Doppler peak may confirm several pairs, as
 surfaces with a common velocity share theirs.
 
 Up and down peaks that are left over are paired in the order in which they are listed (strongest
-first) and marked as unconfirmed: with the reading that comes nearest to any Doppler peak, or,
-where there is none, **with the half sum as the Doppler frequency**, the order of a fast mover
-(PHYSICS section 2 leaves both open): range and velocity are exchanged where that is wrong.
+first) and marked as unconfirmed. They take the reading that comes nearest to any Doppler peak, or,
+where there is none, **with the half sum as the Doppler frequency**, the order of a fast mover.
+PHYSICS section 2 leaves both open. Range and velocity are exchanged where that is wrong.
 
 An up (or down) peak in which two surfaces coincide serves one return only.
 
@@ -38,7 +38,7 @@ TOLERANCE = 3.0
 """Default mismatch [bins] up to which a Doppler peak confirms a pair.
 
 Rounding to bins moves the prediction and the Doppler peak by half a bin each, noise near the
-threshold as much again. A peak anywhere confirms one of the 16 readings by chance with
+threshold as much again. A peak anywhere confirms one of the 16 readings at random with
 16 (2 TOLERANCE) / (N/2) or less: 1.5e-3 at N = 2^17.
 """
 

@@ -1,7 +1,7 @@
 """Random numbers by address: Philox4x64-10 [Salmon et al., SC 2011], compiled.
 
 A draw is a function of the point (the key), the number of the draw, the physical cause (the
-stream) and an index within it, and of nothing else: not of the order of work, the size of blocks
+stream) and an index within it. It does not depend on the order of work, the size of blocks
 or the number of workers. The 256-bit counter is
 
     word 0: block of four outputs    word 1: 0    word 2: draw    word 3: stream
@@ -110,7 +110,8 @@ def to_normals(word0, word1):
 def uniform(key0, key1, draw, stream, index):
     """Return uniform number `index` of a stream of a draw, 2^-53 .. 1 - 2^-53.
 
-    A chance below 1.1e-16 can not be drawn by comparison. One block of four costs one evaluation.
+    A probability below 1.1e-16 can not be drawn by comparison. One block of four costs one
+    evaluation.
     """
     return to_uniform(words4(key0, key1, draw, stream, index >> 2)[index & 3])
 

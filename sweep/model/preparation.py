@@ -1,11 +1,10 @@
 """Points made ready for the spectrum: link budget, receiver noise, and one line on the beam's axis.
 
-What is prepared here is the least that any shot has. Everything else is an effect
+This module prepares the least that any shot has. Everything else is an effect
 (:mod:`sweep.model.effects`), put to it one after the other by :mod:`sweep.model.shot`.
 
 Points that share their categories (architecture, window, law, sizes ...) are prepared together; a
-footprint's geometry is worked out once and serves every point that has it, whatever its
-radiometry.
+footprint's geometry is worked out once and serves every point that has it, whatever its radiometry.
 """
 
 import math
@@ -82,8 +81,8 @@ class PhaseError(NamedTuple):
 class Shots:
     """Points of one category, ready for the spectrum.
 
-    Arrays are (n,) or scalars unless said otherwise; SI throughout. What follows ``amplitude`` is
-    there only where an effect has put it there.
+    Arrays are (n,) or scalars unless said otherwise; SI throughout. The fields after ``amplitude``
+    are there only if an effect has put them there.
     """
 
     architecture: str
@@ -127,9 +126,9 @@ class Shots:
     detector_bandwidth: np.ndarray
     amplifier_bandwidth: np.ndarray
     leakage_floor: np.ndarray
-    """Of :attr:`floor`; :data:`AUTOMATIC` where it follows from the chance below."""
+    """Of :attr:`floor`; :data:`AUTOMATIC` where it follows from the probability below."""
     leakage_tolerance: np.ndarray
-    """Chance of leakage, of all bins far from the lines, that need not be looked for."""
+    """Probability of leakage, of all bins far from the lines, that need not be looked for."""
     line_tolerance: np.ndarray
     """Error of a bin by taking few lines for many, over sigma."""
     beamlets_error: np.ndarray
@@ -241,7 +240,8 @@ class Shots:
         """Gain of each segment's lines in a spectrum whose noise is white, (segments, n).
 
         Spectra are divided by the root of the noise's density over that of white noise. It changes
-        little over an echo and is taken on the beam's axis. What the ADC adds is white before.
+        little over an echo and is taken on the beam's axis. The noise that the ADC adds is white
+        before.
         """
         beats = (
             s.carrier * s.beta
@@ -309,7 +309,7 @@ class Shots:
     def both(
         self, up: np.ndarray, down: np.ndarray, magnitudes: tuple[np.ndarray, np.ndarray]
     ) -> np.ndarray:
-        """Chance that up and down segment are detected, by their own and |X| [V]; (..., n)."""
+        """Probability that up and down segment are detected, by their own and |X| [V]; (..., n)."""
         from sweep.model import detection
 
         if self.fading is None:
@@ -330,7 +330,7 @@ class Shots:
     def detected(
         self, magnitude: np.ndarray, bins: np.ndarray, points: np.ndarray | slice = slice(None)
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Chances that a bin is detected in several looks, and that it is missed, (..., m).
+        """Probabilities that a bin is detected in several looks, and that it is missed, (..., m).
 
         ``magnitude`` [V] is nan for none; ``points`` says which points these are.
         """
@@ -389,7 +389,7 @@ class Shots:
 
     @property
     def segments(self) -> np.ndarray:
-        """Which of up, Doppler and down segment exist, (3,) bool."""
+        """Segments that exist of up, Doppler and down, (3,) bool."""
         return np.array([name in self.order for name in waveform.SEGMENTS])
 
     @property
@@ -405,8 +405,8 @@ class Shots:
     def point_table(self) -> np.ndarray:
         """Numbers of each point as compiled code takes them, (COMMON + OWN segments, n).
 
-        What all segments share, and of each segment the signed chirp rate [Hz/s], the carrier,
-        the whitening, by how much it is nearer, its Doppler ratio, and when it starts.
+        Properties common to all segments, and of each segment the signed chirp rate [Hz/s], the
+        carrier, the whitening, by how much it is nearer, its Doppler ratio, and when it starts.
         """
         columns = (
             self.range, self.beta, self.chirp_rate, self.beat_scale, self.detector_bandwidth,
@@ -605,9 +605,9 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
 def approach(p: Mapping[str, np.ndarray]) -> np.ndarray:
     """Speed at which the range along the beam falls [m/s], (n,) or scalar.
 
-    Not the radial velocity, where the beam slides over slanting ground: with V = v d + u e, d
-    along the beam and e across it towards the near side, a plane of normal n at the grazing angle
-    g is met at a range that falls by V.n / d.n = v + u cot g.
+    This is not the radial velocity if the beam slides over slanting ground. Let V = v d + u e, d
+    along the beam and e across it towards the near side. Then a plane of normal n at the grazing
+    angle g is met at a range that falls by V.n / d.n = v + u cot g.
     """
     if APPROACH in p:
         return p[APPROACH]

@@ -1,21 +1,21 @@
 """Error of too few rays: the change that more rays might make to probabilities and peaks.
 
-Where powers add, the power of the bin that is detected is a mean over the beam, P = sum_b w_b g_b;
-g_b is its power if all light went where beamlet b goes. A hexagonal lattice of whole shells is
-exact for all that is odd about the beam's axis and for squares of the places, and nearly exact for
-smooth ground. So g is made even, and its best polynomial is subtracted, of the second degree for
-few rays and the fourth for more. The rest tells how rough the ground is between the beamlets: the
-share of the beam about each beamlet is taken to be off by as much as it differs from its
-neighbours, each independently,
+If powers add, the power of the bin that is detected is a mean over the beam, P = sum_b w_b g_b; g_b
+is its power if all light went where beamlet b goes. A hexagonal lattice of whole shells is exact
+for everything odd about the beam's axis and for squares of the places, and nearly exact for smooth
+ground. So g is made even, and its best polynomial is subtracted, of the second degree for few rays
+and the fourth for more. The rest tells how rough the ground is between the beamlets: the share of
+the beam about each beamlet is taken to be off by as much as it differs from its neighbours, each
+independently,
 
     (dP)^2 = sum w_a w_b (r_a - r_b)^2    over the pairs of neighbours.
 
-Like the error itself it falls about as one over the number of rays. It knows nothing of what no
-ray has hit, and takes smooth ground for rougher than it is, for 19 rays most of all. It was checked
-on shots that are off by more than 1e-6, powers adding, 1,000 or more of each of scan pattern
-comparison, gale crater descent, forest scan and square high descent, against 8,017 or 16,021 rays.
-It is below half of the error for one in a thousand of the forest's shots, whatever the number of
-rays, and for no others. Its median is 7 to 60 times the error for 19 rays, 2 to 10 from 61 on.
+Like the error itself it falls about as one over the number of rays. It knows nothing of what no ray
+has hit, and takes smooth ground for rougher than it is, for 19 rays most of all. It was checked on
+shots off by more than 1e-6, powers adding, against 8,017 or 16,021 rays: 1,000 of each of scan
+pattern comparison, gale crater descent, forest scan and square high descent. It is below half of
+the error for one in a thousand of the forest's shots, whatever the number of rays, and for no
+others. Its median is 7 to 60 times the error for 19 rays, 2 to 10 from 61 on.
 """
 
 import math
@@ -75,8 +75,8 @@ def ray_error(
 ) -> np.ndarray:
     """Change that more rays may make, (n,), 0..1.
 
-    That of the probabilities of detection, summed over the segments, or that of a peak's magnitude
-    relative to itself, or to sigma where that is larger: whichever is most.
+    The larger of two errors: that of the probabilities of detection, summed over the segments, and
+    that of a peak's magnitude relative to itself, or to sigma where that is larger.
 
     Powers of the shots add. The footprints are what their rays have hit, a hexagonal lattice of
     whole shells, all of it even where the effect of its spread on the lines is left out. `bins` and

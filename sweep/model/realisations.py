@@ -1,13 +1,13 @@
 """Random effects, draw by draw: each draw is a shot of its own, and what counts is their mean.
 
-Points times draws are laid out in a row, cut into stretches that memory holds, and each stretch
-is prepared as any other points are: random effects turn its parameters before, and change its
-shots after, all the others. Over the noise every draw has closed forms (PHYSICS section 6), whose
-mean over the draws converges far faster than a count of detections would.
+Points times draws are laid out in a row, cut into parts that fit the memory, and each part is
+prepared as any other points are. Random effects turn its parameters before, and change its shots
+after, all the others. Over the noise every draw has closed forms (PHYSICS section 6), whose mean
+over the draws converges far faster than a count of detections would.
 
 Every random number is addressed by point, draw and cause (:mod:`sweep.model.philox`), and sums run
-over a point's draws in their order: how draws are cut into stretches, and which points or effects
-are there besides, makes no difference to a single bit.
+over a point's draws in their order. So the cut of draws into parts, and other points or effects,
+make no difference to a single bit.
 """
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -58,7 +58,7 @@ def realise(
     """Shots of every draw of n points on a flat plane.
 
     Parameters as of :func:`sweep.model.shot.prepare`; `keys` (n, 2) are the points' random keys.
-    Any stretch of draws, from `first_draw` on, can be had alone.
+    Any part of the draws, from `first_draw` on, can be had alone.
     """
     everything = DEFAULTS | dict(parameters)
     # So that there are n points even where they differ in nothing.

@@ -1,23 +1,23 @@
 """Number of a footprint's beamlets: as many as the accuracy asked for needs.
 
-``footprint.beamlets`` 0 leaves their number to ``accuracy.tolerance``. Where powers add, the
+``footprint.beamlets`` 0 leaves their number to ``accuracy.tolerance``. If powers add, the
 largest bin's magnitude r is then within a share of itself such that pd is within a quarter of the
 tolerance: with b the threshold over sigma,
 
     |d Q_1(a, b) / d ln a| <= sqrt(a b / (2 pi)),   a (a - b) = 1/2 at its largest,
 
 in each of three segments. Most of the rest is the effects' (:mod:`.effects.planning`).
-Where amplitudes add over a smooth plane no number is enough, as what is summed all but cancels:
+If amplitudes add over a smooth plane no number is enough, as what is summed all but cancels:
 what [T] takes, 109, is then taken.
 
-In a flight each beamlet is a ray, and nothing is known of the ground before they are cast: few are
+In a flight each beamlet is a ray, and nothing is known of the ground before they are cast. Few are
 (:func:`rays_needed`), what these leave is estimated from what they hit (:mod:`.ray_error`), and
 shots of which that is too much are cast again with more (:func:`more_rays`).
 
-Where beamlets add as powers, the mean power of a bin is that of |W(k - f)|^2 over the beam, f being
-nearly proportional to one coordinate along the slope. |W|^2 is band-limited: with r the window's
-autocorrelation over lags of -1..1 records, normalised to sum 1, and s the standard deviation of f
-in bins of fs/L, a rule of nodes x_j and weights w_j is off by
+If beamlets add as powers, the mean power of a bin is that of |W(k - f)|^2 over the beam, f being
+nearly proportional to one coordinate along the slope. The function |W|^2 is band-limited. With r
+the window's autocorrelation over lags of -1..1 records, normalised to sum 1, and s the deviation of
+f in bins of fs/L, a rule of nodes x_j and weights w_j is off by
 
     integral |r(tau)| |sum_j w_j cos(2 pi s tau x_j) - exp(-(2 pi s tau)^2 / 2)| dtau
 
@@ -26,9 +26,9 @@ up to 2 pi s. Gauss and Hermite's rule is best for narrow spreads; for wide ones
 they are all but exact up to where they alias.
 
 To second order the range rises with the square of the distance from the axis, across the slope as
-along it: f = s y + c (x^2 + y^2), where E exp(i t c x^2) = 1 / sqrt(1 - 2 i t c). A line of nodes
-at x = 1 has the mean of x^2, and misses (t c)^2 at the most. More lines lie at the positive nodes
-of a rule of twice as many:
+along it. So f = s y + c (x^2 + y^2), where E exp(i t c x^2) = 1 / sqrt(1 - 2 i t c). A line of
+nodes at x = 1 has the mean of x^2, and misses (t c)^2 at the most. More lines lie at the positive
+nodes of a rule of twice as many:
 
     x ^      .  .  .  .  .      3 lines of 5 nodes, weighted by the Gaussians of x and y;
       |      .  .  .  .  .      as f is even in x, there is no need of their mirror images

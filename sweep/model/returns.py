@@ -10,13 +10,13 @@ Against ``probabilities`` peaks stay in their noiseless bins, and the interpolat
 normal error of the standard error that is reported. ``noise`` is added to ``peak_bin`` and its two
 neighbours, so that another may be the largest, or to all bins of a group's echo.
 
-Ranges and velocities are those at the shot's start, the instant of the truth. What range walk moves
-the interpolated range by, v_r (T_w + 2 t_0), and what motion between segments moves both by, is put
-right by the velocity that is measured with them; nothing tells of the acceleration. Of segments
-with slopes other than 1, 0 and -1 a return is the fit of all its peaks.
+Ranges and velocities are those at the shot's start, the instant of the truth. Range walk moves the
+interpolated range by v_r (T_w + 2 t_0), and motion between segments moves both. The velocity that
+is measured with them corrects both; nothing tells of the acceleration. Of segments with slopes
+other than 1, 0 and -1 a return is the fit of all its peaks.
 
 Echoes in developed speckle fade: in noise by factors on each group's magnitudes in the three
-segments, which share what their speckles do; against probabilities the down segment's chance
+segments, which share what their speckles do. Against probabilities the down segment's probability
 follows from the up segment's draw, and a detected peak's power is drawn for each segment alone.
 
 Standard errors are those of noise and, in quadrature, what the lines in a group make by their
@@ -206,11 +206,11 @@ class Known(NamedTuple):
     levels: np.ndarray
     """(n, 3): sigma [V]; over it, the threshold and the noise of bins that hold lines."""
     alarm: np.ndarray
-    """(n, 3): chance of a false alarm in bins that are not drawn one by one."""
+    """(n, 3): probability of a false alarm in bins that are not drawn one by one."""
     third: np.ndarray
     """(n, 2): as of :func:`sweep.model.pairing.confirm`."""
     beside: np.ndarray
-    """(n, 2, most): chance of a group in the down segment, where the up segment's of the same
+    """(n, 2, most): probability of a group in the down segment, where the up segment's of the same
     number is missed, or detected."""
     searched: np.ndarray
     """(n, 3, 2) int64: first and last of the bins that false peaks may lie in."""
@@ -289,7 +289,7 @@ def _searched(shots: Shots) -> np.ndarray:
 
 
 def _beside(shots: Shots, found: Groups) -> np.ndarray:
-    """Chances of groups in the down segment, as of :class:`Known`."""
+    """Probabilities of groups in the down segment, as of :class:`Known`."""
     up, down = found.pd[:, 0], found.pd[:, 2]
     both = shots.both(up.T, down.T, (found.magnitude[:, 0].T, found.magnitude[:, 2].T)).T
     return np.ascontiguousarray(np.moveaxis(down_given_up(up, down, both), 0, 1))
@@ -615,7 +615,7 @@ def put(peak, whole, fine, error, ratio, spread, how, tables):
 
 @njit(cache=True, error_model="numpy")
 def free_bin(chance, bins, ends, size, signed):
-    """Bin outside the groups and the bins beside them, uniformly by a chance.
+    """Bin outside the groups and their neighbours, uniformly with a given probability.
 
     One of those from the first to the last of ``ends``; of a complex record, of N = ``size`` bins,
     as far round as they go on.

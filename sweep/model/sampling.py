@@ -4,19 +4,19 @@ Draws are held against probabilities, or noise is added to the bins that matter
 (:mod:`sweep.model.draws`), or a detector and an estimator look at whole spectra with noise
 (:mod:`sweep.model.noisy_spectra`).
 
-What is promised is how far pd may be off, each segment's and the shot's, with some confidence. What
-draws tell of pd depends on what is random. Where effects are, pd is the mean over draws of the
-conditional probabilities that each draw has over its noise. Where noise alone is and is drawn, it
-is the share of draws with a detection. Where noise alone is and draws are held against known
-probabilities, pd is exact, and the counts sample it.
+The promise bounds the error of pd, each segment's and the shot's, with some confidence. The
+estimate of pd from draws depends on what is random. If effects are random, pd is the mean over
+draws of the conditional probabilities that each draw has over its noise. If noise alone is random
+and is drawn, it is the share of draws with a detection. If noise alone is random and draws are
+compared with known probabilities, pd is exact, and the counts sample it.
 
-Drawing until the promise is kept goes in rounds over all points that are still open. Who looks
-stops sooner, on the average, where the draws happen to vary little, and that costs coverage and
-adds bias: :func:`looks` looks seldom enough for both to be small. ``benchmarks/stopping.py``
-measures them. Looks come at the same numbers of draws for every point, and what a point has drawn
-depends on nothing but its own draws: other points, blocks and workers change no bit of it. A
-detector sees the draws of one point and segment together, in pieces that depend on the FFT size and
-on numbers of draws alone.
+Drawing until the promise is kept goes in rounds over all points that are still open. A test stops
+sooner, on the average, if the draws happen to vary little. This costs coverage and adds bias:
+:func:`looks` looks seldom enough for both to be small. ``benchmarks/stopping.py`` measures them.
+Looks come at the same numbers of draws for every point, and what a point has drawn depends on
+nothing but its own draws: other points, blocks and workers change no bit of it. A detector sees the
+draws of one point and segment together, in pieces that depend on the FFT size and on numbers of
+draws alone.
 """
 
 import math
@@ -185,7 +185,7 @@ def simulate(
     Parameters
     ----------
     parameters, effects
-        As for :func:`sweep.model.shot.evaluate`. Where random effects are among them the outputs
+        As for :func:`sweep.model.shot.evaluate`. If random effects are among them the outputs
         are means over the same draws that are counted. For whole spectra, parameters also by the
         names of :data:`sweep.model.estimators.DEFAULTS`.
     keys : (n, 2) uint64
@@ -215,7 +215,7 @@ def simulate(
     dict of ndarray
         (n,) by the names of OUTPUTS and ERROR_OUTPUTS, or SPECTRA_OUTPUTS, and ACCURACY_OUTPUTS of
         :mod:`sweep.model.outputs`; (n, batches) int64 by those of DRAW_OUTPUTS, all draws in one
-        count without batches. Where random effects or whole spectra are simulated, also RUNNING,
+        count without batches. If random effects or whole spectra are simulated, also RUNNING,
         (n, columns).
     """
     ends = first_draw + np.cumsum([0, *(batch_sizes or [limit])])

@@ -98,7 +98,7 @@ def _cut(numbers, where, levels, how, magnitudes, exempts, chances):
         :attr:`sweep.model.preparation.Shots.echo_rule`; segments (3,) whose leakage is looked at.
     magnitudes, exempts : ndarray
         Of all runs.
-    chances : (3, segments, m) float64
+    probabilities : (3, segments, m) float64
         pd, miss and leakage.
     """
     (band, period, lines, inside), (rule, leaks) = where, how
@@ -167,7 +167,7 @@ def _keep_echoes(run, exempt, low, level, beside, band, lines):
 
 @njit(cache=True, error_model="numpy")
 def leakage_of(run, exempt, levels):
-    """Chance that any bin of a run that is not exempt adds a crossing to that of noise."""
+    """Probability that any bin of a run that is not exempt adds a crossing to that of noise."""
     level, sigma, floor = levels
     b, any_ = level / sigma, 0.0
     stays = -math.expm1(-0.5 * b * b)

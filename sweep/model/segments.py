@@ -93,7 +93,7 @@ class Runs(NamedTuple):
     leakage: np.ndarray
     """Probability that leaked signal raises at least one extra group, over noise alone."""
     start: np.ndarray
-    """Where each run begins in what follows."""
+    """Begin of each run in the arrays that follow."""
     magnitudes: np.ndarray
     """|X| of all runs, one after the other."""
     exempt: np.ndarray

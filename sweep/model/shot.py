@@ -1,6 +1,6 @@
 """Shots, one or many: parameters in, detection and false-alarm statistics out.
 
-Bare shots, then the effects that are called for, one by one: what no scene calls for is in no step.
+Bare shots, then the effects that are needed, one by one.
 """
 
 from collections.abc import Callable, Collection, Iterator, Mapping
@@ -153,9 +153,9 @@ def statistics(shots: Shots, found: np.ndarray | None = None) -> dict[str, np.nd
 def chances(
     shots: Shots, pd: np.ndarray, miss: np.ndarray, magnitudes: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Chances that a shot is detected, and that it is missed, (n,).
+    """Probabilities that a shot is detected, and that it is missed, (n,).
 
-    By the segments' own chances and |X| of their bins [V], (3, n) each.
+    By the segments' own probabilities and |X| of their bins [V], (3, n) each.
     """
     if shots.any_two:
         if shots.fading is None:

@@ -3,10 +3,10 @@
 Spectra are those of :mod:`sweep.model.noisy_spectra`, as grids have them: a shot is a point, with
 the echoes of all the surfaces that it sees. Flagged bins that are adjacent make a peak, placed by
 the estimator; the strongest of them are paired, judged and measured as all others of a flight
-(:mod:`sweep.model.returns`). A peak belongs to an echo whose bins it touches: those from the first
-to the last of half the echo's largest magnitude, and a main lobe's half-width to either side (the
-strongest and one to either side of it by ``peak_bin``). An echo has one peak, the strongest. All
-others are false, as many as there are.
+(:mod:`sweep.model.returns`). A peak belongs to an echo whose bins it touches. These are the bins
+from the first to the last of half the echo's largest magnitude, and a main lobe's half-width to
+either side (the strongest and one to either side of it by ``peak_bin``). An echo has one peak, the
+strongest. All others are false, as many as there are.
 
 A draw is looked at by itself, so that a user's function answers the same however draws are cut.
 

@@ -344,7 +344,7 @@ def field(first, count, lines, table, form, sizes, tangent, room):
 
 @njit(cache=True, error_model="numpy")
 def gap_of(first, count, lowest, highest, fft_size):
-    """Least distance of some bins from lines, around the circle of all bins; 0 amid them."""
+    """Least distance of some bins from lines, around the circle of all bins; 0 between them."""
     apart = first + 0.5 * (count - 1) - 0.5 * (lowest + highest)
     apart = abs(apart - fft_size * np.rint(apart / fft_size))
     return max(apart - 0.5 * (count - 1) - 0.5 * (highest - lowest), 0.0)

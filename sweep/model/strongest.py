@@ -1,8 +1,9 @@
-"""Segments that report their strongest peak alone: chances that it is the echo's, or another's.
+"""Probabilities that the strongest peak of a segment is the echo's, or another's.
 
 A peak elsewhere that is larger than the echo's takes its place: what is reported is detected, with
-a wrong range. Let Z be the largest |X| of the bins searched that the echo does not occupy, b the
-threshold and P_z the chance that the echo crosses a level z, by the same law as at b. Then
+a wrong range. Let Z be the largest |X| of the bins searched that the echo does not occupy, and b
+the threshold. Let P_z be the probability that the echo crosses a level z, by the same law as at b.
+Then
 
     P(right) = P_b - L,    P(wrong) = P(Z >= b) (1 - P_b) + L,
     L = int_b^inf (P_b - P_z) dP(Z < z),    P(none) = P(Z < b) (1 - P_b)
@@ -10,10 +11,10 @@ threshold and P_z the chance that the echo crosses a level z, by the same law as
 and these three add to 1. All terms are positive, so that small ones keep their digits. P(Z < z) is
 that no bin of noise crosses z, n independent ones at each level (:mod:`sweep.model.alarms`), and
 that no bin of leaked signal does either. With y = z^2 / (2 sigma^2), -ln P(Z < z) is very nearly
-proportional to e^-y. The integral over y is Gauss's in stretches, and its mass is made exact.
+proportional to e^-y. The integral over y is Gauss's in intervals, and its mass is made exact.
 
-Noise is independent from segment to segment, and so are right peaks of a steady echo. Where speckle
-is shared, the chance of both is that of two correlated Rayleigh magnitudes which cross their own
+Noise is independent from segment to segment, and so are right peaks of a steady echo. If speckle is
+shared, the probability of both is that of two correlated Rayleigh magnitudes which cross their own
 levels, max(b, Z), averaged over both Z. An echo of many bins counts at each level as the one bin
 that crosses it as often. It is within 0.01 of drawn records at any threshold.
 
@@ -45,14 +46,14 @@ _SLOPE = np.array(
 
 
 def outcomes(shots: Any, pd: np.ndarray, miss: np.ndarray) -> dict[str, np.ndarray]:
-    """Chances of each segment and of a shot, (n,) by name: ``pd_``, ``miss_``, ``p_wrong_range_``.
+    """Probabilities of segments and shot, (n,) by name: ``pd_``, ``miss_``, ``p_wrong_range_``.
 
     Parameters
     ----------
     shots : Shots
         Prepared points, one record of each segment.
     pd, miss : (3, n) ndarray
-        Chances that each segment's echo crosses the threshold, and that it does not.
+        Probabilities that each segment's echo crosses the threshold, and that it does not.
     """
     lost, alarm, shared = np.zeros((3, shots.size)), np.zeros((3, shots.size)), np.zeros(shots.size)
     for runs in runs_of(shots, every_bin=True):
@@ -197,13 +198,13 @@ def _at_levels(numbers, inside, bins, levels, noise, how, lost, silence):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _share(weights, rare, share, alike, shared):
-    """Excess chance that both peaks are right where any noise crosses in either, (m,) in place.
+    """Excess probability that both peaks are right if noise crosses in either, (m,) in place.
 
     Parameters
     ----------
     weights, rare, share : tuple
-        Of up and down segment, (m, 1 + k) each, the threshold first: chances of levels that the
-        echo has to cross; -ln P_z; share of signal in the power of the bin detected as often.
+        Of up and down segment, (m, 1 + k) each, the threshold first: probabilities of levels that
+        the echo has to cross; -ln P_z; share of signal in the power of the bin detected as often.
     alike : (m,) float64
         Square of the correlation of the signals' amplitudes.
     shared : (m,) float64

@@ -6,12 +6,12 @@ sigma sqrt(2 - pi/2). A threshold of b sigma is written in one of five ways:
     tnr                  b / sqrt(2 - pi/2), as the thesis has it
     threshold_to_mean    b / sqrt(pi/2)
     design_pfa_bin       exp(-b^2 / 2)
-    design_pfa_segment   chance that any bin counted in a segment, the up-chirp's, crosses
+    design_pfa_segment   probability that any bin counted in a segment, the up-chirp's, crosses
     design_pfa_shot      the same of a shot: of any of its segments, one after the other
 
 Design probabilities are those of noise alone, before a detection takes bins away. In several looks
 (:mod:`sweep.model.looks`) b is that of each record, or of the root of their mean power, over sigma
-of one record, and the chances are those of all of them together.
+of one record, and the probabilities are those of all of them together.
 """
 
 import math

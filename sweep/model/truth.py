@@ -104,7 +104,7 @@ def analytic_record(
     """Voltage of one beamlet at the ADC as a complex record (L,); its real part is sampled.
 
     The ground that the beam meets comes nearer by ``approach``, its scatterers by their own radial
-    velocity; both from the shot's start on. Where the two differ the beam slides over the ground:
+    velocity; both from the shot's start on. If the two differ the beam slides over the ground:
     scatterers take each other's place, and the beat has the delay of those that are there.
     """
     sign, carrier = shots.slopes[segment], float(_at(shots.carriers[segment], i))

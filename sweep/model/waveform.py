@@ -10,16 +10,15 @@ Its terms up to t give one line per segment:
     beat             f_seg beta - s S tau_0 (1 + beta)       [Hz, signed]
 
 f_seg is the optical frequency at the segment's start: c/lambda for the up-chirp and the Doppler
-segment, c/lambda + B for the down-chirp. To leading order the beats are f_d - f_r, f_d and
-f_d + f_r with f_d = 2 v_r / lambda and f_r = S 2 R / c [T 2.8]; what is kept beyond that moves
-the down beat of Table 4.1 by 0.2 bins at 150 m/s. The terms in t^2 are range walk, an effect of
-its own. By [T] each segment starts with the target at range R; that it moves on in between is an
-effect too.
+segment, c/lambda + B for the down-chirp. To leading order the beats are f_d - f_r, f_d and f_d +
+f_r with f_d = 2 v_r / lambda and f_r = S 2 R / c [T 2.8]. The further terms move the down beat of
+Table 4.1 by 0.2 bins at 150 m/s. The terms in t^2 are range walk, an effect of its own. By [T] each
+segment starts with the target at range R; that it moves on in between is an effect too.
 
 A shot has an up- and a down-chirp, in any order, and may have a Doppler segment before, between or
 behind them: the lander's ``up doppler down``, the triangle ``up down`` of automotive lidars. All
 last as long, with equal gaps. Without a Doppler segment two beats tell of two unknowns, and
-half sum and half difference could be exchanged: the target is taken to be further away than
+half sum and half difference could be exchanged. The target is taken to be further away than
 |v_r| c / (lambda S), so that |f_d| < f_r, and no beat to be folded. Complex records (I and Q) keep
 the sign of each beat, and two tell both unknowns.
 """
@@ -62,7 +61,7 @@ ENDS = RANGES + VELOCITIES
 
 
 class Segment(NamedTuple):
-    """One stretch of a waveform, in which the frequency rises or falls evenly or stands still."""
+    """One part of a waveform, in which the frequency rises or falls evenly or stands still."""
 
     name: str
     slope: float
@@ -254,14 +253,13 @@ def resolve(
 
     Frequencies with signs (``signed``), of complex records, are read by :data:`SIGNED`. Without a
     Doppler segment, ``doppler=None``, others are read by :data:`FAR`, or by :data:`FAST` where a
-    fast target is ``assumed``. With it there are two
-    unknowns and three peaks: every reading (each peak as it stands or folded at Nyquist,
-    half sum or half difference being the Doppler frequency) predicts the third peak. The reading
-    that predicts it best is taken, a fold counting as :data:`FOLD_PENALTY` bins of mismatch. The
-    sign of down - up is the velocity's.
+    fast target is ``assumed``. With it there are two unknowns and three peaks: every reading (each
+    peak as it stands or folded at Nyquist, half sum or half difference being the Doppler frequency)
+    predicts the third peak. The reading that predicts it best is taken, a fold counting as
+    :data:`FOLD_PENALTY` bins of mismatch. The sign of down - up is the velocity's.
 
-    PHYSICS section 2 gives the unfolded readings. That half sum and half difference belong to
-    the carrier and to the range at mid-chirp is put right here.
+    PHYSICS section 2 gives the unfolded readings. Half sum and half difference belong to the
+    carrier and to the range at mid-chirp; this is corrected here.
     """
     if signed or doppler is None:
         code = SIGNED if signed else FAST if assumed == FAST_TARGET else FAR
@@ -307,9 +305,9 @@ def fit(
     - ``fast``: the Doppler shift exceeds every range beat, so that all beats have one sign, that
       which makes the range positive.
 
-    Peaks with signs (``signed``), of complex records, are known but for whole sample rates: the
-    two segments of rates furthest apart give the least range that is not negative, and a Doppler
-    shift within half the sample rate.
+    Peaks with signs (``signed``), of complex records, are known but for whole sample rates. The two
+    segments of rates furthest apart give the least range that is not negative, and a Doppler shift
+    within half the sample rate.
 
     Parameters
     ----------

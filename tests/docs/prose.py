@@ -12,9 +12,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 REPOSITORY = Path(__file__).parents[2]
-PACKAGES = ("analysis", "cli", "model", "report", "scenes", "spec", "storage", "tasks")
-"""Packages whose docstrings are checked; also the modules directly in sweep/."""
-
 LONGEST = 35
 OPENS = re.compile(r"(What|Whether|Where|How|Who|That|Which)\b(?!-|[^.?!]*\?$)")
 """Relative clauses that open a statement; a question may begin with the same words."""
@@ -25,6 +22,8 @@ AVOID = re.compile(
 )
 
 _FENCE = re.compile(r"^(?P<mark>`{3,}|~{3,}).*?^(?P=mark)[ \t]*$", re.S | re.M)
+_TABLE = re.compile(r"^[ ]*=+( +=+)+\n.*?(?=\n[ ]*\n|\Z)", re.S | re.M)
+"""A table of reStructuredText, up to an empty line."""
 _COMMENT = re.compile(r"<!--.*?-->|\A---\n.*?\n---\n", re.S)
 _LINK = re.compile(r"!?\[([^\]]*)\]\([^)]*\)")
 _CODE = re.compile(r"`+[^`]+`+(_+)?")
@@ -36,7 +35,7 @@ _SHORT = re.compile(r"\b(e\.g|i\.e|etc|cf|Fig|Figs|Eq|Sec|vs|al|approx|No|St)\.(
 
 def sentences(text: str) -> list[str]:
     """Sentences of a text in Markdown."""
-    text = _FENCE.sub("\n\n", _COMMENT.sub("", text))
+    text = _TABLE.sub("\n", _FENCE.sub("\n\n", _COMMENT.sub("", text)))
     paragraphs: list[list[str]] = [[]]
     for line in text.splitlines():
         item = _ITEM.match(line)
@@ -98,8 +97,7 @@ def docstrings(source: str) -> Iterator[str]:
 def files() -> dict[str, list[str]]:
     """Sentences of each file that is checked."""
     pages = [*(REPOSITORY / "docs").rglob("*.md"), *REPOSITORY.glob("*.md")]
-    modules = [m for p in PACKAGES for m in (REPOSITORY / "sweep" / p).rglob("*.py")]
-    modules += (REPOSITORY / "sweep").glob("*.py")
+    modules = (REPOSITORY / "sweep").rglob("*.py")
     found = {}
     for path in sorted(pages) + sorted(modules):
         text = path.read_text(encoding="utf-8")

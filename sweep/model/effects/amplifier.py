@@ -1,12 +1,12 @@
 """Spontaneous emission of an optical amplifier, which beats with the local oscillator.
 
-An amplifier of gain G and inversion factor n_sp emits, beside the light that it raises,
+An amplifier of gain G and inversion factor n_sp emits, besides the light that it amplifies,
 
     N = n_sp (G - 1) h nu                                                       [W/Hz]
 
 into the mode of that light, in its polarisation [Desurvire, Erbium-Doped Fiber Amplifiers, 1994,
-ch. 2; its noise figure is 2 n_sp (G - 1) / G + 1 / G]. What of it comes onto the detector beats
-with the local oscillator's power P_lo: a signal-spontaneous beat noise, of current variance
+ch. 2; its noise figure is 2 n_sp (G - 1) / G + 1 / G]. The part of it that reaches the detector
+beats with the local oscillator's power P_lo: a signal-spontaneous beat noise, of current variance
 
     4 (M Re)^2 P N' B_e                     [Olsson, J. Lightwave Technol. 7, 1071, 1989, eq. 12]
 
@@ -14,16 +14,16 @@ within the electrical bandwidth B_e, for light P and a density N' that has twice
 either side of it. Two ways lead there:
 
 - **With what is sent.** A circulator of the isolation I, a window or a splice puts 1 / I of the
-  sent light, and of the emission with it, onto the detector: P is the part eta P_lo that mixes, and
+  sent light, and of the emission with it, onto the detector. P is the part eta P_lo that mixes, and
   N' = N / I. A balanced receiver sees the beat in full.
-- **With the local oscillator**, where that is tapped behind the amplifier: emission and light go
+- **With the local oscillator**, where that is tapped behind the amplifier. Emission and light go
   with each other, N' = N P_lo / P_sent, and beat on each diode as a fluctuation of the local
   oscillator does, of a relative intensity noise of 4 N / P_sent. The common-mode rejection divides
   it.
 
-Emission that comes back with the echo is left out: it is below the echo's own beat by
-P_sent / (2 N B_e), some 60 dB before the FFT; so is the beat of emission with itself, below these
-by N B_e / P_lo. Direct detection has no local oscillator.
+Emission that comes back with the echo is left out: it is below the echo's own beat by P_sent / (2 N
+B_e), some 60 dB before the FFT. The beat of emission with itself is left out too, below these by N
+B_e / P_lo. Direct detection has no local oscillator.
 """
 
 from collections.abc import Mapping

@@ -12,7 +12,7 @@ Sources of the tables:
   (Elements of Infrared Technology, 1962) as revised by Kim, McArthur and Korevaar (Proc. SPIE
   4214, 2001) below 6 km; visibility 23 km (clear) and 5 km (haze); aerosol scale height 1.2 km
   (Elterman, AFCRL-68-0153, 1968). Molecules add less than 2e-7/m at 1.55 um.
-- Mars: well-mixed dust of scale height 11 km (Conrath, Icarus 24, 1975); optical depths 0.5 (a
+- Mars: well-mixed dust of scale height 11 km (Conrath, Icarus 24, 1975). Optical depths are 0.5 (a
   usual season), 1 and 5 (a global storm), after the record of Lemmon et al., Icarus 251, 2015, at
   0.88 um. Grains of 1.5 um dim 1.55 um alike to some 10 %.
 - Lidar ratios: haze 30 to 70 sr, Martian dust about 40 sr, water drops 18 sr.
@@ -134,7 +134,7 @@ def transmission(
 
 
 PATH_ELEVATION = "path.elevation"
-"""Where a scene gives it: angle of the beam below the horizon [rad], shot by shot."""
+"""Angle of the beam below the horizon [rad] by shot; only of scenes."""
 
 
 def profile_of(p: Mapping[str, np.ndarray]) -> Profile | None:
@@ -259,12 +259,12 @@ def returned(
     """Integral over 0..R of alpha(r) T(r)^2 / (r^2 + r_0^2) dr [1/m^2], r_0 = D / Theta = `near`.
 
     A continuous beam has P_tx A tau_o / S times it sent back by the air to the detector [W], S the
-    lidar ratio [sr]. r^2 / (r^2 + r_0^2) is the overlap of a collimated beam with its own receiver:
-    nearer than r_0 a point's image is larger than the field of view. For a beam at the limit of
-    diffraction, Theta = 4 lambda / (pi D), it is the coherent lidar's of Sonnenschein and Horrigan
-    (Appl. Opt. 10, 1971, 1600, focus at infinity). By Gauss's rule over atan(r / r_0) between the
-    rows of the profile that the path crosses, those cut where the extinction or the overlap has
-    fallen; within 1e-8. Heights as of :func:`optical_depth`.
+    lidar ratio [sr]. The factor r^2 / (r^2 + r_0^2) is the overlap of a collimated beam with its
+    own receiver. Nearer than r_0 a point's image is larger than the field of view. For a beam at
+    the limit of diffraction, Theta = 4 lambda / (pi D), it is the coherent lidar's of Sonnenschein
+    and Horrigan (Appl. Opt. 10, 1971, 1600, focus at infinity). By Gauss's rule over atan(r / r_0)
+    between the rows of the profile that the path crosses, those cut where the extinction or the
+    overlap has fallen; within 1e-8. Heights as of :func:`optical_depth`.
     """
     given = (np.asarray(value, float) for value in (start_height, end_height, range, near))
     h0, h1, far, near = (np.expand_dims(column, -1) for column in np.broadcast_arrays(*given))
@@ -306,8 +306,7 @@ def scatter_back(shots: Shots, scene: Scene) -> Shots:
     """Shot noise of the light that the air sends back.
 
     Its beat with the local oscillator, from ever new grains, is spread over the bins from the
-    nearest range to the target's and is left out; [T 3.3.1] counts backscatter among the noise
-    likewise.
+    nearest range to the target's and is left out; [T 3.3.1] counts it among the noise too.
     """
     p = scene.parameters
     air = profile_of(p)

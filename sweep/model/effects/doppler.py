@@ -2,8 +2,8 @@
 
 Without the shift nothing is known of velocity at all, whatever the detection probability says: it
 is left out only where lines would not move by any share of a bin that matters. The spread matters
-where 2/lambda |v_perp| div is not small against a bin (100 m/s across and 50 urad: 1.4 bins of
-4.6 kHz), or v (1 - cos theta) of a velocity along a wide beam is not.
+where 2/lambda |v_perp| div is not small against a bin (100 m/s across and 50 urad: 1.4 bins of 4.6
+kHz). So does v (1 - cos theta) of a velocity along a wide beam.
 
 The surface of a turning body moves with V + omega x (P - X). A beamlet along d_b that meets it at
 P_b = O + R_b d_b, seen from O, has from the rotation the closing speed -omega x (P_b - X) . d_b =

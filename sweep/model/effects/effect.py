@@ -1,7 +1,7 @@
 """Physical effects to the rest of the model: where each acts, what it changes, what it does.
 
 Its parameters become fields of a spec. The planner asks for its size at the points of each tile;
-:mod:`sweep.model.shot` applies it where some point calls for it, and nothing of it is computed
+:mod:`sweep.model.shot` applies it where some point needs it, and nothing of it is computed
 elsewhere. All effects are listed in :mod:`sweep.model.effects.catalogue`.
 """
 
@@ -19,9 +19,10 @@ if TYPE_CHECKING:
     from sweep.model.effects.points import Points, Smear
 
 STAGES = ("lines", "light", "noise", "record", "spectrum", "detection", "draws")
-"""Where effects act, in this order: on the lines of a footprint; on the light that comes back; on
-the noise; on the record and its phases; on the spectrum; on what is detected in it; and, draw by
-draw, on all of these at random."""
+"""Stages at which effects act, in this order: on the lines of a footprint; on the light that comes
+back; on the noise; on the record and its phases; on the spectrum; on what is detected in it; and,
+draw by draw, on all of these at random.
+"""
 
 MODES = ("auto", "on", "off")
 
@@ -140,7 +141,7 @@ class Effect:
     within: str = ""
     """An effect that this is part of: kept wherever this is; where it is off, so is this."""
     apart: bool = True
-    """Whether points that have it are computed apart from those that don't. Where not, `act` looks
+    """Whether points that have it are computed apart from those that don't. If not, `act` looks
     at :attr:`Scene.where`, and leaves the bits of other points as they would be without it."""
     needs: tuple[str, ...] = ()
     """Effects that this one is simulated with, however little they change by themselves."""

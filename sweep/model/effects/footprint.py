@@ -72,11 +72,11 @@ FOOTPRINT = Effect(
 def phase_size(points: Points) -> Size | None:
     """Change of the largest bin by optical phases: it may fade, or gain as a sum in phase does.
 
-    The round trip to beamlet b differs by 4 pi/lambda (R_b - R_0) in phase. Where that is not small
+    The round trip to beamlet b differs by 4 pi/lambda (R_b - R_0) in phase. If that is not small
     against 1 the sum may be anything from nothing to sqrt(N) times (Cauchy and Schwarz) what the
-    powers make; where it is, beamlets add in phase to g = sum a_b / sqrt(sum a_b^2) times that,
-    which is no less of a change: it is kept wherever there are several beamlets. One beamlet's line
-    adds to its own image.
+    powers make. If it is small, beamlets add in phase to g = sum a_b / sqrt(sum a_b^2) times that,
+    which is no less of a change. So the effect is kept wherever there are several beamlets. One
+    beamlet's line adds to its own image.
     """
     if not points.by_roots:
         return None
@@ -105,10 +105,10 @@ FOOTPRINT_PHASE = Effect(
 def surfaces_size(points: Points) -> Size | None:
     """Change of the largest bin by the ranges of other surfaces than the axis's.
 
-    As powers, with a share f beside the axis's surface, whose own lines put a in their largest
-    bin: with the effect that bin holds a at the least, and no bin more than a + f; without it the
-    largest holds a at the least, and a and f's line on the axis at the most. Of amplitudes that
-    add nothing is known but that no bin holds more than all in phase.
+    As powers, with a share f off the axis's surface, whose own lines put a in their largest bin.
+    With the effect that bin holds a at the least, and no bin more than a + f. Without it the
+    largest holds a at the least, and a and f's line on the axis at the most. Of amplitudes that add
+    nothing is known but that no bin holds more than all in phase.
     """
     share = np.minimum(points.footprint.beside, 1.0)
     if not (share > 0).any():

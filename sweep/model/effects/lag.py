@@ -3,7 +3,7 @@
 A scanner has turned on by omega 2R/c before the light is back, so that the receiver looks where it
 no longer transmits. The parallax of a bistatic pair and a misalignment do the same. Of the light
 that one mode collects exp(-2 d^2 / (w_T^2 + w_L^2)) is left, d the distance of the axes
-(:mod:`sweep.model.beam`). Where all light in the aperture mixes, nothing is lost.
+(:mod:`sweep.model.beam`). If all light in the aperture mixes, nothing is lost.
 """
 
 from dataclasses import replace

@@ -3,10 +3,10 @@
 Two models, both as the mean of |X|^2 over records, with the window's actual kernel.
 
 **Gaussian** [T, section 3.2]: the power spectrum convolved with a Gaussian of the given FWHM, at
-any delay. That is exactly the mean over records that each have one random normal frequency,
-common to all beamlets: jitter slow against the record. The mean over the frequency is a sum over
-equally spaced shifts, to a stated error: |X|^2 of a record of L samples has lags below L only,
-and the trapezium rule misses a Gaussian's aliases alone.
+any delay. This is exactly the mean over records that each have one random normal frequency, common
+to all beamlets: jitter slow against the record. The mean over the frequency is a sum over equally
+spaced shifts, to a stated error. |X|^2 of a record of L samples has lags below L only. The
+trapezium rule misses a Gaussian's aliases alone.
 
 **Lorentzian**: a laser whose phase is a random walk (FWHM dnu, Gamma = 2 pi dnu), mixed with
 itself after a delay tau [Gallion and Debarge 1984; Richter et al. 1986]. The beat's factor
@@ -147,9 +147,9 @@ def power_under_line(
     :func:`coherent_share`.
 
     sum_j r_j [e^{-Gamma T_j} - e^{-Gamma tau}], r the window's autocorrelation, is taken as it
-    stands where few lags are left of it; else as the integral over the lag, by Gauss and Legendre's
-    rule, and what its kinks at no lag and at the delay alias to, in closed form: within 2e-5 for
-    delays from 20 samples, 1 % for a delay of less than one sample.
+    stands where few lags are left of it. Else it is the integral over the lag, by Gauss and
+    Legendre's rule, and what its kinks at no lag and at the delay alias to, in closed form. This is
+    within 2e-5 for delays from 20 samples, 1 % for a delay of less than one sample.
     """
     duration = np.asarray(duration, float)
     gamma = 2 * np.pi * np.asarray(line_width, float) * duration
@@ -278,9 +278,9 @@ def walked_phase(
     """Phase theta(t) - theta(t - tau) [rad] of a laser over a record, but for its first sample's.
 
     `steps` (walk_steps,) are standard normal numbers, `per_sample` the variance of theta's change
-    from sample to sample, Gamma / fs, `delay` is tau [samples]; with `whole` the first sample's as
-    well, for a delay shorter than the record. Each step between samples is taken in two, before and
-    after the place in it at which delayed samples lie: so delays need not be whole.
+    from sample to sample, Gamma / fs. `delay` is tau [samples]. With `whole` the result has the
+    first sample's as well, for a delay shorter than the record. Each step between samples is taken
+    in two, before and after the place in it at which delayed samples lie. So delays need not be whole.
     """
     before, after = steps.reshape(2, -1)
     part = delay - math.floor(delay)

@@ -10,22 +10,21 @@ tau(t) = tau_0 - beta t - alpha t^2, beta = 2 v_r / c, alpha = a / c:
     psi(t) = f_seg alpha t^2 + s S [ -tau_0 alpha t^2 + alpha (1 + beta) t^3 + alpha^2 t^4 / 2 ]
 
 the first a frequency drift of 2 s S (2 v_r / c), of opposite sign in up and down chirp, none in the
-Doppler segment; the second mostly one of 2 a / lambda, positive when the radial velocity grows.
-Half of the first comes from the range, half from the chirp's rising Doppler shift. Where the range
+Doppler segment. The second is mostly one of 2 a / lambda, positive when the radial velocity grows.
+Half of the first comes from the range, half from the chirp's rising Doppler shift. If the range
 along the beam falls at another speed u than v_r, as the beam slides over slanting ground, its own
-half follows u: s S (u - v_r) / c t^2 more.
-Time runs from the segment's start: the line moves by the drift up to the middle of the record and
-spreads over what drifts within it.
+half follows u: s S (u - v_r) / c t^2 more. Time runs from the segment's start: the line moves by
+the drift up to the middle of the record and spreads over what drifts within it.
 
-A sweep departs from a straight line by e(x) [Hz], a property of the laser's tuning: a function of
-the place u along the sweep, -1 at the lowest and 1 at the highest frequency, so that the down-chirp
-runs through it backwards:
+A sweep departs from a straight line by e(x) [Hz], a property of the laser's tuning. It is a
+function of the place u along the sweep, -1 at the lowest and 1 at the highest frequency, so that
+the down-chirp runs through it backwards:
 
     e = q T_2(u) + k T_3(u) + p sin(pi m u),    u = s (2 t / T - 1)
 
-T_2 = 2 u^2 - 1 and T_3 = 4 u^3 - 3 u are what is left of a square and a cube beside the best
-straight line, with peak 1; m is the number of periods over the sweep. With E the integral of e
-over time, the beat (delayed wave less local oscillator) gains exactly
+T_2 = 2 u^2 - 1 and T_3 = 4 u^3 - 3 u are a square and a cube less the best straight line, with peak
+1. The number m is the number of periods over the sweep. With E the integral of e over time, the
+beat (delayed wave less local oscillator) gains exactly
 
     psi(t) = E(t - tau(t)) - E(t),    tau(t) = tau_0 - beta t
 
@@ -34,9 +33,9 @@ An error that was measured comes as a table, of frequency errors by the time in 
 fitted once by a Chebyshev series (:mod:`sweep.model.effects.sweep_table`), whose integral over the
 delay is exact.
 
-Sizes: with w real and even about the record's middle, a phase error phi = o(x) + e(x), odd and even
-part (a constant does not matter), changes a line's spectrum W(y), real but for the factor
-exp(-i pi y) and the unpaired first sample w_0, by A + i B, all relative to sum w:
+Sizes: w is real and even about the record's middle. A phase error has an odd and an even part, phi
+= o(x) + e(x); a constant does not matter. It changes a line's spectrum W(y), real but for the
+factor exp(-i pi y) and the unpaired first sample w_0, by A + i B, all relative to sum w:
 
     |A| <= a = <|o| + e^2 / 2>      |B| <= b = <|e|>      < > the mean weighted with |w| / sum w
 
@@ -143,7 +142,7 @@ def missed(smear: Smear, window: Window) -> np.ndarray:
 def added(points: Points, smear: Smear) -> np.ndarray:
     """Part of a phase error in sums of amplitudes, lines and images, as of :class:`Size`.
 
-    Lines beside their images change by the phase in the record's middle too, and so does a line by
+    Lines next to their images change by the phase in the record's middle too, and so does a line by
     what an image far away adds to it.
     """
     known = means(points.window)

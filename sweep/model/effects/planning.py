@@ -1,21 +1,21 @@
-"""Effects to be simulated in each tile: those that any of its points calls for.
+"""Effects to be simulated in each tile: those that any of its points needs.
 
 The change by leaving an effect out is estimated at each point, and is a tile's largest. The
 smallest are left out as long as their sum is within the tolerance: a tighter one keeps all that a
 looser one does.
 
 With x = ln a, a and the threshold b over sigma, dQ_1/dx = a b I_1(a b) e^{-(a^2 + b^2)/2} is at
-most sqrt(a b / (2 pi)) e^{-(a - b)^2 / 2}, which has one maximum, at a (a - b) = 1/2. It is taken
-at its largest between the least and the largest a that all effects together may leave. What is
-added to a magnitude counts by dQ_1/da <= 1/2 e^{-(a - b)^2 / 2}, noise that the threshold does not
-follow by -dQ_1/d ln b <= b^2 e^{-(a - b)^2 / 2} / sqrt(1 + 2 a b), and
+most sqrt(a b / (2 pi)) e^{-(a - b)^2 / 2}. This has one maximum, at a (a - b) = 1/2. It is taken
+at its largest between the least and the largest a that all effects together may leave. An addition
+to a magnitude counts by dQ_1/da <= 1/2 e^{-(a - b)^2 / 2}, noise that the threshold does not follow
+by -dQ_1/d ln b <= b^2 e^{-(a - b)^2 / 2} / sqrt(1 + 2 a b), and
 
     |d log10 P^2| <= |d b^2| / ln 10
 
-for the chance P^2 of a false alarm in a shot. Where pd is 1 whatever happens bins still have
+for the probability P^2 of a false alarm in a shot. If pd is 1 whatever happens bins still have
 magnitudes: |X| counts by its change over itself, or over sigma where it is below that.
 
-Where segments report their strongest peak alone an echo has to exceed the largest noise too: b is
+If segments report their strongest peak alone an echo has to exceed the largest noise too: b is
 the level at which pd is steepest, of those between the threshold and that.
 """
 
@@ -170,9 +170,9 @@ def changes(
 ) -> dict[str, np.ndarray]:
     """Change of pd, log10 pfa or |X| by each effect, whichever is most, 0..1, over the points.
 
-    Of pd it is the sum of the changes in all segments, which bounds that of their product. Where
-    leakage is asked for, `leaking` tells of each effect whether it moves light from bins to others:
-    bins that leak are then taken to be off by as many sigmas as the largest; that counts up to the
+    Of pd it is the sum of the changes in all segments, which bounds that of their product. If
+    leakage is asked for, `leaking` tells of each effect whether it moves light from bins to others.
+    Bins that leak are then taken to be off by as many sigmas as the largest; that counts up to the
     leakage's own size.
     """
     low, high = plausible(sizes, points)

@@ -1,8 +1,7 @@
 """Pointing jitter over a plane: a random turn of the beam, draw by draw.
 
 The beam is thrown off by two independent normal angles of deviation sigma, a in the plane of
-incidence (towards grazing) and b across it. From the same height over the same plane it then
-meets
+incidence (towards grazing) and b across it. From the same height over the same plane it then meets
 
     sin(grazing') = sin(grazing) cos(t) - a cos(grazing) sin(t)/t,     t^2 = a^2 + b^2
     range' = range sin(grazing) / sin(grazing'),
@@ -11,11 +10,11 @@ to first order range (1 + a cot(grazing)); along the normal, range (1 + t^2/2). 
 knows nothing of it: its reports are of the turned beam.
 
 It acts before everything else, on the geometry of a draw, from which echo, lines and noise follow
-as ever; the footprint turns with its axis. Where phases follow the geometry, the footprint of
+as ever; the footprint turns with its axis. If phases follow the geometry, the footprint of
 every draw fades anew.
 
-Of the velocity, a plane's target gives what lies along the beam. What lies across may be given
-too; the turned beam sees v_r cos(t) + (v_a a + v_b b) sin(t)/t.
+Of the velocity, a plane's target gives what lies along the beam. The velocity across may be given
+too. The turned beam sees v_r cos(t) + (v_a a + v_b b) sin(t)/t.
 """
 
 import math
@@ -29,7 +28,7 @@ from sweep.model.effects.points import Points, Smear, by_power
 from sweep.model.footprint import NO_SPREAD, reach_of
 
 RARE = 1e-6
-"""Chance of a draw whose beam is further off than its size takes it to be."""
+"""Probability of a draw whose beam is further off than its size takes it to be."""
 
 _JITTER = "target.pointing_jitter"
 

@@ -33,8 +33,9 @@ from sweep.model.unsupported import UnsupportedShot
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(32)
 _CUTS = np.array([-8.0, 0.0, 8.0])
-"""Where the quarter of a period is cut, in deviations of the noise off full scale: the integrands
-are smooth in between."""
+"""Point at which the quarter of a period is cut, in deviations of the noise off full scale: the
+integrands are smooth in between.
+"""
 _SMALLEST = 1e-30
 """Stands for what is no more than positive."""
 _NO_LIMIT = 1e100
@@ -162,8 +163,8 @@ def beat_amplitude(shots: Shots) -> np.ndarray:
 def size(points: Points) -> Size | None:
     """Change by leaving clipping out, whatever else is noise or dims the echo.
 
-    Line and noise lose no more than the chance that the highest sample is clipped, as the mean
-    slope of what is left is one less that chance; the threshold stays.
+    Line and noise lose no more than the probability that the highest sample is clipped, as the mean
+    slope of what is left is one less that probability; the threshold stays.
     """
     if not points.has(_FULL_SCALE):
         return None

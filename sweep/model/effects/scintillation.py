@@ -1,20 +1,19 @@
 """Scintillation: turbulent air makes the echo's power twinkle from shot to shot.
 
-The strength of turbulence C_n^2(h) gives the Rytov variance of a plane or a spherical wave over
-the path, and this the variances of the logarithms of large and small eddies' factors, averaged
-over an aperture, at any strength [Andrews and Phillips, Laser Beam Propagation through Random
-Media, 2nd ed. 2005, ch. 9, 10; zero inner scale, infinite outer scale].
+The strength of turbulence C_n^2(h) gives the Rytov variance of a plane or a spherical wave over the
+path. This gives the variances of the logarithms of large and small eddies' factors, averaged over
+an aperture, at any strength [Andrews and Phillips, Laser Beam Propagation through Random Media, 2nd
+ed. 2005, ch. 9, 10; zero inner scale, infinite outer scale].
 
 The irradiance, of unit mean, is the product of the two factors: log-normal (weak turbulence) or
 each gamma-distributed, the gamma-gamma law of Al-Habash, Andrews and Phillips (Opt. Eng. 40, 2001),
 for any strength.
 
-The beam goes there and back. What is taken: on the way out a plane wave twinkles on the target,
-averaged over the footprint; on the way back a spherical wave twinkles in the receiver's aperture;
-the two are independent, and their product multiplies the power of the whole echo, so its root the
-amplitudes, alike in all segments of a shot (milliseconds). That they pass the same eddies, which
-a small rough target next to the axis would show as enhanced backscatter, is left out; so is the
-spreading of the beam and the loss of mixing over the aperture.
+The beam goes there and back. On the way out a plane wave twinkles on the target, averaged over the
+footprint. On the way back a spherical wave twinkles in the receiver's aperture. The two are
+independent. Their product multiplies the power of the whole echo, so its root the amplitudes, alike
+in all segments of a shot (milliseconds). Eddies that both pass (enhanced backscatter of small rough
+targets near the axis), the spreading of the beam and the loss of mixing are left out.
 """
 
 import math
@@ -112,10 +111,10 @@ def log_variances(
     """Log variances of the irradiance averaged over an aperture, by large and small eddies.
 
     exp(large + small) - 1 is the scintillation index: the Rytov variance for a point in weak
-    turbulence, and 1 + 0.86 sigma_R^(-4/5) for a plane wave in strong. As it serves any strength
-    the published fit averages too little over wide apertures: in weak turbulence it is 1.3 times
-    Kolmogorov's integral where k D^2 / 4 L is 1, and 2 (plane) or 1.5 (spherical) where it is 10.
-    The Rytov variance is that of `wave`; the aperture's diameter [m] is 0 for a point.
+    turbulence, and 1 + 0.86 sigma_R^(-4/5) for a plane wave in strong. Because it serves any
+    strength, the published fit averages too little over wide apertures. In weak turbulence it is
+    1.3 times Kolmogorov's integral where k D^2 / 4 L is 1, and 2 (plane) or 1.5 (spherical) where
+    it is 10. The Rytov variance is that of `wave`; the aperture's diameter [m] is 0 for a point.
     """
     v = np.asarray(rytov_variance, float)
     k = 2 * math.pi / np.asarray(wavelength, float)
@@ -168,7 +167,7 @@ def _moments(distribution: str, legs: Sequence[LogVariances]) -> tuple[np.ndarra
 
 
 def _inverse(distribution: str, chance: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """Value that a factor of unit mean and this log variance falls below by chance.
+    """Value that a factor of unit mean and this log variance falls below with a given probability.
 
     A gamma law of shape a has the variance 1/a = exp(log variance) - 1. Shapes beyond 1e5, which
     the library's inverse can get wrong, go by Wilson and Hilferty's cube of a normal number,
@@ -220,7 +219,7 @@ def size(points: Points) -> Size | None:
     """Change of mean probabilities by leaving twinkling out.
 
     With L half the logarithm of the factor I, E I = 1, and h the probability over the logarithm of
-    the amplitude, |E h(x + L) - h(x)| <= sup h' |E L| + sup |h''| E L^2 / 2; in a product of
+    the amplitude, |E h(x + L) - h(x)| <= sup h' |E L| + sup |h''| E L^2 / 2. In a product of
     segments, which twinkle alike, the suprema of two slopes, times E L^2, come on top.
     """
     if points.word(_TURBULENCE) == "none" or (air := turbulence_of(points.parameters)) is None:

@@ -1,27 +1,27 @@
 """Motion between segments: the target moves on from one to the next.
 
 A segment that starts at t finds the target at R - u t - a t^2 / 2 and v_r + a t, with u the speed
-at which the range along the beam falls: 7.5 cm nearer after 500 us at 150 m/s. [T] has all segments
-begin at one range (``segment_motion: off``).
+at which the range along the beam falls. This is 7.5 cm nearer after 500 us at 150 m/s. [T] has all
+segments begin at one range (``segment_motion: off``).
 
 Two speeds. The light that comes back at any instant is that of the scatterers in the beam: its
 Doppler shift is their v_r = V.d, V the velocity of instrument against ground and d the beam's
-direction. Which scatterers these are changes as the beam slides over the ground, and with them the
-delay, so that a plane of normal n is met at a range that falls by u = (V + R d').n / d.n, d' the
-rate at which the beam turns. On level flight u is 0, however fast the ground ahead closes.
-Likewise a = d(V.d)/dt is that of the beam, V'.d + V.d'; that of a scatterer, less by v_perp^2 / R,
-is what its phase bends by while it is in the beam, against a spread of Doppler shifts that is
-larger by as much as the footprint is than what slides past: it is left out.
+direction. The scatterers change as the beam slides over the ground, and the delay with them. So a
+plane of normal n is met at a range that falls by u = (V + R d').n / d.n, d' the rate at which the
+beam turns. On level flight u is 0, however fast the ground ahead closes. Likewise a = d(V.d)/dt is
+that of the beam, V'.d + V.d'. The acceleration of a scatterer is less by v_perp^2 / R. This
+difference bends its phase while it is in the beam, against a spread of Doppler shifts that is
+larger by as much as the footprint is than what slides past. It is left out.
 
 Beamlets keep their scatterers: their ranges differ by what their own velocities have made of it.
 
-Up and down beat are those of R at the middle t_m of their starts, but for what they mix. With t_d
-the time from up to down segment, which is negative where the down-chirp comes first, their half sum
-is short of 2 v_r / lambda by the share S t_d / 2 of the optical frequency at mid-chirp, and the
-acceleration changes the range by a t_d f / (2 S): 0.55 m at 11 m/s^2 for Table 4.1. Range and
-velocity that are interpolated are put right for the velocity that is measured with them (as they
-are for range walk), by v_r t_m and by that share; nothing in the beats tells of the acceleration,
-or of a beam that slides over slanting ground.
+Up and down beat are those of R at the middle t_m of their starts, but for what they mix. Let t_d be
+the time from up to down segment, negative if the down-chirp comes first. Their half sum is short of
+2 v_r / lambda by the share S t_d / 2 of the optical frequency at mid-chirp. The acceleration
+changes the range by a t_d f / (2 S): 0.55 m at 11 m/s^2 for Table 4.1. Range and velocity that are
+interpolated are put right for the velocity that is measured with them (as they are for range walk),
+by v_r t_m and by that share. Nothing in the beats tells of the acceleration, or of a beam that
+slides over slanting ground.
 
 In several looks (:mod:`sweep.model.looks`) segments start as those of the middle look do, to whose
 time interpolated ranges are put right, and lines move on by the same number of bins from look to
@@ -50,7 +50,7 @@ def size(points: Points) -> Size | None:
     """Change of the largest bin as its line moves, with the phases of lines that add up.
 
     A line meets its image at the phase of where it has come to. Beamlets with velocities of their
-    own turn against each other. Where it is off segments begin at one range, by
+    own turn against each other. If it is off segments begin at one range, by
     the law of [T]: that is no error of the simulation.
     """
     if points.at_one_range or not any(

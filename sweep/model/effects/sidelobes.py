@@ -3,29 +3,29 @@
 **Images**: the real record's line at -f, which reaches the bins of f near DC and Nyquist.
 
 X[k] has W(k - nu) and, conjugated, W(k + nu); past Nyquist the line that is seen is the image of
-one that is not. Without the effect only the kernel of the folded line itself is summed, where it
-is seen. It acts on the spectrum. Its size follows from the envelope E of the window's sidelobes:
-with all light of a line, wherever footprint and record put it, e bins from the edge (DC or Nyquist)
-or further, bins within e/2 have images at most E(3/2 e) high, and all others at most E(e/2) + E(e)
-altogether.
+one that is not. Without the effect only the kernel of the folded line itself is summed, where it is
+seen. It acts on the spectrum. Its size follows from the envelope E of the window's sidelobes. Let
+all light of a line, wherever footprint and record put it, be e bins from the edge (DC or Nyquist)
+or further. Then bins within e/2 have images at most E(3/2 e) high, and all others at most E(e/2) +
+E(e) altogether.
 
 A bin at the threshold, far down the lines' sidelobes, is smaller than the largest by far, and moved
 by an image that the largest does not feel. It then belongs to the detection, or does no more, and
 of the bins that may raise a false alarm there is one fewer or more. With lines d bins away such a
-bin has images at 2 e - d; if these move it by a share x of the threshold, it must lie that near,
-and bins whose sidelobes fall no slower than 1/d lie there with a chance of x d.
+bin has images at 2 e - d; if these move it by a share x of the threshold, it must lie that near.
+Bins whose sidelobes fall no slower than 1/d lie there with a probability of x d.
 
 **Leakage**: extra groups raised by the signal's own bins below the threshold.
 
 It changes no detecting bin, and so no detection probability; it is what ``p_leakage`` holds. It
-acts on the detection: without it no bin beside the groups need be looked at. By the union bound
+acts on the detection: without it only bins of the groups are evaluated. By the union bound
 
     p_leakage <= sum_k (Q_1(a_k, b) - Q_1(0, b)) / (1 - Q_1(0, b)),   a_k <= min(A E_k, b),
 
 over the bins that may leak, with A the magnitude of all lines together, E_k the largest |W| at
 the distances that light may have from bin k, and b the threshold, all over sigma. Not among them
 are the detecting bin and its neighbours. By Parseval's theorem the bins have no more power together
-than ENBW times A^2, and the chance rises faster than a^2, so that the sum is at most ENBW times
+than ENBW times A^2, and the probability rises faster than a^2. So the sum is at most ENBW times
 that of one bin of A, or A^2 / b^2 times that of one at the threshold.
 """
 
@@ -51,7 +51,7 @@ _SELDOM = 1e-4
 def image_size(points: Points) -> Size | None:
     """Change of the largest bin by images; complex records have none.
 
-    Where amplitudes add, the sum may be anything, and what images add to any bin of 0..N/2 is at
+    If amplitudes add, the sum may be anything, and what images add to any bin of 0..N/2 is at
     most E(e) of all lines in phase.
     """
     if points.word(RECORD) == "complex":
@@ -71,8 +71,8 @@ def image_size(points: Points) -> Size | None:
 def _beside(points: Points) -> np.ndarray:
     """Change of leakage by images that add as powers: of a bin at the threshold, or of all bins.
 
-    These cross with chances of y e^-y a^2 / 2 where a is small, y = b^2 / 2. Images fall no slower
-    than 1 / k from ``apart`` on, so that all bins have ``apart`` times the a^2 of the nearest.
+    These cross with probabilities of y e^-y a^2 / 2 where a is small, y = b^2 / 2. Images fall no
+    slower than 1 / k from ``apart`` on, so all bins have ``apart`` times the nearest's a^2.
     """
     image = points.level * points.footprint.gain * points.lobe.tail(points.apart)
     square, b = np.minimum(image, _HUGE) ** 2, points.threshold
@@ -131,7 +131,7 @@ _IMAGES = 1.1
 
 
 def leakage_size(points: Points) -> Size:
-    """Chance that leaked signal raises an extra group, in all segments together."""
+    """Probability that leaked signal raises an extra group, in all segments together."""
     b, near = points.threshold, points.near_image
     over = points.level * points.footprint.gain * np.where(near, 2.0, _IMAGES) / b
     over = np.where(np.isnan(over), np.inf, over)
@@ -154,7 +154,7 @@ def leakage_size(points: Points) -> Size:
 
 @lru_cache(maxsize=256)
 def table(name: str, length: int, fft_size: int, level: float, looks: Looks = ONE) -> np.ndarray:
-    """Chances by reach and by octaves of A over the threshold, the last row by Parseval alone."""
+    """Probabilities by reach and octaves of A over the threshold, the last row by Parseval."""
     form, rows = lobe(name, length, fft_size), (_STRONGEST - _FAINTEST) * _OCTAVES + 1
     together = level * 2.0 ** (np.arange(rows) / _OCTAVES + _FAINTEST)
     quiet = looks.steady(np.zeros(1), np.array([level]))[0][0]
@@ -174,13 +174,13 @@ def table(name: str, length: int, fft_size: int, level: float, looks: Looks = ON
 
 
 def _crossing(signal: np.ndarray, level: float, quiet: float, looks: Looks) -> np.ndarray:
-    """Chance to cross the threshold that a bin of some signal has more than one without."""
+    """Probability to cross the threshold that a bin of some signal has more than one without."""
     chance = looks.steady(signal, np.full(signal.shape, level))[0]
     return np.maximum(chance - quiet, 0.0) / max(1 - quiet, 1e-12)
 
 
 def look_beside(shots: Shots, scene: Scene) -> Shots:
-    """Bins beside the detection looked at too."""
+    """Bins evaluated on either side of the detection."""
     return replace(shots, leakage=True)
 
 

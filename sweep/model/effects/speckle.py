@@ -7,29 +7,29 @@ Optics, ch. 2]. A beamlet's patch here takes the factor
     g_b = sqrt(kappa) u_b + sqrt(1 - kappa) z_b,     z_b complex normal with E|z_b|^2 = 1,
 
 whose mean power is 1. kappa = exp(-(4 pi sigma_h / lambda)^2) is the share of power that stays
-coherent when the round trip has normal phases of deviation 4 pi sigma_h / lambda; u_b is 1 where
-the footprint's phases follow its geometry, and a random phase where they do not. kappa = 0 is a
-Swerling-1 target, any other a Rician one.
+coherent when the round trip has normal phases of deviation 4 pi sigma_h / lambda. Further, u_b is 1
+where the footprint's phases follow its geometry, and a random phase where they do not. kappa = 0 is
+a Swerling-1 target, any other a Rician one.
 
-The three segments of a shot see the same heights, so that one g_b serves all three: amplitudes at
+The three segments of a shot see the same heights, so one g_b serves all three. Amplitudes at
 frequencies df apart have the correlation exp(-(4 pi sigma_h df / c)^2 / 2), 1 to 1e-6 for 1 GHz and
 heights of 10 um. With the instrument moving across the beam the Doppler shifts differ over the
 footprint, which turns the beamlets against each other from one segment to the next. Motion between
-segments has that in the lines' phases; where it is left out it is done here, but for coherent
+segments has that in the lines' phases. If it is left out it is done here, but for coherent
 footprints with a share kappa left, whose segments are then more alike than they are.
 
 It acts on the lines' amplitudes alone; the mean echo, and so its shot noise, stays.
 
 **Fading**: developed speckle (kappa = 0) without draws, the default for surfaces. A sum of circular
 complex Gaussian amplitudes is one itself, in every bin; its mean power is what beamlets make that
-add as powers. A bin then crosses the threshold with Swerling's first chance, and two segments' bins
-as two correlated ones do, with the correlation
+add as powers. A bin then crosses the threshold with Swerling's first probability, and two segments'
+bins as two correlated ones do, with the correlation
 
     mu(dt) = sum_b P_b exp(2 pi i f beta_b dt) / sum_b P_b
 
-over the beam's power, which is what Doppler shifts that differ by 1/dt or more destroy: in closed
-form, as beamlets that are enough for the power of a bin may be too few for it. It acts on the
-detection; leaked signal keeps its mean power.
+over the beam's power, which is what Doppler shifts that differ by 1/dt or more destroy. It is in
+closed form, as beamlets that are enough for the power of a bin may be too few for it. It acts on
+the detection; leaked signal keeps its mean power.
 """
 
 import math
@@ -98,7 +98,7 @@ def size(points: Points) -> Size | None:
     A bin of magnitude |X| becomes sqrt(kappa) X + D with D complex normal of power
     (1 - kappa) |X|^2: between smooth and rough, 4 pi sigma_h << lambda, it lies within
     1 +- 5 (4 pi sigma_h / lambda). Incoherent footprints have a coherent share of random phases.
-    What may have cancelled is no measure of what is scattered: the sum of powers is.
+    A sum that may have cancelled does not measure the scattered light; the sum of powers does.
     """
     if not points.has(_ROUGHNESS):
         return None

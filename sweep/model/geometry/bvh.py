@@ -1,16 +1,16 @@
 """Nearest triangles of bundles of rays: a tree of boxes, eight to a node, and its walk.
 
-What a ray hits is a property of the ray and the mesh alone: of the triangles hit the nearest
+The hit of a ray is a property of the ray and the mesh alone: of the triangles hit the nearest
 counts, and of equally near ones the first in the mesh. The order of the rays, their grouping and
 the tree's shape change no bit of it.
 
-A triangle counts as hit where the three edge functions of the sheared triangle (Woop, Benthin
-and Wald, JCGT 2 (1), 2013) have no opposite signs. Each is a difference of two products that the
+A triangle counts as hit where the three edge functions of the sheared triangle (Woop, Benthin and
+Wald, JCGT 2 (1), 2013) have no opposite signs. Each is a difference of two products that the
 neighbour across the edge forms with the sign reversed, and rounding is monotone, so a difference
-can round to zero but not to the wrong sign: between triangles that share an edge or a vertex
-there is no crack. This holds as long as no fused multiply-add contracts the difference, so there
-is no fastmath here. The boxes are float32, rounded outwards and widened a little, so that no
-rounding of that test can hit what its box missed; the triangles themselves stay float64.
+can round to zero but not to the wrong sign. Between triangles that share an edge or a vertex there
+is no crack. This holds as long as no fused multiply-add contracts the difference, so there is no
+fastmath here. The boxes are float32, rounded outwards and widened a little, so that no rounding of
+that test can hit what its box missed; the triangles themselves stay float64.
 """
 
 from typing import NamedTuple
@@ -29,7 +29,7 @@ _SLACK = 2.0**-30
 sideways (some 1e-15 of the range, for ranges to 1e5 times the mesh's size), and below float32."""
 
 _FAR = np.float32(3e38)
-"""Where the box of nothing begins, and minus this where it ends."""
+"""Begin of the empty box; it ends at minus this."""
 
 _STACK = 8 * 16
 """Entries that the deepest tree can leave behind: seven a level."""
@@ -168,9 +168,9 @@ def _smaller(a, b):
 def nearest(tree, origins, directions, distance, face):
     """Nearest triangle of each ray of each bundle that lies nearer than what is known.
 
-    A bundle, rays from one origin in neighbouring directions, walks the tree once: a box is
-    entered where the interval of the directions may reach it, and a leaf's triangles are tested
-    against all rays together. Where they spread too far, each ray walks alone.
+    A bundle, rays from one origin in neighbouring directions, walks the tree once. A box is entered
+    where the interval of the directions may reach it. A leaf's triangles are tested against all
+    rays together. If they spread too far, each ray walks alone.
 
     Origins (n, 3) [m] are in the tree's frame, directions (n, b, 3). `distance` (n, b), in lengths
     of the direction, is the nearest known before (inf: none), and is replaced where a triangle is

@@ -2,8 +2,8 @@
 
 A micrometre of wavelength at kilometres of range asks for the last bits of float64, and grazing
 incidence divides them away. So a facet's normal, the ray's origin relative to a corner and their
-products are carried as two float64 each (high + low, Dekker's and Knuth's exact sums and
-products); what remains is the rounding of the range itself, half a unit in its last place.
+products are carried as two float64 each (high + low, Dekker's and Knuth's exact sums and products).
+The error that remains is the rounding of the range itself, half a unit in its last place.
 """
 
 from __future__ import annotations
@@ -83,8 +83,8 @@ def round_centre(vertices: np.ndarray) -> np.ndarray:
 
     Zero along an axis where zero is no farther off than the mesh is large, since small numbers
     would lose their last digits there. Else rounded to a power of two not below 1/1024 of the
-    extent: a coordinate and the centre are then both multiples of the coordinate's last place,
-    and their difference is no larger than the coordinate.
+    extent. A coordinate and the centre are then both multiples of the coordinate's last place, and
+    their difference is no larger than the coordinate.
     """
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     extent = float((high - low).max())

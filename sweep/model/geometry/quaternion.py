@@ -85,7 +85,7 @@ def from_heading(
 ) -> np.ndarray:
     """Attitude of a body (x forward, y left, z up), (..., 4), by angles [rad].
 
-    The heading is that of the forward axis from the world's x, counter-clockwise from above; then
+    The heading is that of the forward axis from the world's x, counter-clockwise from above. Then
     the pitch lifts the nose, a right-handed turn about -y; last the roll lifts the left side, one
     about x.
     """

@@ -1,10 +1,10 @@
 """Rays cast at rigid bodies: what each hits first, how far off and how steeply.
 
-Coordinates are taken relative to a mesh's own origin exactly, the nearest triangle is found by
-tests that leave no crack between neighbours (:mod:`sweep.model.geometry.bvh`), and its
-plane is met in twice float64's precision (:mod:`sweep.model.geometry.mesh`): a range is the
-exact one of the numbers given, rounded once, which at 2 km is 1e-6 rad of optical phase. A body
-that moves is met in its own frame, so its mesh is never rebuilt.
+Coordinates are taken relative to a mesh's own origin exactly. The nearest triangle is found by
+tests that leave no crack between neighbours (:mod:`sweep.model.geometry.bvh`). Its plane is met in
+twice float64's precision (:mod:`sweep.model.geometry.mesh`). So a range is the exact one of the
+numbers given, rounded once, which at 2 km is 1e-6 rad of optical phase. A body that moves is met in
+its own frame, so its mesh is never rebuilt.
 """
 
 from collections.abc import Sequence

@@ -3,7 +3,7 @@
 Directions are in the body frame (x forward, y left, z up).
 
 A measurement cycle is the set of shots from which one velocity vector is made. Everything is a
-function of the shot's number, so that any stretch of a flight can be had without the rest.
+function of the shot's number, so that any part of a flight can be had without the rest.
 """
 
 from __future__ import annotations
@@ -323,7 +323,7 @@ class PointingJitter(NamedTuple):
     """Seed of the study, >= 0."""
 
     def turned(self, attitude: np.ndarray, index: np.ndarray) -> np.ndarray:
-        """Attitudes (n, 4) of shots by number (n,), turned; any stretch is the same bit for bit."""
+        """Attitudes (n, 4) of shots by number (n,), turned; any part is the same bit for bit."""
         from sweep.model.philox import STREAM_POINTING_JITTER, normals, point_keys, uniforms
 
         key = point_keys(np.empty((1, 0)), domain=JITTER_DOMAIN, seed=self.seed)
