@@ -94,7 +94,7 @@ def pictures(tmp_path_factory):
         chart = comparison.figure(comparison.compared(opened, less))
         sheets["comparison"] = sheet_of(chart, "T", "")
     for name, page in (("grid", writing._grid_page), ("scene", writing._scene_page)):
-        items = (i for s in page(stores[name], lambda text: None).sections for i in s.items)
+        items = (i for s in page(stores[name]).sections for i in s.items)
         plots = [item for item in items if isinstance(item, Plot)]
         sheets |= {f"{name}: {plot.heading}": plot.figure for plot in reversed(plots)}
     return sheets
