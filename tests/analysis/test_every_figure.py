@@ -104,7 +104,7 @@ def short(values):
     """Number of values, the lowest and highest to three digits."""
     values = np.asarray(values)
     if values.dtype.kind not in "fiu":
-        return [str(v) for v in values.ravel()[:3]]
+        return [f"{v:.3g}" if isinstance(v, float) else str(v) for v in values.ravel()[:3]]
     known = values[np.isfinite(values)] if values.dtype.kind == "f" else values
     ends = [f"{known.min():.3g}", f"{known.max():.3g}"] if known.size else []
     return [int(values.size), *ends]
