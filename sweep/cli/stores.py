@@ -238,15 +238,15 @@ def compare(a: Location, b: Location, figure: Path | None) -> None:
         )
     from sweep.tasks.progress import working
 
-    try:
-        with working("comparing"):
-            from sweep.analysis.answers import comparison
-            from sweep.spec import difference
+    with working("comparing"):
+        from sweep.analysis.answers import comparison
+        from sweep.spec import difference
 
-            left, right = _opened(a), _opened(b)
+        left, right = _opened(a), _opened(b)
+        try:
             compared = comparison.compared(left, right)
-    except ValueError as error:
-        raise click.UsageError(str(error)) from None
+        except ValueError as error:
+            raise click.UsageError(str(error)) from None
     for line in difference(left.sweep.spec, right.sweep.spec) or ["the same study"]:
         tell(line)
     for scanner, found in compared.items():

@@ -256,7 +256,7 @@ def changed(spec: Declared, changes: Mapping[str, Any]) -> Declared:
     written = spec.to_yaml_mapping()
     for path, value in changes.items():
         first, _, rest = path.partition(".")
-        if first == "axes":
+        if first == "axes" and rest:
             written[first] = {**written.get(first, {}), rest: value}
             continue
         *sections, last = path.split(".")

@@ -78,7 +78,7 @@ def test_every_field_estimator_and_array_of_detectors_is_listed():
     stored = {*SPECTRA_OUTPUTS, *ACCURACY_OUTPUTS, *DRAW_OUTPUTS}
     about = named(DETECTORS.partition("## What is drawn")[2].partition("## False alarms")[0])
     assert {name for name in about if name != "array"} <= stored
-    exported = named(DETECTORS.partition("exports spectra to try code")[2])
+    exported = named(DETECTORS.partition("try code outside of a study")[2])
     assert set(exported) == set(TOLD) - {"draw", "segment", "frequency"}
 
 
