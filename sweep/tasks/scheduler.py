@@ -83,7 +83,7 @@ class BlockQueue:
     def put_back(self, blocks: list[int]) -> None:
         """Put blocks back whose answer was lost, by no fault of theirs, or that are begun.
 
-        One that failed before stays a suspect, and is never out beside another.
+        One that failed before stays a suspect, and is never out together with another.
         """
         for block in blocks:
             (self._suspects if block in self.failed else self._returned).append(block)
