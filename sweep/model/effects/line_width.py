@@ -280,7 +280,7 @@ def walked_phase(
     `steps` (walk_steps,) are standard normal numbers, `per_sample` the variance of theta's change
     from sample to sample, Gamma / fs. `delay` is tau [samples]. With `whole` the result has the
     first sample's as well, for a delay shorter than the record. Each step between samples is taken
-    in two, before and after the place in it at which delayed samples lie. So delays need not be whole.
+    in two, at the place in it at which delayed samples lie. So delays need not be whole.
     """
     before, after = steps.reshape(2, -1)
     part = delay - math.floor(delay)
