@@ -47,7 +47,7 @@ def compiling():
 def test_functions_are_counted_while_they_are_compiled_and_not_told_of_otherwise():
     told = Told()
     with progress.working("planning", told):
-        told.until("planning, 0 s")
+        told.until("planning, 0.0")
         assert not any("compiling" in line for line in told.lines)
         with compiling():
             told.until("compiling the model, once; functions so far: 0")

@@ -69,7 +69,11 @@ def test_what_is_no_store_of_ours_is_refused_and_left_as_it_is(tmp_path):
     (tmp_path / "notes" / "text").write_text("mine")
     (tmp_path / "file").write_text("mine")
     before = everything(tmp_path)
-    for name, shown in (("theirs.zarr", "not one that"), ("notes", "not a"), ("file", "not a")):
+    for name, shown in (
+        ("theirs.zarr", "not one that"),
+        ("notes", "not a"),
+        ("file", "no Zarr store"),
+    ):
         with pytest.raises(StoreError, match=shown):
             resume(tmp_path / name, progress=False)
         for overwrite in (False, True):
@@ -80,9 +84,9 @@ def test_what_is_no_store_of_ours_is_refused_and_left_as_it_is(tmp_path):
     assert everything(tmp_path) == before
 
 
-def test_a_run_into_a_store_of_the_same_study_points_to_resume_and_overwrite(undisturbed):
+def test_a_run_into_a_whole_store_of_the_same_study_points_to_status_and_overwrite(undisturbed):
     before = everything(undisturbed)
-    with pytest.raises(StoreError, match=r"12 of 12 blocks done: `sweep resume .*--overwrite"):
+    with pytest.raises(StoreError, match=r"12 of 12 blocks done: `sweep status .*--overwrite"):
         quiet(small(), undisturbed)
     assert everything(undisturbed) == before
 
