@@ -67,7 +67,7 @@ def flown(tmp_path, record="real", **chirp):
             "initial_speed": "15 m/s", "final_speed": "15 m/s",
         }},
         "scanners": {"frame": {"kind": "raster", "columns": 20, "rows": 20,
-                               "half_angles": ["12 deg", "12 deg"], "rate": "200 Hz"}},
+                               "half_angles": ["12 deg", "12 deg"], "rate": "20 Hz"}},
         "footprint": {"beamlets": 1, "speckle": "none"}, "draws": {"number": 2},
     })  # fmt: skip
     store = tmp_path / f"{record}_{'_'.join(map(str, chirp.values()))}.zarr".replace(" ", "_")
