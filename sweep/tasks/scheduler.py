@@ -254,7 +254,12 @@ class Scheduler:
     def _relieve(self) -> None:
         """Send what silent workers hold to others as well, where these have nothing to do."""
         now = time.monotonic()
-        late = [task for task in set(self._flying.values()) if now - task.sent > self._lease(task)]
+        late = [
+            task
+            for task in set(self._flying.values())
+            if now - task.sent > self._lease(task)
+            and not any(future.done() for future in task.futures.values())  # yet to be looked at
+        ]
         if not late:
             return
         held = {worker: set(keys) for worker, keys in self._client.processing().items()}

@@ -138,3 +138,37 @@ def test_an_answer_lost_with_its_worker_whose_second_run_fails_is_a_failure_of_i
     answer = scheduler._next()
     assert [failure.block for failure in answer.failures] == [3, 4] and not answer.receipts
     assert all(failure.error.startswith("RuntimeError") for failure in answer.failures)
+
+
+def test_a_task_that_is_over_is_not_sent_again_before_its_answer_is_looked_at():
+    """A block that kills its worker would kill another, and what is on it."""
+
+    class Sent:
+        def __init__(self, key, over=False):
+            self.key, self.over = key, over
+
+        def done(self):
+            return self.over
+
+        def add_done_callback(self, call):
+            pass
+
+    class Idle(Client):
+        def __init__(self):
+            self.sent = []
+
+        def processing(self):
+            return {}
+
+        def submit(self, work, job, blocks, *, key, retries, workers):
+            self.sent.append(blocks)
+            return Sent(key)
+
+    client, blocks = Idle(), BlockQueue(np.zeros(8, dtype=bool))
+    scheduler = Scheduler(client, 0, Job("x.zarr", "0"), blocks, seen=None, say=None)
+    scheduler._slots.now()
+    for block, over in ((4, True), (5, False)):
+        task = _Task([block], {str(block): Sent(str(block), over)}, sent=-1e9)
+        scheduler._flying[str(block)] = task
+    scheduler._relieve()
+    assert client.sent == [[5]]
