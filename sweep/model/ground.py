@@ -140,7 +140,7 @@ class Cast:
 
 
 Ground = Plane | Cast
-"""What n points' beams meet."""
+"""Ground that the beams of n points meet."""
 
 
 def powers_add(p: Mapping[str, Any]) -> bool:

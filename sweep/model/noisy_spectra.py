@@ -63,7 +63,7 @@ from sweep.model.segments import spectrum as segment_spectrum
 from sweep.model.shot import fit
 
 VALUES = ("pfa_bin", "false_alarms", "range", "radial_velocity", "range_2", "radial_velocity_2")
-"""What is averaged over draws; the last two are squares of bounds."""
+"""Values that are averaged over draws; the last two are squares of bounds."""
 
 
 class Methods(NamedTuple):
@@ -323,7 +323,7 @@ class View(NamedTuple):
 
     shots: Shots
     i: int
-    """Which of the shots."""
+    """Number of the shot."""
     key: np.ndarray
     """(2,) uint64: random key of the point."""
     signals: tuple[Signal | None, ...]

@@ -112,7 +112,7 @@ STRONGEST_OUTPUTS: dict[str, Output] = _by_segment(
 """Floats, one a point, of studies that report the strongest peak of a segment alone."""
 
 WITHOUT_ECHO = tuple(name for name, output in OUTPUTS.items() if NO_ECHO in output.comment)
-"""What has no value where no light comes back."""
+"""Outputs without a value where no light comes back."""
 
 _PLACES = {
     "up": "the up-chirp segment",
@@ -153,7 +153,7 @@ ACCURACY_OUTPUTS: dict[str, Output] = {
         "1", "largest half-width less the tolerance", "0 where the tolerance is met"
     ),
 }
-"""What draws have come to, point by point."""
+"""Results of draws, point by point."""
 
 RUNNING = "running_sums"
 
@@ -162,7 +162,7 @@ RUNNING_OUTPUTS: dict[str, Output] = {
         "1", "sums that further draws are added to", "of random effects; of use to sweep extend"
     ),
 }
-"""What draws of random effects leave for further ones, a row a point."""
+"""Sums of draws of random effects for further ones, a row a point."""
 
 LOGARITHMS = np.array([name.startswith("log10_") for name in OUTPUTS])
 SPREAD_OF = LOGARITHMS | np.array([f"{name}_error" in ERROR_OUTPUTS for name in OUTPUTS])
@@ -261,7 +261,7 @@ BEAMLETS: dict[str, Output] = _over(("shot", "beamlet"), {
     "cos_incidence": Output("1", "cosine of the incidence angle"),
     "surface": Output("1", "surface hit", dtype="int16"),
 })  # fmt: skip
-"""What an eyepoint store holds of each beamlet, beside SHOTS and CYCLES."""
+"""Arrays of an eyepoint store for each beamlet, besides SHOTS and CYCLES."""
 
 WEIGHT = Output("1", "power fraction of the beamlet", dims=("beamlet",))
 
@@ -297,7 +297,7 @@ SIMULATED: dict[str, Output] = _over(("shot",), {
         "the probability of a false alarm, or of a relative magnitude, whichever is most",
     ),
 })  # fmt: skip
-"""What was simulated of each shot; none of the effects where nothing is seen."""
+"""Effects that were simulated of each shot; none of the effects where nothing is seen."""
 
 _FALSE = "nan: a false one"
 

@@ -157,7 +157,7 @@ class Shots:
     beta: np.ndarray | float = 0.0
     """Doppler ratio 2 v_r / c of the line on the axis."""
     incoherent: bool = True
-    """Whether beamlets add as powers."""
+    """True where beamlets add as powers."""
     phase: np.ndarray = field(default_factory=lambda: np.empty((3, 0, 0)))
     """(3, rows, beamlets): further phases [cycles] in up, Doppler and down segment; or empty."""
     starts: tuple[np.ndarray | float, ...] = (0.0, 0.0, 0.0)
@@ -170,7 +170,7 @@ class Shots:
     slowing: np.ndarray | float = 0.0
     """Share of the radial velocity by which the beats tell less, (n,)."""
     alike: bool = False
-    """Whether many shots have the same phase errors, as those of a flight do not."""
+    """True where many shots have the same phase errors, as those of a flight do not."""
     gaussian_width: np.ndarray | None = None
     """(n,): FWHM [Hz] of the beat's Gaussian line."""
     laser_width: np.ndarray | float = 0.0
@@ -180,7 +180,7 @@ class Shots:
     noise_gain: np.ndarray | float = 1.0
     """Factor on the noise variance by what happens to the record after the threshold was set."""
     complex_record: bool = False
-    """Whether the record is I and Q, and its spectrum has signed bins and no images."""
+    """True where the record is I and Q, and its spectrum has signed bins and no images."""
     antialias: dict[str, np.ndarray] = field(default_factory=dict)
     """Bandwidth [Hz] and order of the filter before the ADC; empty without one."""
     image_gain: np.ndarray | float = 0.0
@@ -192,9 +192,9 @@ class Shots:
     leak_delay: np.ndarray | float = 0.0
     """Its delay [s]."""
     image: bool = False
-    """Whether the lines' images at negative frequencies are summed."""
+    """True where the lines' images at negative frequencies are summed."""
     leakage: bool = False
-    """Whether the bins beside the detection are looked at for groups of leaked signal."""
+    """True where the bins next to the detection are looked at for groups of leaked signal."""
     looks: Looks = Looks()  # noqa: RUF009  # a tuple
     """Records of each segment, and how they are combined."""
 

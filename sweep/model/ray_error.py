@@ -38,7 +38,7 @@ _REACH, _STEPS, _SAMPLES = 4, 1024, 1024
 """Bins of fs/L up to which a line's power is known, steps of each, samples of the window."""
 
 _NEIGHBOURS = 1.3
-"""How far neighbours may be from each other, over the nearest; the next but one are 1.7 away."""
+"""Largest distance between neighbours, over the nearest; the next but one are 1.7 away."""
 
 _QUARTIC = 37
 """Rays from which on the polynomials are of the fourth degree, and leave enough to tell from."""

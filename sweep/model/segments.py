@@ -62,7 +62,7 @@ ROOM_FOR_RUNS = 1 << 21
 """Bins of runs that are kept at a time, at least."""
 
 SEGMENT_FIELDS = ("pd", "miss", "magnitude", "frequency", "exempted", "leakage")
-"""What is found in each segment's spectrum."""
+"""Values found for each segment's spectrum."""
 
 NO_LEAKAGE, INTEGRAL, BIN_BY_BIN = range(3)
 """Ways to look at leakage: not at all; all bins, those far away as an integral; those of the run

@@ -29,7 +29,7 @@ IN_SECONDS = ("README.md", "docs/howto/read_results.md", "docs/howto/search_a_ba
 """Pages that the fast suite runs."""
 
 NEEDED = {"keep_stores_in_a_bucket": "moto.server", "variables": "pint_xarray"}
-"""What a page has its reader install."""
+"""Modules that a page has its reader install."""
 
 ELSEWHERE = re.compile(r"^(make|pip|helm|kubectl) |--cluster deploy/", re.M)
 """Commands that set up a copy of the repository or need a cluster: they are named, and not run."""
@@ -78,7 +78,7 @@ def save(text, over=WHOLE):
 
 
 def is_quoted(code):
-    """Whether code is a part of the source, shown to its first colon or comma."""
+    """Tell whether code is a part of the source, shown to its first colon or comma."""
     return code.rstrip()[-1] in ":,"
 
 

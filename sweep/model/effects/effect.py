@@ -46,7 +46,7 @@ class Parameter:
     alone: bool = True
     """Tell whether nothing else can bring the effect."""
     category: bool = False
-    """Whether points are computed together only where they share it; words always are."""
+    """True where points are computed together only if they share it; words always are."""
 
     @property
     def unit(self) -> str:
@@ -106,8 +106,8 @@ class Size(NamedTuple):
     noise: Sized = 0.0
     """Relative change of a bin's noise variance."""
     threshold_follows: bool = True
-    """Whether the threshold is set on the changed noise, as for noise that is always there; else it
-    stays where it was, as for noise that comes with the signal."""
+    """True where the threshold is set on the changed noise, as for noise that is always there; else
+    it stays where it was, as for noise that comes with the signal."""
     shift: Sized = 0.0
     """Bins by which what is measured moves; they count as a change of a probability does."""
     alarms: Sized = 0.0
@@ -124,24 +124,24 @@ class Effect:
 
     name: str
     about: str
-    """What it is, in a few words, for tables and help."""
+    """Description in a few words, for tables and help."""
     stage: str
     """One of :data:`STAGES`."""
     size: "Callable[[Points], Size | None]"
-    """What leaving it out would change at each point. None: the scene has nothing of it."""
+    """Change at each point by leaving it out. None: the scene has nothing of it."""
     smear: "Callable[[Points], Smear | None] | None" = None
-    """What it does to lines over the record; all smears are known before any size is asked for."""
+    """Change of lines over the record; all smears are known before any size is asked for."""
     act: Callable[[Shots, Scene], Shots] | None = None
-    """What it does to shots, once."""
+    """Change of shots, once."""
     turn: Callable[[dict[str, np.ndarray], Realisation], dict[str, np.ndarray]] | None = None
-    """What it does at random to parameters, before any shot is prepared."""
+    """Random change of parameters, before any shot is prepared."""
     draw: Callable[[Shots, Scene, Realisation], Shots] | None = None
-    """What it does at random to shots, after all else but spectrum and detection."""
+    """Random change of shots, after all else but spectrum and detection."""
     parameters: tuple[Parameter, ...] = ()
     within: str = ""
     """An effect that this is part of: kept wherever this is; where it is off, so is this."""
     apart: bool = True
-    """Whether points that have it are computed apart from those that don't. If not, `act` looks
+    """True where points that have it are computed apart from those that don't. If not, `act` looks
     at :attr:`Scene.where`, and leaves the bits of other points as they would be without it."""
     needs: tuple[str, ...] = ()
     """Effects that this one is simulated with, however little they change by themselves."""

@@ -99,7 +99,7 @@ class Points:
         self.architecture = self.word(RECEIVER + "architecture")
         self.fft_size = self.whole(PROCESSING + "fft_size")
         self.at_rest = False
-        """Whether the Doppler effect is off."""
+        """True where the Doppler effect is off."""
         self.at_one_range = False
         """True where the target stands still between segments."""
         self.smears: dict[str, Smear] = {}
@@ -136,7 +136,7 @@ class Points:
         coherent = self.word("footprint.phases") == "coherent"
         self.adds_amplitudes = coherent or direct
         self.by_roots = coherent and not direct
-        """Whether roots of echoes add."""
+        """True where roots of echoes add."""
 
     def __getitem__(self, path: str) -> np.ndarray:
         """Return a parameter that is a number."""

@@ -50,7 +50,7 @@ TOO_LONG = 2
 """Of these, in which stretches are cut: calls cost the dearest settings nothing to speak of."""
 
 FIRST_TRIED = 8
-"""How much shorter the stretches are by which settings are known to be dear."""
+"""Factor by which the stretches are shorter in which settings are known to be dear."""
 
 FIRST_ROUND, UNTIL_TRUTH = 0.6, 0.8
 """Shares of the time limit by which the first round, and then the truth, ends."""

@@ -109,7 +109,7 @@ class Ladder:
     about: str  # what the reference is
     notes: tuple[str, ...] = ()
     fixed: Callable[[float], dict[str, Any]] = lambda tolerance: {}
-    """What else is fixed where effects are, to a tolerance."""
+    """Overrides that are fixed too where effects are, to a tolerance."""
 
     @property
     def reference(self) -> Rung:
