@@ -6,6 +6,7 @@ from scipy import signal
 
 from sweep.model import link, shot, truth
 from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.effects import circulator_leak
 from sweep.model.effects.circulator_leak import line_of
 from sweep.model.effects.saturation import beat_amplitude
 
@@ -161,6 +162,24 @@ def test_a_leaked_line_passes_the_filter_at_its_own_frequency(table_4_1):
     scale, _ = line_of(shots, 0, 0)
     amplitude = float(np.broadcast_to(shots.leak_amplitude, 1)[0])
     assert scale == pytest.approx(amplitude / 2 / np.sqrt(density), rel=1e-6)
+
+
+def test_skirts_at_an_echo_are_whitened_as_the_echo_is(table_4_1, monkeypatch):
+    """Their share of it is that of a spectrum that is not whitened; a bin's density is 1 % off."""
+    shares, raised = [], circulator_leak.raised
+
+    def seen(magnitudes, skirts, **given):
+        shares.append(skirts[magnitudes.argmax()] / magnitudes.max())
+        return raised(magnitudes, skirts, **given)
+
+    monkeypatch.setattr(circulator_leak, "raised", seen)
+    leak = {"instrument.telescope.leak_path": 3.0, "instrument.telescope.isolation": 1e6}
+    for shape in ("receiver", "white"):
+        scene = scene_of(table_4_1, 280e6) | leak | {"instrument.receiver.noise_shape": shape}
+        shot.evaluate(scene, (*EVERY, "circulator_leak"))
+    receiver, white = np.array(shares).reshape(2, -1)
+    assert white.size and (white > 0).all()
+    assert receiver == pytest.approx(white, rel=0.01)
 
 
 @pytest.mark.parametrize("at", [None, 200e6])
