@@ -17,7 +17,7 @@ from sweep.cli import main
 from sweep.spec import Spec, load
 from sweep.tasks import driver, progress
 from sweep.tasks.cluster import LITTLE, RunOptions, about_seconds
-from sweep.tasks.lock import Lock
+from sweep.tasks.journal import Lock
 
 STUDY = """\
 title: A small study

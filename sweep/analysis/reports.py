@@ -21,8 +21,7 @@ from sweep.analysis.scenes.recording import INTERPOLATED, Recording, by_ranges
 from sweep.model.pairing import UNCONFIRMED
 from sweep.spec import Mistake, SpecError
 from sweep.spec.scene import Interface
-from sweep.storage.atomic_replace import draft
-from sweep.storage.locations import Location
+from sweep.storage.locations import Location, draft
 
 VALUES = ("range", "radial_velocity")
 COLUMNS = {

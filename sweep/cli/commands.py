@@ -77,7 +77,7 @@ class Commands(click.Group):
             from sweep.spec import SpecError
             from sweep.storage.locations import ObjectStoreError, worded
             from sweep.storage.opening import ReplacedError
-            from sweep.tasks.errors import StoreError, TaskError
+            from sweep.tasks.progress import StoreError, TaskError
 
             told = (
                 ObjectStoreError, ReplacedError, SceneError, SpecError, StoreError, TaskError,

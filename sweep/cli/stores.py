@@ -66,9 +66,9 @@ def status(store: Location) -> None:
 
 
 def _tell_what_is_under_way(store: Location) -> None:
-    from sweep.storage.atomic_replace import real
-    from sweep.tasks.errors import StoreError
+    from sweep.storage.locations import real
     from sweep.tasks.journal import EXTENDS, read_recipe
+    from sweep.tasks.progress import StoreError
     from sweep.tasks.store import under_way
 
     try:

@@ -28,8 +28,7 @@ from sweep.report.flights import Seen
 from sweep.report.page import Item, Page, Section, Table, Text, plot, rendered
 from sweep.spec import SceneSpec, Slices, Spec, Surface
 from sweep.spec.fields import parameter_rules
-from sweep.storage.atomic_replace import draft
-from sweep.storage.locations import Location, located
+from sweep.storage.locations import Location, draft, located
 
 PAGE = Room(parts=detector.MOST_PARTS, columns=500, rows=180, cells=400_000, abreast=1)
 """Cells of all heat maps of a page together, which keep it to a few megabytes."""

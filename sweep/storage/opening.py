@@ -19,8 +19,7 @@ import numpy as np
 import zarr
 from zarr.storage import LocalStore
 
-from sweep.storage.atomic_replace import settle, stamp
-from sweep.storage.locations import JOURNAL, Location, ObjectStoreError, zarr_store
+from sweep.storage.locations import JOURNAL, Location, ObjectStoreError, settle, stamp, zarr_store
 from sweep.storage.logs import read_lines
 
 #: What a store is made of before there are results, and the digest of each object, in the journal.

@@ -29,9 +29,8 @@ from sweep.spec.clusters import (
 from sweep.spec.sections import Execution
 from sweep.tasks import user_code
 from sweep.tasks.clusters import kubernetes, machines
-from sweep.tasks.errors import ClusterError
 from sweep.tasks.grid import seconds_a_point
-from sweep.tasks.progress import Interrupts, Progress, chosen
+from sweep.tasks.progress import ClusterError, Interrupts, Progress, chosen
 from sweep.tasks.scheduler import BlockQueue, Scheduler, Seen, plain
 from sweep.tasks.study import Evaluate
 from sweep.tasks.worker import Answer, Job

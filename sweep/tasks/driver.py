@@ -12,12 +12,20 @@ from typing import Any
 import numpy as np
 
 from sweep.spec import SceneSpec
-from sweep.storage.atomic_replace import beside, eyepoints_path, put, real, replaced_by, settle
-from sweep.storage.locations import PACKED, Location, located
+from sweep.storage.locations import (
+    PACKED,
+    Location,
+    eyepoints_path,
+    located,
+    real,
+    replaced_by,
+    settle,
+    successor,
+    take_place,
+)
 from sweep.storage.opening import read_attributes, study_id
 from sweep.tasks import studies, user_code
 from sweep.tasks.cluster import Pool, RunOptions
-from sweep.tasks.errors import BusyError, ClusterError, StoreError, told
 from sweep.tasks.eyepoint_study import EyepointStudy, world_of
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.grid_study import GridStudy
@@ -25,6 +33,7 @@ from sweep.tasks.journal import (
     CODE,
     EXTENDS,
     REPLACES,
+    Lock,
     committed,
     forget_older,
     read_recipe,
@@ -32,8 +41,7 @@ from sweep.tasks.journal import (
     refuse_damaged_recipe,
     write_recipe,
 )
-from sweep.tasks.lock import Lock
-from sweep.tasks.progress import working
+from sweep.tasks.progress import BusyError, ClusterError, StoreError, told, working
 from sweep.tasks.session import Outcome, Session
 from sweep.tasks.store import (
     create,
@@ -240,8 +248,8 @@ def _into(
         if replace and path.exists():
             refuse_to_replace(path)
             stack.callback(Lock(path).release)
-        if replace and isinstance(path, Path) and (path.exists() or beside(path).exists()):
-            new = beside(path)
+        if replace and isinstance(path, Path) and (path.exists() or successor(path).exists()):
+            new = successor(path)
             facts[REPLACES] = study_id(path)
         if extends is not None:
             facts[EXTENDS] = str(extends)
@@ -276,7 +284,7 @@ def _into(
             if not there:
                 remove(new)  # nothing was computed, and the next try should not meet it
             raise
-        if outcome.complete and isinstance(path, Path) and new == beside(path):
+        if outcome.complete and isinstance(path, Path) and new == successor(path):
             _succeed(path, durable=durable)
             return dataclasses.replace(outcome, store=path)
         return outcome
@@ -284,11 +292,11 @@ def _into(
 
 def _succeed(path: Path, *, durable: bool) -> None:
     """Put the complete store beside a place, which the caller has locked, into it."""
-    new = beside(path)
+    new = successor(path)
     with told(f"{new} can't take the place of {path}"):
         if durable:
             sync(new)
-        put(new, path)
+        take_place(new, path)
         forget_older(path)  # where it stands now it extends and replaces nothing
 
 

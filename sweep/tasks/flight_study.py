@@ -21,8 +21,7 @@ from sweep.model.outputs import (
     STATISTICS,
 )
 from sweep.model.resolution import by_tolerance
-from sweep.storage.atomic_replace import eyepoints_path
-from sweep.storage.locations import Location
+from sweep.storage.locations import Location, eyepoints_path
 from sweep.storage.opening import open_group
 from sweep.tasks.eyepoint_study import (
     SIZES,

@@ -12,11 +12,11 @@ import numpy as np
 import zarr
 
 from sweep.storage import logs
-from sweep.storage.atomic_replace import draft
 from sweep.storage.locations import (
     JOURNAL,
     PACKED,
     Location,
+    draft,
     files_below,
     in_words,
     located,
@@ -26,9 +26,8 @@ from sweep.storage.locations import (
 from sweep.storage.logs import read_lines, sealed
 from sweep.storage.opening import open_group
 from sweep.tasks import store, studies
-from sweep.tasks.errors import StoreError, told
 from sweep.tasks.journal import LOGS, RECIPE, committed
-from sweep.tasks.progress import Progress, chosen
+from sweep.tasks.progress import Progress, StoreError, chosen, told
 from sweep.tasks.study import ArrayLayout, BlockGrid, Study
 
 #: Bytes of a shard, before compression, as far as whole chunks allow; one a thread is in memory.

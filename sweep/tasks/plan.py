@@ -17,8 +17,7 @@ import psutil
 from sweep.model.effects.catalogue import EFFECTS, NAMES
 from sweep.model.outputs import SHOTS
 from sweep.scenes.eyepoint_arrays import from_arrays
-from sweep.storage.atomic_replace import eyepoints_path
-from sweep.storage.locations import Location
+from sweep.storage.locations import Location, eyepoints_path
 from sweep.tasks import cluster
 from sweep.tasks.eyepoint_study import EyepointStudy
 from sweep.tasks.flight_study import FlightStudy, Part

@@ -1,4 +1,4 @@
-"""Progress of a run: a bar in a terminal, a plain line now and then elsewhere; and Ctrl-C."""
+"""Words to who runs a study, and Ctrl-C from them: errors; a bar in a terminal, or plain lines."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 from typing import TYPE_CHECKING, Any
+
+from sweep.storage.opening import StoreError as StoreError
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
@@ -27,6 +29,35 @@ BROAD = 100
 LATE = 2.0
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class TaskError(Exception):
+    """A study that can't be run as asked: the text says why and what to do."""
+
+
+class BusyError(StoreError):
+    """A store that another process writes to."""
+
+
+class ClusterError(TaskError):
+    """A scheduler or workers that can't be had."""
+
+
+class CodeError(TaskError):
+    """A function of the user's that may not run, can't be imported, or answers wrongly."""
+
+
+class SchedulerLost(Exception):
+    """A scheduler that went away with work still out; what was committed stays."""
+
+
+@contextmanager
+def told(what: str) -> Iterator[None]:
+    """Say what can't be done where the disk, or an object store, raises."""
+    try:
+        yield
+    except OSError as error:
+        raise StoreError(f"{what}: {error.strerror or error}") from error
 
 
 class Progress:

@@ -18,9 +18,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sweep.tasks.errors import SchedulerLost, StoreError
 from sweep.tasks.journal import Receipt
-from sweep.tasks.progress import duration
+from sweep.tasks.progress import SchedulerLost, StoreError, duration
 from sweep.tasks.worker import Answer, Job, failure, work
 
 if TYPE_CHECKING:

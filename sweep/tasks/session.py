@@ -19,10 +19,8 @@ from sweep.storage.locations import Location, ObjectStoreError
 from sweep.storage.logs import read_receipts
 from sweep.tasks import journal, store
 from sweep.tasks.cluster import Pool
-from sweep.tasks.errors import SchedulerLost, StoreError
-from sweep.tasks.journal import Failure, Journal, Look, Receipt, given_up
-from sweep.tasks.lock import Lock
-from sweep.tasks.progress import duration, working
+from sweep.tasks.journal import Failure, Journal, Lock, Look, Receipt, given_up
+from sweep.tasks.progress import SchedulerLost, StoreError, duration, working
 from sweep.tasks.scheduler import TICK, BlockQueue
 from sweep.tasks.study import Study
 from sweep.tasks.worker import Answer

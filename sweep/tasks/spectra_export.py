@@ -13,9 +13,9 @@ import numpy as np
 from sweep.model.detectors import taper
 from sweep.model.effects.catalogue import DEFAULTS, EFFECTS
 from sweep.model.looks import NUMBER, Looks
-from sweep.storage.atomic_replace import draft
-from sweep.tasks.errors import StoreError
+from sweep.storage.locations import draft
 from sweep.tasks.grid_study import draw_keys
+from sweep.tasks.progress import StoreError
 
 if TYPE_CHECKING:
     import xarray as xr

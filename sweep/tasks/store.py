@@ -29,23 +29,25 @@ from zarr.codecs import Crc32cCodec, ZstdCodec
 from sweep.model import VERSION
 from sweep.spec import SceneSpec, Spec, difference
 from sweep.storage import locations, opening
-from sweep.storage.atomic_replace import beside, discard, draft, settle
 from sweep.storage.locations import (
     JOURNAL,
     Location,
     ObjectPath,
+    discard,
+    draft,
     each,
     files_below,
     in_words,
     located,
     names_below,
     put_whole,
+    settle,
+    successor,
 )
 from sweep.storage.logs import digest, digest_of, read_lines, sealed
 from sweep.storage.opening import LAYOUT, MANIFEST, ZSTD_LEVEL
-from sweep.tasks.errors import BusyError, StoreError
-from sweep.tasks.journal import LOGS, REPLACES, read_recipe, write_recipe
-from sweep.tasks.lock import LOCK, Lock
+from sweep.tasks.journal import LOCK, LOGS, REPLACES, Lock, read_recipe, write_recipe
+from sweep.tasks.progress import BusyError, StoreError
 from sweep.tasks.study import CONVENTIONS, ArrayLayout, Content, Study
 
 if TYPE_CHECKING:
@@ -379,7 +381,7 @@ def refuse_to_replace(path: Location) -> None:
 def under_way(path: Location) -> Path | None:
     """Return the unfinished store that is to replace the one at a path; StoreError for another."""
     settle(path)
-    if not isinstance(path, Path) or not (new := beside(path)).exists():
+    if not isinstance(path, Path) or not (new := successor(path)).exists():
         return None
     if read_recipe(new).get(REPLACES) != opening.study_id(path):
         now = "holds another study now" if path.exists() else "is gone"

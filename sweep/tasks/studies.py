@@ -21,16 +21,15 @@ from sweep.spec.fields import parameter_rules
 from sweep.spec.grid_rules import is_method
 from sweep.spec.mistakes import Mistake
 from sweep.storage import logs, opening
-from sweep.storage.atomic_replace import real
-from sweep.storage.locations import Location, located
+from sweep.storage.locations import Location, located, real
 from sweep.storage.opening import open_group
 from sweep.tasks import store
-from sweep.tasks.errors import StoreError
 from sweep.tasks.eyepoint_study import EyepointStudy
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.grid import TOLERANCE, Lattice, Value, canonical_rows
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.journal import EXTENDS, committed, digests, read_recipe
+from sweep.tasks.progress import StoreError
 from sweep.tasks.study import DAMAGED, Results
 
 Declared = Spec | SceneSpec

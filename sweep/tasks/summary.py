@@ -19,11 +19,11 @@ from sweep.model.unsupported import UnsupportedShot
 from sweep.storage.locations import PACKED, Location, files_below, located
 from sweep.storage.logs import read_receipts
 from sweep.storage.opening import open_group
-from sweep.tasks import journal, lock, studies
-from sweep.tasks.errors import StoreError
+from sweep.tasks import journal, studies
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.grid_study import GridStudy, evaluate_points, select, with_few_draws
 from sweep.tasks.journal import begun_points, receipted
+from sweep.tasks.progress import StoreError
 from sweep.tasks.study import Study
 
 if TYPE_CHECKING:
@@ -368,7 +368,7 @@ class Status:
     blocks_done: int
     points_begun: float  # drawn in part, in blocks that take long
     failures: dict[int, dict[str, Any]]  # of blocks that are not done, by block
-    holder: lock.Holder | None  # who writes to it
+    holder: journal.Holder | None  # who writes to it
     holder_lives: bool
     draws_done: int  # where each point has a fixed number; else 0
     bytes: int  # of all results, as they were stored; of a packed copy all its files
@@ -394,7 +394,7 @@ def status(store: str | Location) -> Status:
     begun = journal.last_begun(path)
     receipts = read_receipts(path, study.n_blocks, since=begun)
     packed = sum(files_below(path).values()) if PACKED in attributes else 0
-    holder = lock.holder(path)
+    holder = journal.holder(path)
     points = study.points_in(receipts.points > 0)
     spent = receipts.last - begun
     return Status(
@@ -409,10 +409,10 @@ def status(store: str | Location) -> Status:
         points_begun=sum(begun_points(path, study.id).values()),
         failures=journal.given_up(path, study.n_blocks),
         holder=holder,
-        holder_lives=holder is not None and lock.is_live(path, holder),
+        holder_lives=holder is not None and journal.is_live(path, holder),
         draws_done=points * int(study.spec.draws.number) if isinstance(study, GridStudy) else 0,
         bytes=packed or int(receipts.sizes.sum()),
         rate=receipts.recent / spent if receipts.recent and spent > 0 else 0.0,
         workers=len(receipts.workers),
-        heartbeat=lock.heartbeat_age(path) if holder else float("inf"),
+        heartbeat=journal.heartbeat_age(path) if holder else float("inf"),
     )

@@ -21,7 +21,7 @@ import numpy as np
 from sweep.model.detectors import DETECTORS, Setting
 from sweep.model.estimators import ESTIMATORS
 from sweep.model.window import window
-from sweep.tasks.errors import CodeError
+from sweep.tasks.progress import CodeError
 
 if TYPE_CHECKING:
     from sweep.model.noisy_spectra import Methods

@@ -18,23 +18,23 @@ import google_crc32c
 import numpy as np
 
 from sweep.storage import opening
-from sweep.storage.atomic_replace import eyepoints_path, settle
 from sweep.storage.locations import (
     JOURNAL,
     PACKED,
     PARTIAL,
     Location,
+    eyepoints_path,
     located,
     names_below,
     put_whole,
+    settle,
 )
 from sweep.storage.logs import digest, digest_of, read_lines, read_sealed
 from sweep.storage.opening import MANIFEST
-from sweep.tasks import journal, lock, store, studies
-from sweep.tasks.errors import StoreError, told
+from sweep.tasks import journal, store, studies
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.journal import RECIPE, read_recipe
-from sweep.tasks.progress import Progress, chosen
+from sweep.tasks.progress import Progress, StoreError, chosen, told
 from sweep.tasks.studies import AnyStudy
 from sweep.tasks.study import Study
 
@@ -121,7 +121,7 @@ def _verify(path: Location, study: AnyStudy | None, repair: bool, shown: Progres
     found, restored = damages(path), []
     if found and study and repair:
         store.refuse_foreign(path)  # a lock would be the first thing of ours in it
-        with lock.Lock(path):
+        with journal.Lock(path):
             found, restored = [], restore(path, study)
     logs = _of_logs(path)
     blocks = list(_of_blocks(path, study, shown)) if study else []
@@ -144,8 +144,8 @@ def _whole(path: Location, study: Study, damages: list[Damage]) -> int:
 
 def _of_logs(path: Location) -> list[Damage]:
     """Damaged lines of the journal; the last of a log that is being written may be unfinished."""
-    holder = lock.holder(path)
-    alive = holder is not None and lock.is_live(path, holder)
+    holder = journal.holder(path)
+    alive = holder is not None and journal.is_live(path, holder)
     return [
         Damage(f"{JOURNAL}/{name} line {number}", "is damaged or cut short")
         for name in (*journal.LOGS, RECIPE)
@@ -224,7 +224,7 @@ def _wrong(place: Location, damage_of: Callable[[bytes], str]) -> str:
 def _mark(path: Location, damages: list[Damage]) -> str:
     """Withdraw receipts of damaged blocks; why that can't be, where it can't."""
     try:
-        with lock.Lock(path), told(f"{path} can't be written"):
+        with journal.Lock(path), told(f"{path} can't be written"):
             log = journal.Journal(path)
             for block in sorted({damage.block for damage in damages}):
                 named = [f"{d.object} {d.what}" for d in damages if d.block == block]

@@ -15,13 +15,12 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import TypeVar
 
-from sweep.storage.atomic_replace import stamp
-from sweep.storage.locations import located
+from sweep.storage.locations import located, stamp
 from sweep.storage.opening import read_attributes
 from sweep.tasks import journal, store, studies
-from sweep.tasks.errors import StoreError
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.journal import Begun, Failure, Receipt
+from sweep.tasks.progress import StoreError
 from sweep.tasks.study import Evaluate, Results, Stop, Unfinished
 
 T = TypeVar("T")

@@ -17,7 +17,7 @@ from small import quiet, small, tree
 from sweep.spec import cluster_of, load_cluster
 from sweep.spec.clusters import Bounds
 from sweep.tasks.clusters import kubernetes, machines
-from sweep.tasks.errors import ClusterError
+from sweep.tasks.progress import ClusterError
 
 pytest.importorskip("dask_kubernetes", reason="the extra sweep[kubernetes] is not installed")
 

@@ -15,7 +15,7 @@ from small import quiet, small, tree
 
 from sweep.spec import cluster_of
 from sweep.tasks.clusters import machines
-from sweep.tasks.errors import ClusterError
+from sweep.tasks.progress import ClusterError
 
 SSH = {
     "kind": "ssh",

@@ -14,7 +14,7 @@ from sweep.cli import main
 from sweep.spec import cluster_of
 from sweep.tasks import cluster
 from sweep.tasks.clusters import machines
-from sweep.tasks.errors import ClusterError
+from sweep.tasks.progress import ClusterError
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import pytest
 from small import receipts, small, tree
 
 from sweep.tasks.driver import resume, run
-from sweep.tasks.errors import StoreError
+from sweep.tasks.progress import StoreError
 from sweep.tasks.summary import status
 from sweep.tasks.verify import verify
 

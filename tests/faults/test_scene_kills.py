@@ -9,7 +9,7 @@ from small import receipts, tree
 from small_flights import small_scene
 from test_kills import process, wait_for
 
-from sweep.storage.atomic_replace import eyepoints_path
+from sweep.storage.locations import eyepoints_path
 from sweep.tasks.driver import resume, run
 
 CLIENT = """

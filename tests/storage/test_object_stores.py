@@ -27,8 +27,8 @@ from sweep.storage import locations, logs
 from sweep.storage.locations import JOURNAL, located
 from sweep.storage.logs import read_lines, sealed, unsealed
 from sweep.tasks.driver import extend, resume, run
-from sweep.tasks.errors import StoreError
-from sweep.tasks.lock import LOCK, Holder, Lock, holder
+from sweep.tasks.journal import LOCK, Holder, Lock, holder
+from sweep.tasks.progress import StoreError
 from sweep.tasks.summary import status
 from sweep.tasks.verify import verify
 

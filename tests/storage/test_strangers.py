@@ -17,8 +17,8 @@ from sweep.cli import main
 from sweep.storage.logs import closed
 from sweep.storage.opening import NotAStoreError
 from sweep.tasks import store
-from sweep.tasks.errors import StoreError
 from sweep.tasks.grid_study import GridStudy
+from sweep.tasks.progress import StoreError
 from sweep.tasks.summary import status
 
 

@@ -16,9 +16,8 @@ from small import copied, receipts, small, threads, tree
 
 from sweep.tasks import progress, scheduler, session, store, worker
 from sweep.tasks.driver import resume, run
-from sweep.tasks.errors import ClusterError, StoreError
 from sweep.tasks.grid_study import GridStudy
-from sweep.tasks.progress import Progress
+from sweep.tasks.progress import ClusterError, Progress, StoreError
 from sweep.tasks.worker import worker_address
 
 

@@ -14,11 +14,10 @@ from sweep.model import sampling
 from sweep.storage.locations import ObjectPath
 from sweep.tasks import journal, progress, worker
 from sweep.tasks.driver import extend, resume, run
-from sweep.tasks.errors import StoreError
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.journal import Begun
 from sweep.tasks.packing import pack
-from sweep.tasks.progress import Progress
+from sweep.tasks.progress import Progress, StoreError
 from sweep.tasks.study import Found, Known
 from sweep.tasks.summary import status
 from sweep.tasks.verify import verify

@@ -18,12 +18,11 @@ from small_flights import small_scene
 
 from sweep.cli import main
 from sweep.model import sampling
-from sweep.storage.atomic_replace import beside
+from sweep.storage.locations import successor
 from sweep.tasks import grid_study
 from sweep.tasks.driver import extend, resume
-from sweep.tasks.errors import StoreError
 from sweep.tasks.grid_study import GridStudy
-from sweep.tasks.progress import Progress
+from sweep.tasks.progress import Progress, StoreError
 from sweep.tasks.summary import status
 from sweep.tasks.verify import verify
 
@@ -361,7 +360,7 @@ def see_it_refused(store, spec, *told, match="needs a store of its own"):
     with pytest.raises(StoreError, match=match) as error:
         larger(store, spec)
     assert all(line in str(error.value) for line in told)
-    assert everything(store) == before and not beside(store).exists()
+    assert everything(store) == before and not successor(store).exists()
 
 
 @pytest.mark.parametrize("changes, told", REFUSED.values(), ids=REFUSED)
@@ -398,7 +397,7 @@ def test_ctrl_c_leaves_the_store_and_both_commands_go_on(tmp_path, undisturbed, 
     path, spec = copied(undisturbed, tmp_path), small(axes=APPENDED)
     for _ in range(2):
         outcome = extend(path, spec, progress=Interrupting(), scheduler="none")
-        assert outcome.stopped == "interrupted" and outcome.store == beside(path)
+        assert outcome.stopped == "interrupted" and outcome.store == successor(path)
         assert tree(path) == tree(undisturbed)
     told = CliRunner().invoke(main, ["resume", str(path), "--scheduler", "none"])
     assert told.exit_code == 0 and f"{path}: 108 of 108 points" in told.stdout
@@ -411,7 +410,7 @@ import os, signal, sys
 sys.path.insert(0, sys.argv[1])
 from pathlib import Path
 from small import STUDY, small
-from sweep.storage import atomic_replace
+from sweep.storage import locations
 from sweep.tasks import driver
 from sweep.tasks.journal import Journal
 
@@ -427,7 +426,7 @@ def committing(self, *receipts):
         die()
 
 def renaming(old, new):
-    ahead = {"old": store, "new": atomic_replace.beside(store)}
+    ahead = {"old": store, "new": locations.successor(store)}
     if moment == f"before the {''.join(k for k, v in ahead.items() if v == Path(old))} one moves":
         die()
     rename(old, new)
@@ -435,7 +434,7 @@ def renaming(old, new):
 if moment == "three blocks":
     Journal.commit = committing
 elif moment == "as the old one is removed":
-    atomic_replace.shutil.rmtree = lambda path, **_: Path(path).exists() and die()
+    locations.shutil.rmtree = lambda path, **_: Path(path).exists() and die()
 else:
     os.rename = renaming
 spec = small(axes={**STUDY["axes"], "instrument.laser.power": ["1 W", "2 W", "3 W"]})

@@ -17,10 +17,10 @@ from sweep.model.accuracy import Accuracy
 from sweep.model.resolution import rays_needed
 from sweep.report.writing import accuracy
 from sweep.spec import SceneSpec
-from sweep.storage.atomic_replace import eyepoints_path
+from sweep.storage.locations import eyepoints_path
 from sweep.tasks import eyepoint_study
 from sweep.tasks.driver import extend
-from sweep.tasks.errors import StoreError
+from sweep.tasks.progress import StoreError
 from sweep.tasks.summary import rays_table
 
 RAYS = Accuracy.rays

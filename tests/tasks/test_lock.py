@@ -12,15 +12,15 @@ import pytest
 from small import quiet, receipts, small
 
 from sweep.storage.locations import JOURNAL, located
-from sweep.tasks import lock
+from sweep.tasks import journal
 from sweep.tasks.driver import resume
-from sweep.tasks.errors import StoreError
-from sweep.tasks.lock import Holder, Lock, holder, is_live
+from sweep.tasks.journal import Holder, Lock, holder, is_live
+from sweep.tasks.progress import StoreError
 
 
 def put(store, who: Holder, *, age: float = 0.0) -> None:
     """A lock of someone else's, its last heartbeat some seconds old."""
-    path = store / JOURNAL / lock.LOCK
+    path = store / JOURNAL / journal.LOCK
     path.parent.mkdir(exist_ok=True)
     path.write_text(json.dumps(asdict(who)))
     os.utime(path, (time.time() - age, time.time() - age))
@@ -38,7 +38,7 @@ def test_a_held_lock_refuses_a_second_driver_and_says_who_holds_it(tmp_path):
 
 def test_the_lock_of_a_dead_process_is_taken_over(tmp_path):
     code = (
-        "import os, sys; from pathlib import Path; from sweep.tasks.lock import Lock;"
+        "import os, sys; from pathlib import Path; from sweep.tasks.journal import Lock;"
         "Lock(Path(sys.argv[1])); os.kill(os.getpid(), 9)"
     )
     subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=False)
@@ -69,14 +69,14 @@ def test_on_another_host_the_heartbeat_decides(tmp_path, age, live):
 
 
 def test_a_held_lock_beats(tmp_path, monkeypatch):
-    monkeypatch.setattr(lock, "HEARTBEAT", 0.02)
+    monkeypatch.setattr(journal, "HEARTBEAT", 0.02)
     held = Lock(tmp_path)
-    path = tmp_path / JOURNAL / lock.LOCK
+    path = tmp_path / JOURNAL / journal.LOCK
     os.utime(path, (0, 0))
     deadline = time.monotonic() + 5
     while path.stat().st_mtime == 0 and time.monotonic() < deadline:
         time.sleep(0.01)
-    assert lock.heartbeat_age(tmp_path) < 5
+    assert journal.heartbeat_age(tmp_path) < 5
     held.release()
 
 
@@ -132,9 +132,9 @@ def test_a_driver_whose_lock_was_taken_commits_nothing_more(tmp_path):
 @pytest.mark.parametrize("kind", ["file", "object"])
 def test_a_lock_beats_from_the_first_on_and_not_once_it_is_left(kind, tmp_path):
     store = tmp_path if kind == "file" else located(f"memory://bucket/{time.time_ns()}/s.zarr")
-    assert holder(store) is None and lock.heartbeat_age(store) == float("inf")
+    assert holder(store) is None and journal.heartbeat_age(store) == float("inf")
     held = Lock(store)
-    assert held.is_mine() and lock.heartbeat_age(store) < 60
+    assert held.is_mine() and journal.heartbeat_age(store) < 60
     held.release()
     assert holder(store) is None
 
@@ -147,7 +147,7 @@ def test_a_lock_on_a_read_only_disk_has_an_age(tmp_path, monkeypatch):
 
     with monkeypatch.context() as patched:
         patched.setattr("pathlib.Path.write_bytes", refuse)
-        assert lock.heartbeat_age(tmp_path) < 60
+        assert journal.heartbeat_age(tmp_path) < 60
     held.release()
 
 
@@ -156,7 +156,7 @@ def test_no_two_heartbeats_of_an_object_are_alike():
     store = located(f"memory://bucket/{time.time_ns()}/s.zarr")
     held, states = Lock(store), []
     for _ in range(3):
-        states.append((store / JOURNAL / lock.LOCK).read_bytes())
+        states.append((store / JOURNAL / journal.LOCK).read_bytes())
         held._claim.beat()
         assert held.is_mine()
     held.release()

@@ -15,8 +15,8 @@ from sweep.cli import main
 from sweep.storage.locations import files_below
 from sweep.tasks import packing
 from sweep.tasks.driver import resume
-from sweep.tasks.errors import StoreError
 from sweep.tasks.packing import pack, shard_shape
+from sweep.tasks.progress import StoreError
 from sweep.tasks.study import ArrayLayout
 from sweep.tasks.summary import scene_summary, status
 from sweep.tasks.verify import verify

@@ -7,8 +7,8 @@ from small import STUDY, copied, everything, quiet, small, tree
 
 from sweep.tasks import cluster
 from sweep.tasks.driver import resume, run
-from sweep.tasks.errors import ClusterError, StoreError
-from sweep.tasks.lock import Lock
+from sweep.tasks.journal import Lock
+from sweep.tasks.progress import ClusterError, StoreError
 from sweep.tasks.store import software
 from sweep.tasks.summary import status
 

@@ -14,13 +14,13 @@ from small import STUDY, copied, failing, quiet, small, tree
 
 import sweep
 from sweep.cli import main
-from sweep.storage.atomic_replace import beside
+from sweep.storage.locations import successor
 from sweep.storage.opening import ReplacedError
 from sweep.tasks import cluster, packing
 from sweep.tasks.driver import extend, resume, run
-from sweep.tasks.errors import ClusterError, StoreError
-from sweep.tasks.lock import Lock
+from sweep.tasks.journal import Lock
 from sweep.tasks.packing import pack
+from sweep.tasks.progress import ClusterError, StoreError
 from sweep.tasks.spectra_export import write
 from sweep.tasks.summary import status
 from sweep.tasks.verify import verify
@@ -37,7 +37,7 @@ def begun(store, tmp_path):
     """An extension of a store of which no block is done."""
     outcome = extend(store, larger(), progress=False, scheduler="none",
                      evaluate=failing(set(range(99)), tmp_path / "log"))  # fmt: skip
-    assert outcome.blocks_done == 0 and beside(store).exists()
+    assert outcome.blocks_done == 0 and successor(store).exists()
     (tmp_path / "log").unlink()
 
 
@@ -49,12 +49,12 @@ def test_overwriting_without_a_cluster_takes_nothing_away(
     store = copied(undisturbed, tmp_path)
     if under_way:
         begun(store, tmp_path)
-        before = tree(beside(store))
+        before = tree(successor(store))
     with pytest.raises(ClusterError):
         quiet(small(seed=9), store, overwrite=True, **NOWHERE)
     assert tree(store) == tree(undisturbed) and status(store).complete
     if under_way:
-        assert tree(beside(store)) == before
+        assert tree(successor(store)) == before
     else:
         assert list(tmp_path.iterdir()) == [store]
 
@@ -65,10 +65,10 @@ def test_what_is_to_replace_a_store_does_so_once_it_is_complete(undisturbed, tmp
     outcome = quiet(other, store, scheduler="none", overwrite=True, evaluate=failed)
     assert not outcome.complete and tree(store) == tree(undisturbed)
     told = CliRunner().invoke(main, ["status", str(store)]).output
-    assert "complete" in told and f"being replaced: sweep status {beside(store)}" in told
+    assert "complete" in told and f"being replaced: sweep status {successor(store)}" in told
     assert resume(outcome.store, progress=False, scheduler="none", retry_failed=True).complete
     assert tree(store) == tree(quiet(other, tmp_path / "at_once.zarr").store)
-    assert not beside(store).exists()
+    assert not successor(store).exists()
 
 
 def test_a_forgotten_extension_never_takes_another_studys_place(undisturbed, tmp_path):
@@ -93,7 +93,7 @@ def test_an_extension_of_what_was_removed_by_hand_is_refused(undisturbed, tmp_pa
     ):
         with pytest.raises(StoreError, match=f"{then}|holds another study"):
             command()
-    assert store.exists() == (then != "gone") and beside(store).exists()
+    assert store.exists() == (then != "gone") and successor(store).exists()
     assert quiet(small(seed=9), store, scheduler="none", overwrite=True).complete
     assert status(store).study_id == small(seed=9).id and list(tmp_path.iterdir()) == [store]
 

@@ -14,15 +14,14 @@ from test_driver import StopAfter
 
 from sweep.model.geometry.rays import Caster
 from sweep.model.outputs import CYCLES, NAVIGATION, POINTS, SHOTS, SIMULATED, STATISTICS
-from sweep.storage.atomic_replace import eyepoints_path
+from sweep.storage.locations import eyepoints_path
 from sweep.tasks import eyepoint_study
 from sweep.tasks.driver import resume, run
-from sweep.tasks.errors import StoreError
 from sweep.tasks.eyepoint_study import EyepointStudy
 from sweep.tasks.flight_study import FlightStudy
-from sweep.tasks.lock import Lock
+from sweep.tasks.journal import Lock
 from sweep.tasks.plan import plan
-from sweep.tasks.progress import Progress
+from sweep.tasks.progress import Progress, StoreError
 from sweep.tasks.store import create
 from sweep.tasks.summary import scene_summary, status
 

@@ -8,8 +8,8 @@ from small import everything, small
 
 from sweep.storage import logs
 from sweep.tasks import store
-from sweep.tasks.errors import StoreError
 from sweep.tasks.grid_study import GridStudy
+from sweep.tasks.progress import StoreError
 
 
 @pytest.fixture

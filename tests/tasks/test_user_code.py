@@ -17,8 +17,8 @@ from small_flights import SCENE, small_scene
 import sweep
 from sweep.tasks import plan as planned
 from sweep.tasks import user_code
-from sweep.tasks.errors import CodeError, TaskError
 from sweep.tasks.plan import plan
+from sweep.tasks.progress import CodeError, TaskError
 
 CODE = """
     import numpy as np

@@ -12,12 +12,11 @@ from small_flights import small_scene
 import sweep
 from sweep.analysis.opening import NotAStoreError
 from sweep.cli import main
-from sweep.storage.atomic_replace import eyepoints_path
+from sweep.storage.locations import eyepoints_path
 from sweep.tasks import journal, studies
 from sweep.tasks.driver import resume, run
-from sweep.tasks.errors import StoreError
-from sweep.tasks.lock import Lock
-from sweep.tasks.progress import Progress
+from sweep.tasks.journal import Lock
+from sweep.tasks.progress import Progress, StoreError
 from sweep.tasks.verify import verify
 
 TINY = {"axes": {"target.range": ["1 km", "2 km"]}, "storage": {"block_points": 1}}

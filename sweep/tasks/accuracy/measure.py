@@ -14,8 +14,7 @@ import numpy as np
 
 from sweep.spec import SceneSpec, Spec
 from sweep.storage import opening
-from sweep.storage.atomic_replace import real
-from sweep.storage.locations import Location
+from sweep.storage.locations import Location, real
 from sweep.tasks import store
 from sweep.tasks.accuracy.bench import GridBench, Seen, Trial, spread
 from sweep.tasks.accuracy.flight_bench import FlightBench
@@ -30,8 +29,7 @@ from sweep.tasks.accuracy.rungs import (
     Rung,
     ladder,
 )
-from sweep.tasks.errors import StoreError, TaskError
-from sweep.tasks.progress import Interrupts, Progress, chosen, working
+from sweep.tasks.progress import Interrupts, Progress, StoreError, TaskError, chosen, working
 from sweep.tasks.studies import ACCURACY, study_of
 from sweep.tasks.study import ArrayLayout, Study, described
 

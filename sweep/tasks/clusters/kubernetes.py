@@ -11,7 +11,7 @@ from typing import Any
 from sweep.extras import remedy
 from sweep.spec.clusters import Bounds, Kubernetes
 from sweep.tasks.clusters import machines
-from sweep.tasks.errors import ClusterError
+from sweep.tasks.progress import ClusterError
 
 API = "kubernetes.dask.org/v1"
 PORT = 8786

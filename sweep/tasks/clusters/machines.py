@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from sweep.spec.clusters import SSH, Bounds, Cluster, Local, Scheduler
-from sweep.tasks.errors import ClusterError
+from sweep.tasks.progress import ClusterError
 
 if TYPE_CHECKING:
     from distributed import Security
