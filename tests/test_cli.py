@@ -16,8 +16,8 @@ from drawn_files import shows
 from sweep.cli import main
 from sweep.spec import Spec, load
 from sweep.tasks import driver, progress
-from sweep.tasks.cluster import LITTLE, RunOptions, about_seconds
 from sweep.tasks.journal import Lock
+from sweep.tasks.session import LITTLE, RunOptions, about_seconds
 
 STUDY = """\
 title: A small study

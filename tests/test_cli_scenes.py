@@ -8,8 +8,8 @@ import yaml
 from test_cli import STUDY, refused, sweep
 
 from sweep.spec import SceneSpec
-from sweep.tasks.cluster import LITTLE, RunOptions, about_seconds
 from sweep.tasks.eyepoint_study import world_of
+from sweep.tasks.session import LITTLE, RunOptions, about_seconds
 
 SCENE = (
     STUDY.split("target:")[0]

@@ -123,9 +123,10 @@ def folder(help: str) -> Callable[..., Any]:
 
 
 def _allow(context: click.Context, parameter: click.Parameter, modules: tuple[str, ...]) -> None:
-    from sweep.tasks.user_code import allow
+    if modules:
+        from sweep.tasks.user_code import allow
 
-    allow(modules)
+        allow(modules)
 
 
 ALLOW_CODE = click.option(

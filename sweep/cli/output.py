@@ -261,9 +261,9 @@ def plan_lines(
 ) -> Iterator[tuple[str, str]]:
     """Lines, with their headings, of what a study will take."""
     from sweep.spec import Spec
-    from sweep.tasks.cluster import RunOptions
     from sweep.tasks.plan import plan
     from sweep.tasks.progress import duration
+    from sweep.tasks.session import RunOptions
 
     p = plan(study, store=store, workers=workers)
     if isinstance(study, Spec):

@@ -24,8 +24,7 @@ from sweep.storage.locations import (
     take_place,
 )
 from sweep.storage.opening import read_attributes, study_id
-from sweep.tasks import studies, user_code
-from sweep.tasks.cluster import Pool, RunOptions
+from sweep.tasks import studies
 from sweep.tasks.eyepoint_study import EyepointStudy, world_of
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.grid_study import GridStudy
@@ -42,7 +41,7 @@ from sweep.tasks.journal import (
     write_recipe,
 )
 from sweep.tasks.progress import BusyError, ClusterError, StoreError, told, working
-from sweep.tasks.session import Outcome, Session
+from sweep.tasks.session import Outcome, Pool, RunOptions, Session
 from sweep.tasks.store import (
     create,
     refuse_altered,
@@ -54,6 +53,7 @@ from sweep.tasks.store import (
     under_way,
 )
 from sweep.tasks.studies import Declared, changed, refuse_unlike, what_is_there
+from sweep.tasks.study import own_functions
 from sweep.tasks.verify import refuse_damaged
 
 #: Seconds between looks at rays that another run casts.
@@ -72,7 +72,7 @@ def run(
     overwrite
         Whether to put the new store in the place of one that is there, once it is complete.
     **options
-        Where and how to compute, by the names of :class:`sweep.tasks.cluster.RunOptions`:
+        Where and how to compute, by the names of :class:`sweep.tasks.session.RunOptions`:
         ``workers=4``, ``client=...``, ``progress=False`` and so on.
 
     Returns
@@ -87,7 +87,7 @@ def run(
         where the study names a function that may not run (:mod:`sweep.tasks.user_code`).
     """
     path, how = real(located(store)), RunOptions(**options)
-    user_code.check(spec)
+    _check_code(spec)
     pool = Pool(how, spec)
     if not overwrite:
         _refuse_in_the_way(path, studies.study_of(spec, path))
@@ -122,7 +122,7 @@ def resume(store: str | Location, *, spec: Declared | None = None, **options: An
     if spec is not None:
         refuse_other_study(path, attributes, study.spec, spec)
     _refuse_unsound(path, attributes, study)
-    user_code.check(study.spec)
+    _check_code(study.spec)
     if spec is None:
         refuse_damaged_recipe(path)
     else:
@@ -179,7 +179,7 @@ def extend(
     path, how = real(located(store)), RunOptions(**options)
     attributes, older = _held(path)
     asked = changed(older.spec if spec is None else spec, changes or {})
-    user_code.check(asked)
+    _check_code(asked)
     pool = Pool(how, asked)
     _refuse_unsound(path, attributes, older)
     if asked.id == attributes["study_id"]:
@@ -306,10 +306,21 @@ def _facts(spec: Declared) -> dict[str, str]:
     return {} if base is None else {"base": str(base.absolute())}
 
 
+def _check_code(spec: Declared) -> None:
+    """Import and try the functions that a study names, if any; CodeError where one fails."""
+    if any(own_functions(spec)):
+        from sweep.tasks.user_code import check
+
+        check(spec)
+
+
 def _tell_changed_code(path: Location, spec: Declared, say: Callable[[str], None]) -> None:
     """Say which of the user's modules a store, or the one that it extends, was not begun with."""
-    if not (here := user_code.digests(spec)):
+    if not any(own_functions(spec)):
         return
+    from sweep.tasks.user_code import digests
+
+    here = digests(spec)
     recipe = read_recipe(path)
     older = read_recipe(located(recipe[EXTENDS])) if EXTENDS in recipe else {}
     begun = here | older.get(CODE, {}) | recipe.get(CODE, {})

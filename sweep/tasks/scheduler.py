@@ -9,18 +9,16 @@ from __future__ import annotations
 import hashlib
 import queue
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError
 from dataclasses import dataclass, field, replace
-from itertools import chain, islice, takewhile
+from itertools import chain, takewhile
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
 
 from sweep.tasks.journal import Receipt
 from sweep.tasks.progress import SchedulerLost, StoreError, duration
-from sweep.tasks.worker import Answer, Job, failure, work
+from sweep.tasks.worker import NOT_HERE, TICK, Answer, BlockQueue, Job, Seen, failure, work
 
 if TYPE_CHECKING:
     from dask.typing import Key
@@ -34,8 +32,7 @@ MOST_BLOCKS = 1000
 #: worker threads tasks are longer for it.
 TASKS_A_SECOND = 100.0
 
-#: Seconds between looks at the scheduler, the lock and the clock while nothing arrives.
-TICK = 0.5
+#: Seconds between looks at the workers that there are.
 SLOTS_AGE = 2.0
 
 #: Seconds after which a worker that does not answer is silent; longer where its blocks are.
@@ -45,66 +42,7 @@ LEASE = 30.0
 #: knows of a folder for as long.
 LATENCY = 60.0
 
-NOT_HERE = "what was written is not in the store here: does the worker see the same file system?"
-
-Seen = Callable[[Receipt, bool], bool]
 Say = Callable[[str], None]
-
-
-class BlockQueue:
-    """Blocks that are not done, (blocks,) bool, handed out lazily; what fails comes back, alone."""
-
-    def __init__(self, done: np.ndarray) -> None:
-        self.left = int(done.size - np.count_nonzero(done))  # not yet handed out
-        self._fresh = _numbers(done)
-        self._suspects: deque[int] = deque()
-        self._returned: deque[int] = deque()
-        self.failed: set[int] = set()
-
-    def take(self, count: int, *, suspects: bool = True) -> list[int]:
-        """Up to `count` blocks for one task; one that failed before comes by itself, if at all."""
-        if self._suspects and suspects:
-            return [self._suspects.popleft()]
-        if self._returned:
-            return [self._returned.popleft()]
-        blocks = list(islice(self._fresh, count))
-        self.left -= len(blocks)
-        return blocks
-
-    def again(self, block: int) -> bool:
-        """Put a failed block back; False where this was its second failure."""
-        if block in self.failed:
-            return False
-        self.failed.add(block)
-        self._suspects.append(block)
-        return True
-
-    def put_back(self, blocks: list[int]) -> None:
-        """Put blocks back whose answer was lost, by no fault of theirs, or that are begun.
-
-        One that failed before stays a suspect, and is never out together with another.
-        """
-        for block in blocks:
-            (self._suspects if block in self.failed else self._returned).append(block)
-
-
-def _numbers(done: np.ndarray, stretch: int = 1 << 16) -> Iterator[int]:
-    for start in range(0, done.size, stretch):
-        yield from (start + np.flatnonzero(~done[start : start + stretch])).tolist()
-
-
-def plain(
-    job: Job, blocks: BlockQueue, stopping: Callable[[], bool], seen: Seen
-) -> Iterator[Answer]:
-    """Answers of a study computed here, one block after the other: what defines its bytes."""
-    while not stopping() and (some := blocks.take(1)):
-        answer = work(job, some)
-        if not all(seen(receipt, False) for receipt in answer.receipts):
-            answer = Answer(failures=[failure(block, StoreError(NOT_HERE)) for block in some])
-        blocks.put_back(list(answer.begun))
-        yield answer
-        if answer.unfit is not None:
-            raise answer.unfit
 
 
 @dataclass

@@ -1,8 +1,9 @@
-"""One run over what a store lacks: blocks handed out, answers committed, an outcome at its end."""
+"""One run over what a store lacks: where to compute, answers committed, an outcome at its end."""
 
 from __future__ import annotations
 
 import errno
+import math
 import os
 import socket
 import threading
@@ -11,19 +12,56 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sweep.spec import Spec
+from sweep.spec.clusters import (
+    Address,
+    AnyCluster,
+    Bounds,
+    Cluster,
+    Local,
+    LocalWorker,
+    cluster_of,
+    load_cluster,
+)
+from sweep.spec.sections import Execution
 from sweep.storage.locations import Location, ObjectStoreError
 from sweep.storage.logs import read_receipts
 from sweep.tasks import journal, store
-from sweep.tasks.cluster import Pool
+from sweep.tasks.grid import seconds_a_point
 from sweep.tasks.journal import Failure, Journal, Lock, Look, Receipt, given_up
-from sweep.tasks.progress import SchedulerLost, StoreError, duration, working
-from sweep.tasks.scheduler import TICK, BlockQueue
-from sweep.tasks.study import Study
-from sweep.tasks.worker import Answer
+from sweep.tasks.progress import (
+    ClusterError,
+    Interrupts,
+    Progress,
+    SchedulerLost,
+    StoreError,
+    chosen,
+    duration,
+    working,
+)
+from sweep.tasks.study import Evaluate, Study, own_functions
+from sweep.tasks.worker import TICK, Answer, BlockQueue, Job, Seen, plain
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+    from sweep.spec import SceneSpec
+    from sweep.tasks.cluster import Reached
+
+#: Scheduler "address" of the plain loop.
+NONE = "none"
+
+#: Work that is done here and at once, where nobody says otherwise [s of one core]: workers take
+#: some seconds to start.
+LITTLE = 10.0
+
+#: Seconds of a core that a ray, and a draw of a shot, take at the most, about.
+RAY, SHOT = 5e-6, 4e-4
 
 #: Blocks that may fail before any succeeds: beyond, the fault is not in the blocks.
 HOPELESS = 20
@@ -51,6 +89,167 @@ NOT_FOUND = (
     "block {} is computed in pieces, and what one worker saved was not found by the next: "
     "do all of them see the same store?"
 )
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions:
+    """Ways to compute a study; nothing of them shows in the results.
+
+    Parameters
+    ----------
+    client
+        Dask client to compute with; without one, `scheduler` and `workers` say what to use. By
+        default little work is done here, in a plain loop, and more of it by workers on all cores of
+        this machine.
+    workers, processes
+        Workers to start on this machine, as processes or as threads.
+    scheduler
+        Address of a Dask scheduler, or "none" for a plain loop in this process.
+    cluster
+        The file that describes a cluster, or what such a file holds; `workers` fixes how many.
+    progress
+        True for a bar or lines on standard error, False for none, or a `Progress`.
+    block_timeout
+        Seconds that a block may take; beyond, it is tried once more and then given up.
+    durable
+        Whether blocks are on the disk, and not only with the operating system, once committed: a
+        power failure then loses none of them.
+    retry_failed
+        Whether to try blocks again that were given up, for their errors, in an earlier run.
+    performance_report
+        HTML file to put Dask's own account of the run into.
+    evaluate
+        What computes a block in place of the model, with the same results; for instrumenting.
+    """
+
+    client: Client | None = None
+    workers: int | None = None
+    processes: bool = True
+    scheduler: str | None = None
+    cluster: str | Path | Mapping[str, Any] | AnyCluster | None = None
+    progress: bool | Progress = True
+    block_timeout: float | None = None
+    durable: bool = False
+    retry_failed: bool = False
+    performance_report: str | Path | None = None
+    evaluate: Evaluate | None = None
+
+    def place(self, spec: Spec | SceneSpec) -> AnyCluster | None:
+        """Return the cluster given here or by the spec's `execution`; None for a plain loop.
+
+        ClusterError where both a scheduler and a cluster are named, or workers that are not
+        ours to start.
+        """
+        if self.cluster is not None:
+            if self.scheduler is not None:
+                raise ClusterError("a scheduler and a cluster are both named: leave out one")
+            given = self.cluster
+            if not isinstance(given, Cluster):
+                given = cluster_of(given) if isinstance(given, Mapping) else load_cluster(given)
+            return _of_workers(given, self.workers)
+        scheduler, execution = self.scheduler, spec.execution
+        if scheduler is None and self.workers is None:
+            scheduler = execution.scheduler or None
+        if scheduler == NONE or (scheduler is None and self._leaves_it_open(spec)):
+            return None
+        if scheduler is not None:
+            return Address.model_construct(kind="scheduler", address=scheduler, security=None)
+        here = Local(kind="local", worker=LocalWorker(threads=execution.threads))
+        return _of_workers(here, self.workers or execution.workers or None)
+
+    def _leaves_it_open(self, spec: Spec | SceneSpec) -> bool:
+        """Tell whether nothing is said that takes workers, and the work takes none."""
+        said = self.workers or self.block_timeout or self.performance_report or self.evaluate
+        if said or not self.processes or spec.execution != Execution():
+            return False
+        return not any(own_functions(spec)) and about_seconds(spec) <= LITTLE
+
+
+def _of_workers(cluster: AnyCluster, workers: int | None) -> AnyCluster:
+    """Fix the number of workers of a cluster, if one is given and they are ours."""
+    if workers is None:
+        return cluster
+    if isinstance(cluster, Address):
+        raise ClusterError(
+            f"the workers of {cluster.address} are there already: leave out their number"
+        )
+    return cluster.model_copy(update={"workers": Bounds(workers, workers)})
+
+
+def about_seconds(spec: Spec | SceneSpec) -> float:
+    """Time of one core that a study takes, about [s]; infinite if rays follow a tolerance."""
+    places = math.prod(int(axis.size) for axis in spec.axes)
+    if isinstance(spec, Spec):
+        return places * seconds_a_point(spec)
+    if spec.rays_by_tolerance:
+        return math.inf
+    shots = sum(spec.cycles(name) * spec.shots_a_cycle(name) for name in spec.scanners)
+    rays = float(spec.parameters()["footprint.beamlets"])
+    return shots * (rays * RAY + places * int(spec.draws.number) * SHOT)
+
+
+class Pool(ExitStack):
+    """A place in use: its workers serve one study after another, and end with it."""
+
+    def __init__(self, options: RunOptions, spec: Spec | SceneSpec) -> None:
+        super().__init__()
+        self.options, self.interrupts = options, Interrupts()
+        self.told = chosen(options.progress)
+        self._cluster = options.place(spec)
+        self.most = 1  # blocks of the study: more workers than that have nothing to do
+        self._reached: Reached | None = None
+
+    @property
+    def is_plain(self) -> bool:
+        """Tell whether blocks are computed in a plain loop, without workers."""
+        return self.options.client is None and self._cluster is None
+
+    def connect(self) -> Reached:
+        """Reach the workers, no more than `most`; ClusterError where there are none to be had."""
+        from sweep.tasks.cluster import Reached, connected, reported
+
+        if self._reached is None:
+            client = self.options.client
+            if client is None:
+                assert self._cluster is not None
+                self._reached = self.enter_context(
+                    connected(
+                        self._cluster,
+                        most=self.most,
+                        processes=self.options.processes,
+                        say=self.told.say,
+                    )
+                )
+            elif client.asynchronous:
+                raise ClusterError("the client is asynchronous: give one of another kind, Client()")
+            else:
+                self._reached = Reached(client, 0)
+            if file := self.options.performance_report:
+                report = reported(self._reached.client, Path(file), self.told.say)
+                self.enter_context(report)
+        return self._reached
+
+    def answers(self, path: str, study_id: str, queue: BlockQueue, seen: Seen) -> Iterator[Answer]:
+        """Answers of a study's blocks as they arrive; `seen` tells what is in the store here."""
+        options = self.options
+        job = Job(path, study_id, options.evaluate, options.block_timeout, options.durable)
+        if self.is_plain:
+            if options.performance_report is not None:
+                self.told.say("no performance report: a plain loop has no scheduler to tell of it")
+            return plain(job, queue, self._stopping, seen)
+        from sweep.tasks.scheduler import Scheduler
+
+        client, slots, _ = self.connect()
+        scheduler = Scheduler(client, slots, job, queue, seen=seen, say=self.told.say)
+        return scheduler.answers(self._stopping)
+
+    def _stopping(self) -> bool:
+        return self.interrupts.stopping
+
+    def revive(self) -> None:
+        """Start workers of this machine again that are gone."""
+        if self._reached is not None:
+            self._reached.revive()
 
 
 @dataclass(frozen=True, kw_only=True)

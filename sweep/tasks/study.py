@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
@@ -411,6 +411,24 @@ class GrowingStudy(Study):
         """Points of a block that the smaller study has, if nothing is damaged."""
         shares = self.earlier.shares(block) if self.earlier else ()
         return sum(share.points.size for share in shares) * self.find(block)[0].each
+
+
+METHODS = {
+    "detector": "instrument.processing.detector.kind",
+    "estimator": "instrument.processing.estimator.kind",
+}
+"""Parameters that name what looks at whole spectra: one of ours, or a function of the user's."""
+
+
+def own_functions(spec: Any) -> Iterator[tuple[str, str]]:
+    """Roles and names of the functions of the user's that a study names."""
+    draws = getattr(spec, "draws", None)
+    if not getattr(draws, "whole_spectra", False):
+        return
+    for role, path in METHODS.items():
+        on_axes = [m.values for axis in spec.axes for m in axis.members if m.path == path]
+        names = on_axes[0] if on_axes else [spec.parameters()[path]]
+        yield from ((role, name) for name in dict.fromkeys(map(str, names)) if ":" in name)
 
 
 Evaluate = Callable[[Any, int], Results]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import lru_cache
 from hashlib import blake2b
 from importlib import import_module
@@ -22,6 +22,7 @@ from sweep.model.detectors import DETECTORS, Setting
 from sweep.model.estimators import ESTIMATORS
 from sweep.model.window import window
 from sweep.tasks.progress import CodeError
+from sweep.tasks.study import METHODS, own_functions
 
 if TYPE_CHECKING:
     from sweep.model.noisy_spectra import Methods
@@ -29,11 +30,7 @@ if TYPE_CHECKING:
 
 ALLOWED = "SWEEP_ALLOW_CODE"
 
-DETECTOR, ESTIMATOR = "detector", "estimator"
-_PATHS = {
-    DETECTOR: "instrument.processing.detector.kind",
-    ESTIMATOR: "instrument.processing.estimator.kind",
-}
+DETECTOR, ESTIMATOR = METHODS
 
 
 def allow(modules: Iterable[str]) -> None:
@@ -56,35 +53,19 @@ def _allowed() -> set[str]:
 
 def check(spec: Spec | SceneSpec) -> None:
     """Import the functions that a study names, and try each; CodeError where one fails."""
-    for role, name in _named(spec):
+    for role, name in own_functions(spec):
         _try(role, name)
-
-
-def names_any(spec: Spec | SceneSpec) -> bool:
-    """Tell whether a study names a function of the user's."""
-    return any(True for _ in _named(spec))
 
 
 def digests(spec: Spec | SceneSpec) -> dict[str, str]:
     """Digest of each module, as it is imported here, whose functions a study names."""
-    modules = {name.partition(":")[0] for _, name in _named(spec)}
+    modules = {name.partition(":")[0] for _, name in own_functions(spec)}
     sources = {module: getattr(import_module(module), "__file__", None) for module in modules}
     return {
         module: blake2b(Path(source).read_bytes(), digest_size=16).hexdigest()
         for module, source in sources.items()
         if source
     }
-
-
-def _named(spec: Spec | SceneSpec) -> Iterator[tuple[str, str]]:
-    """Roles and names of the functions that a study names."""
-    draws = getattr(spec, "draws", None)
-    if not getattr(draws, "whole_spectra", False):
-        return
-    for role, path in _PATHS.items():
-        on_axes = [m.values for axis in spec.axes for m in axis.members if m.path == path]
-        names = on_axes[0] if on_axes else [spec.parameters()[path]]
-        yield from ((role, name) for name in dict.fromkeys(map(str, names)) if ":" in name)
 
 
 def methods(parameters: Mapping[str, Any]) -> Methods:
@@ -97,7 +78,7 @@ def methods(parameters: Mapping[str, Any]) -> Methods:
             for name in map(str, np.unique(np.asarray(parameters[path])))
             if ":" in name
         }
-        for role, path in _PATHS.items()
+        for role, path in METHODS.items()
     }
     return Methods({**DETECTORS, **own[DETECTOR]}, {**ESTIMATORS, **own[ESTIMATOR]})
 

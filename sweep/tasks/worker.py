@@ -1,4 +1,4 @@
-"""Blocks on a worker: evaluated, in the time that they may take, written, and receipted."""
+"""Blocks handed out, and on a worker: evaluated in the time they may take, written, receipted."""
 
 from __future__ import annotations
 
@@ -10,10 +10,14 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import islice
 from typing import TypeVar
+
+import numpy as np
 
 from sweep.storage.locations import located, stamp
 from sweep.storage.opening import read_attributes
@@ -38,8 +42,16 @@ PIECE_SECONDS = 10.0
 #: Seconds that a thread has, after its time, to come back from compiled code and be interrupted.
 GRACE = 10.0
 
+#: Seconds between looks at the scheduler, the lock and the clock while nothing arrives.
+TICK = 0.5
+
 #: Studies that a worker holds open at once.
 STUDIES_OPEN = 4
+
+
+NOT_HERE = "what was written is not in the store here: does the worker see the same file system?"
+
+Seen = Callable[[Receipt, bool], bool]
 
 
 @dataclass(frozen=True)
@@ -281,3 +293,59 @@ def worker_address() -> str:
         return str(get_worker().address)
     except ValueError:
         return ""
+
+
+class BlockQueue:
+    """Blocks that are not done, (blocks,) bool, handed out lazily; what fails comes back, alone."""
+
+    def __init__(self, done: np.ndarray) -> None:
+        self.left = int(done.size - np.count_nonzero(done))  # not yet handed out
+        self._fresh = _numbers(done)
+        self._suspects: deque[int] = deque()
+        self._returned: deque[int] = deque()
+        self.failed: set[int] = set()
+
+    def take(self, count: int, *, suspects: bool = True) -> list[int]:
+        """Up to `count` blocks for one task; one that failed before comes by itself, if at all."""
+        if self._suspects and suspects:
+            return [self._suspects.popleft()]
+        if self._returned:
+            return [self._returned.popleft()]
+        blocks = list(islice(self._fresh, count))
+        self.left -= len(blocks)
+        return blocks
+
+    def again(self, block: int) -> bool:
+        """Put a failed block back; False where this was its second failure."""
+        if block in self.failed:
+            return False
+        self.failed.add(block)
+        self._suspects.append(block)
+        return True
+
+    def put_back(self, blocks: list[int]) -> None:
+        """Put blocks back whose answer was lost, by no fault of theirs, or that are begun.
+
+        One that failed before stays a suspect, and is never out together with another.
+        """
+        for block in blocks:
+            (self._suspects if block in self.failed else self._returned).append(block)
+
+
+def _numbers(done: np.ndarray, stretch: int = 1 << 16) -> Iterator[int]:
+    for start in range(0, done.size, stretch):
+        yield from (start + np.flatnonzero(~done[start : start + stretch])).tolist()
+
+
+def plain(
+    job: Job, blocks: BlockQueue, stopping: Callable[[], bool], seen: Seen
+) -> Iterator[Answer]:
+    """Answers of a study computed here, one block after the other: what defines its bytes."""
+    while not stopping() and (some := blocks.take(1)):
+        answer = work(job, some)
+        if not all(seen(receipt, False) for receipt in answer.receipts):
+            answer = Answer(failures=[failure(block, StoreError(NOT_HERE)) for block in some])
+        blocks.put_back(list(answer.begun))
+        yield answer
+        if answer.unfit is not None:
+            raise answer.unfit

@@ -8,7 +8,7 @@ from small import quiet, small, tree
 
 from sweep.cli import main
 from sweep.spec import cluster_of
-from sweep.tasks import cluster
+from sweep.tasks import cluster, session
 from sweep.tasks.clusters import machines
 from sweep.tasks.progress import ClusterError
 
@@ -46,10 +46,10 @@ def test_no_more_workers_are_started_than_there_are_blocks():
 
 def test_a_number_of_workers_fixes_those_of_a_file_and_none_are_started_elsewhere():
     described = cluster_of({**LOCAL, "workers": {"least": 2, "most": 40}})
-    assert cluster.of_workers(described, 7).workers == (7, 7)
-    assert cluster.of_workers(described, None) is described
+    assert session._of_workers(described, 7).workers == (7, 7)
+    assert session._of_workers(described, None) is described
     with pytest.raises(ClusterError, match="there already"):
-        cluster.of_workers(cluster_of({"kind": "scheduler", "address": "tcp://a:1"}), 3)
+        session._of_workers(cluster_of({"kind": "scheduler", "address": "tcp://a:1"}), 3)
 
 
 def test_the_command_tells_what_is_wrong_with_a_clusters_file(tmp_path, monkeypatch):

@@ -9,14 +9,13 @@ from sweep.tasks.scheduler import (
     MOST_BLOCKS,
     TASK_SECONDS,
     TASKS_A_SECOND,
-    BlockQueue,
     Pace,
     Scheduler,
     Slots,
     _Task,
     task_key,
 )
-from sweep.tasks.worker import Answer, Job
+from sweep.tasks.worker import Answer, BlockQueue, Job
 
 
 def test_blocks_that_are_done_are_not_handed_out():
