@@ -287,7 +287,7 @@ def words_of(text):
 def test_no_number_is_cut_however_narrow_the_terminal_and_nothing_is_folded_without_one(
     here, monkeypatch, columns
 ):
-    from sweep.cli.output import print_table
+    from sweep.cli.terminal import print_table
 
     cells = ["12,345 of 678,901", "0.000123", "1.2e+03 us", "123,456,789"]
     where = "range 10..5000 m, grazing_angle 20..90 deg, laser power 1..3 W"
@@ -310,7 +310,7 @@ def test_no_number_is_cut_however_narrow_the_terminal_and_nothing_is_folded_with
 
 @pytest.mark.parametrize("columns", [40, 60, 80])
 def test_sentences_are_folded_to_a_terminal_and_commands_in_them_stay_whole(monkeypatch, columns):
-    from sweep.cli.output import folded
+    from sweep.cli.terminal import folded
 
     command = "`sweep resume results/a_study.zarr`"
     text = f"  one.yaml:7: is no field, and {command} goes on with what there is by now"
@@ -357,7 +357,7 @@ def test_alarms_of_an_axis_of_thresholds_and_of_cfar_are_by_design(here):
 
 def test_a_very_large_study_begins_only_after_a_question(here, monkeypatch):
     """By its points, its bytes, and the time that it takes; a plan says so, too."""
-    from sweep.cli import output
+    from sweep.cli import terminal
 
     text = STUDY.replace("number: 40", "number: 100000").replace(
         "[1 W, 3 W]", "{linear: [1 W, 5 W], number: 100000}"
@@ -369,12 +369,12 @@ def test_a_very_large_study_begins_only_after_a_question(here, monkeypatch):
     begun = []
     monkeypatch.setattr(driver, "run", lambda study, **how: begun.append(study) or sys.exit(0))
     assert sweep("run", "huge.yaml", "--yes").exit_code == 0 and len(begun) == 1
-    monkeypatch.setattr(output, "MEASURED", 10)
+    monkeypatch.setattr(terminal, "MEASURED", 10)
     assert sweep("run", "small.yaml").exit_code == 0 and len(begun) == 2
     with monkeypatch.context() as fewer:
-        fewer.setattr(output, "MOST_POINTS", 79)
+        fewer.setattr(terminal, "MOST_POINTS", 79)
         assert "takes --yes: 80 points" in sweep("plan", "small.yaml").stdout
-    monkeypatch.setattr(output, "MOST_SECONDS", 1e-9)
+    monkeypatch.setattr(terminal, "MOST_SECONDS", 1e-9)
     refused(sweep("run", "small.yaml"), "of one core: say --yes to begin it")
 
 

@@ -146,4 +146,4 @@ def test_stores_are_opened_by_their_checked_document_alone(path):
         if called in {"open_zarr", "open_datatree", "open_dataset", "open_consolidated"}:
             assert any(key.arg is None and key.value.id == "CHECKED" for key in node.keywords)
         if called in {"open_group", "open_array"}:
-            assert _module_name(path) in {"sweep.storage.opening", "sweep.tasks.packing"}
+            assert _module_name(path) in {"sweep.storage.opening", "sweep.tasks.verify"}

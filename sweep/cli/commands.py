@@ -10,31 +10,29 @@ from typing import Any
 
 import click
 
-from sweep.cli.options import (
+from sweep.cli.terminal import (
     ALLOW_CODE,
     FORMAT,
+    INCOMPLETE,
+    MISTAKE,
     OVERWRITE,
     SPEC,
     STORE,
     WORKERS,
     LocalPath,
     StorePath,
+    alarms_told,
+    ask_before,
     assignments,
     at,
     computing,
-    folder,
-    shown,
-)
-from sweep.cli.output import (
-    INCOMPLETE,
-    MISTAKE,
-    alarms_told,
-    ask_before,
     conclude,
     conclude_accuracy,
     effects_of,
     folded,
+    folder,
     plan_lines,
+    shown,
     tell,
     tell_effects,
     warn_before,
@@ -434,7 +432,7 @@ def instruments(name: str | None) -> None:
       sweep instruments
       sweep instruments settembrini_2026
     """  # noqa: D301
-    from sweep.cli.output import instrument_lines
+    from sweep.cli.terminal import instrument_lines
     from sweep.spec.mistakes import near_miss
     from sweep.spec.reading import library, read_document
 

@@ -9,8 +9,16 @@ from typing import TYPE_CHECKING
 import click
 from rich.filesize import decimal
 
-from sweep.cli.options import STORE, LocalPath, StorePath, shown
-from sweep.cli.output import INCOMPLETE, print_table, tell, tell_accuracy
+from sweep.cli.terminal import (
+    INCOMPLETE,
+    STORE,
+    LocalPath,
+    StorePath,
+    print_table,
+    shown,
+    tell,
+    tell_accuracy,
+)
 from sweep.storage.locations import Location, beside, files_below
 
 if TYPE_CHECKING:
@@ -139,7 +147,7 @@ def finalize(store: Location, output: Location | None) -> None:
       sweep finalize results/range_angle.zarr
       sweep finalize results/range_angle.zarr s3://bucket/range_angle.zarr
     """  # noqa: D301
-    from sweep.tasks.packing import pack
+    from sweep.tasks.verify import pack
 
     made = pack(store, output or store.with_name(f"{store.name.removesuffix('.zarr')}_final.zarr"))
     files = files_below(made)

@@ -1,11 +1,13 @@
-"""Every byte of a store held against the digests that were taken as it was written.
+"""Every byte of a store held against its digests; a finished store copied into few large files.
 
 All that a store held before there were results is listed with digests in the journal's directory.
-It follows from the study, so that any of it can be made again, to the same bytes.
+It follows from the study, so that any of it can be made again, to the same bytes. A copy is checked
+value by value as it is made.
 """
 
 from __future__ import annotations
 
+import math
 import re
 import tempfile
 from collections.abc import Callable, Iterator
@@ -16,6 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import google_crc32c
 import numpy as np
+import zarr
 
 from sweep.storage import opening
 from sweep.storage.locations import (
@@ -23,20 +26,24 @@ from sweep.storage.locations import (
     PACKED,
     PARTIAL,
     Location,
+    draft,
     eyepoints_path,
+    files_below,
+    in_words,
     located,
     names_below,
     put_whole,
     settle,
+    zarr_store,
 )
-from sweep.storage.logs import digest, digest_of, read_lines, read_sealed
-from sweep.storage.opening import MANIFEST
+from sweep.storage.logs import digest, digest_of, read_lines, read_sealed, sealed
+from sweep.storage.opening import MANIFEST, open_group
 from sweep.tasks import journal, store, studies
 from sweep.tasks.flight_study import FlightStudy
-from sweep.tasks.journal import RECIPE, read_recipe
+from sweep.tasks.journal import LOGS, RECIPE, committed, read_recipe
 from sweep.tasks.progress import Progress, StoreError, chosen, told
 from sweep.tasks.studies import AnyStudy
-from sweep.tasks.study import Study
+from sweep.tasks.study import ArrayLayout, BlockGrid, Study
 
 if TYPE_CHECKING:
     from sweep.spec import SceneSpec, Spec
@@ -349,3 +356,101 @@ def _refuse_unproven(path: Location, study: Study, aside: Path, wrong: list[str]
             (aside / name).unlink()
         if written.digest.encode() != committed[block]:
             raise StoreError(f"{path} holds another study: its block {block} has other results")
+
+
+#: Bytes of a shard, before compression, as far as whole chunks allow; one a thread is in memory.
+SHARD_BYTES = 64 << 20
+
+
+def pack(
+    path: str | Location, output: str | Location, *, progress: bool | Progress = True
+) -> Location:
+    """Copy a complete store into one of few files, each many chunks: whole, or not at all.
+
+    StoreError where it is not complete, where something is in the way of the copy, or it can't
+    be written or read back as it was.
+    """
+    path, output = located(path).absolute(), located(output).absolute()
+    attributes, study = studies.read(path)
+    left = study.n_blocks - int(np.count_nonzero(committed(path, study)))
+    if attributes.get(PACKED) or left:
+        why = "is packed already" if attributes.get(PACKED) else f"lacks {left:,} blocks: resume it"
+        raise StoreError(f"{path} {why}")
+    if output.exists():
+        raise StoreError(f"{output} is there already: name another place")
+    shown = chosen(progress)
+    with told(f"{output} can't be made"):
+        if isinstance(output, Path):
+            with draft(output) as aside:
+                aside.mkdir()
+                _pack(path, aside, study, shown)
+                store.sync(aside)  # else a power cut may leave the name without the values
+        else:
+            with store.making(output):
+                _pack(path, output, study, shown)
+    return output
+
+
+def _pack(path: Location, output: Location, study: Study, shown: Progress) -> None:
+    """Write a packed copy, the document of its group last."""
+    attributes = {**studies.read(path)[0], PACKED: True}
+    with tempfile.TemporaryDirectory() as directory:
+        template = Path(directory) / "template"
+        store.build(template, study, attributes, shards=shard_shape)
+        root = (template / "zarr.json").read_bytes()
+        for name in files_below(template).keys() - {"zarr.json", f"{JOURNAL}/{MANIFEST}"}:
+            put_whole(output / name, (template / name).read_bytes())
+    names, arrays = sorted(study.owners()), open_group(path)
+    shown.begin(points=len(names), done=0, unit="arrays")
+    try:
+        for name in names:
+            with in_words(path), in_words(output):
+                _pack_array(arrays[name], output / name)
+            shown.advance(points=1, failed=0)
+    finally:
+        shown.end()
+    if studies.read(path)[0]["study_id"] != study.id:
+        raise StoreError(f"{path} was extended or replaced while it was copied: try again")
+    for name in (*LOGS, RECIPE):
+        lines = read_lines(path / JOURNAL / name)
+        # without the machine, as copies are given away
+        given = [{k: v for k, v in line.items() if k not in ("host", "pid")} for line in lines]
+        if content := b"".join(map(sealed, given)):
+            put_whole(output / JOURNAL / name, content)
+    names = [name for name in files_below(output) if not name.startswith(f"{JOURNAL}/")]
+    digests = {name: digest(output, [name]) for name in names}
+    digests["zarr.json"] = digest_of([("zarr.json", root)])
+    store.list_objects(output, attributes, digests)
+    put_whole(output / "zarr.json", root)
+
+
+def _pack_array(source: Any, output: Location) -> None:
+    """Copy an array, shard by shard, and read each back."""
+    target = zarr.open_array(zarr_store(output), mode="r+").with_config(store.WRITTEN_WHOLE)
+    dims = tuple(map(str, range(target.ndim)))
+    files = BlockGrid(dims, target.shape, target.shards or target.chunks)
+    with ThreadPoolExecutor(THREADS) as pool:
+        for _ in pool.map(lambda n: _copy(source, target, files.block(n)), range(files.n_blocks)):
+            pass
+
+
+def _copy(source: zarr.Array[Any], target: zarr.Array[Any], part: tuple[slice, ...]) -> None:
+    values = np.asarray(source[part or ...])
+    target[part or ...] = values
+    back = np.asarray(target[part or ...])
+    if back.tobytes() != values.tobytes():
+        raise OSError(5, f"{target.path} does not read back as it was written")
+
+
+def shard_shape(layout: ArrayLayout) -> tuple[int, ...] | None:
+    """Whole chunks along each axis that make a file, the last axis filled first; or None."""
+    if layout.values is not None:
+        return None
+    room = SHARD_BYTES // max(1, layout.bytes_of(layout.chunks))
+    counts = [1] * len(layout.shape)
+    for k in reversed(range(len(counts))):
+        counts[k] = max(1, min(-(-layout.shape[k] // layout.chunks[k]), room))
+        room //= counts[k]
+    if math.prod(counts) == 1:
+        return None
+    return tuple(count * chunk for count, chunk in zip(counts, layout.chunks, strict=True))

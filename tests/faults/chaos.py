@@ -44,8 +44,7 @@ from sweep.storage import locations
 from sweep.tasks import journal, scheduler, store
 from sweep.tasks.driver import extend, resume, run
 from sweep.tasks.grid_study import GridStudy
-from sweep.tasks.packing import pack
-from sweep.tasks.verify import verify
+from sweep.tasks.verify import pack, verify
 
 BLOCKS = 12
 PATIENCE = 120.0

@@ -3,7 +3,7 @@
 import pytest
 from written_specs import written
 
-from sweep.cli.output import warn_of_beam
+from sweep.cli.terminal import warn_of_beam
 from sweep.spec import Spec, SpecError
 from sweep.spec.grid_rules import too_narrow
 

@@ -16,11 +16,10 @@ from sweep.tasks import journal, progress, worker
 from sweep.tasks.driver import extend, resume, run
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.journal import Begun
-from sweep.tasks.packing import pack
 from sweep.tasks.progress import Progress, StoreError
 from sweep.tasks.study import Found, Known
 from sweep.tasks.summary import status
-from sweep.tasks.verify import verify
+from sweep.tasks.verify import pack, verify
 
 QUICK = {**STUDY["instrument"], "laser": {**STUDY["instrument"]["laser"], "power": "0.1 W"}}
 QUICK["processing"] = {**QUICK["processing"], "fft_size": "2^11", "tnr": 6}

@@ -13,13 +13,11 @@ import sweep
 from sweep.analysis.scenes.recording import place
 from sweep.cli import main
 from sweep.storage.locations import files_below
-from sweep.tasks import packing
 from sweep.tasks.driver import resume
-from sweep.tasks.packing import pack, shard_shape
 from sweep.tasks.progress import StoreError
 from sweep.tasks.study import ArrayLayout
 from sweep.tasks.summary import scene_summary, status
-from sweep.tasks.verify import verify
+from sweep.tasks.verify import pack, shard_shape, verify
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +93,7 @@ class Losing(WrapperStore):
 
 
 def test_a_copy_that_does_not_read_back_is_not_kept(undisturbed, tmp_path, monkeypatch):
-    monkeypatch.setattr(packing, "zarr_store", lambda place: Losing(LocalStore(place)))
+    monkeypatch.setattr("sweep.tasks.verify.zarr_store", lambda place: Losing(LocalStore(place)))
     with pytest.raises(StoreError, match="does not read back as it was written"):
         pack(undisturbed, tmp_path / "final.zarr")
     assert list(tmp_path.iterdir()) == []

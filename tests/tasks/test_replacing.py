@@ -16,14 +16,13 @@ import sweep
 from sweep.cli import main
 from sweep.storage.locations import successor
 from sweep.storage.opening import ReplacedError
-from sweep.tasks import cluster, packing
+from sweep.tasks import cluster, verify
 from sweep.tasks.driver import extend, resume, run
 from sweep.tasks.journal import Lock
-from sweep.tasks.packing import pack
 from sweep.tasks.progress import ClusterError, StoreError
 from sweep.tasks.spectra_export import write
 from sweep.tasks.summary import status
-from sweep.tasks.verify import verify
+from sweep.tasks.verify import _pack_array, pack, verify
 
 POWERS = {**STUDY["axes"], "instrument.laser.power": ["1 W", "2 W", "3 W"]}
 NOWHERE = {"scheduler": "tcp://127.0.0.1:9"}
@@ -141,14 +140,14 @@ def test_a_dataset_that_is_open_says_that_its_store_was_extended(undisturbed, tm
 
 
 def test_a_copy_is_never_of_two_studies(undisturbed, tmp_path, monkeypatch):
-    store, real = copied(undisturbed, tmp_path), packing._pack_array
+    store, real = copied(undisturbed, tmp_path), _pack_array
 
     def extended_meanwhile(path, output):
         real(path, output)
         if status(store).study_id == small().id:
             run(small(seed=9), store=store, progress=False, scheduler="none", overwrite=True)
 
-    monkeypatch.setattr(packing, "_pack_array", extended_meanwhile)
+    monkeypatch.setattr("sweep.tasks.verify._pack_array", extended_meanwhile)
     with pytest.raises(StoreError, match="extended or replaced while it was copied"):
         pack(store, tmp_path / "copy_final.zarr", progress=False)
     assert list(tmp_path.iterdir()) == [store]
