@@ -16,7 +16,7 @@ import sweep
 from sweep.cli import main
 from sweep.storage.locations import successor
 from sweep.storage.opening import ReplacedError
-from sweep.tasks import cluster, verify
+from sweep.tasks import cluster
 from sweep.tasks.driver import extend, resume, run
 from sweep.tasks.journal import Lock
 from sweep.tasks.progress import ClusterError, StoreError
