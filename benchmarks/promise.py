@@ -35,7 +35,7 @@ from sweep.tasks.accuracy.rungs import (
     Rung,
     ladder,
 )
-from sweep.tasks.grid import Grid
+from sweep.tasks.study import Grid
 
 POINTS, SEED, ROUNDS = 1000, 2017, 5
 STRETCH = 4096

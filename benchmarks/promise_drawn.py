@@ -24,8 +24,8 @@ from sweep.model.outputs import PROMISED
 from sweep.model.shot import find, prepare
 from sweep.spec import Spec, load
 from sweep.tasks.accuracy.rungs import ADAPTIVE, Rung
-from sweep.tasks.grid import Grid
 from sweep.tasks.grid_study import GridStudy
+from sweep.tasks.study import Grid
 
 SEEDS = {0.1: 11, 0.01: 11, 0.001: 2}
 """Times that all points are drawn anew at a tolerance."""

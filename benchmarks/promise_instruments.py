@@ -16,8 +16,8 @@ from sweep.model.effects.planning import plan
 from sweep.model.effects.points import Points
 from sweep.model.resolution import effects_tolerance
 from sweep.model.shot import DEFAULTS
-from sweep.tasks.grid import Grid
 from sweep.tasks.grid_study import evaluate_points, select
+from sweep.tasks.study import Grid
 
 TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 WINDOWS = ("rectangular", "hann", "hamming", "blackman", "kaiser(8)")

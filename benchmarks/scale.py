@@ -90,9 +90,9 @@ def timed(what):
 def blocks(n_blocks, store):
     """Seconds of processor time, and memory, that so many blocks take; printed for the parent."""
     from sweep.storage.logs import read_receipts
-    from sweep.tasks.grid import Grid
     from sweep.tasks.journal import Journal, listed
-    from sweep.tasks.scheduler import BlockQueue
+    from sweep.tasks.study import Grid
+    from sweep.tasks.worker import BlockQueue
 
     axes = {"target.range": {"linear": ["1 m", "10 km"], "number": n_blocks // 100},
             "target.grazing_angle": {"linear": ["1 deg", "90 deg"], "number": 100}}  # fmt: skip

@@ -17,8 +17,7 @@ import numpy as np
 from sweep.model.accuracy import Accuracy
 from sweep.model.outputs import BEAMLETS, CYCLES, SHOTS, WEIGHT
 from sweep.model.resolution import more_rays
-from sweep.tasks.grid import TILE_SHOTS
-from sweep.tasks.study import FILLS, ArrayLayout, BlockGrid, Results, Study, described
+from sweep.tasks.study import FILLS, TILE_SHOTS, ArrayLayout, BlockGrid, Results, Study, described
 
 if TYPE_CHECKING:
     from sweep.model.eyepoints import Eyepoints

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, cached_property, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from sweep.model.accuracy import Accuracy
-from sweep.model.effects.catalogue import flag_attributes
+from sweep.model.effects.catalogue import DEFAULTS, flag_attributes, flags_of
+from sweep.model.effects.points import Points
+from sweep.model.ground import of_rays
 from sweep.model.outputs import (
     BEAMLETS,
     CYCLES,
@@ -20,7 +22,7 @@ from sweep.model.outputs import (
     SIMULATED,
     STATISTICS,
 )
-from sweep.model.resolution import by_tolerance
+from sweep.model.resolution import by_tolerance, effects_tolerance
 from sweep.storage.locations import Location, eyepoints_path
 from sweep.storage.opening import open_group
 from sweep.tasks.eyepoint_study import (
@@ -30,20 +32,19 @@ from sweep.tasks.eyepoint_study import (
     scene_map,
     world_of,
 )
-from sweep.tasks.grid import (
-    EFFECTS,
-    ERROR,
+from sweep.tasks.grid_study import EFFECTS, ERROR, Selected, coordinates
+from sweep.tasks.study import (
     TILE_SHOTS,
+    ArrayLayout,
+    BlockGrid,
+    GrowingStudy,
     Lattice,
     LatticeGrid,
-    Selected,
-    ShotsPlan,
-    plan_shots,
+    Results,
 )
-from sweep.tasks.grid_study import coordinates
-from sweep.tasks.study import ArrayLayout, BlockGrid, GrowingStudy, Results
 
 if TYPE_CHECKING:
+    from sweep.model.effects.planning import Plan
     from sweep.model.error_floor import ErrorFloor
     from sweep.model.eyepoints import Eyepoints
     from sweep.model.geometry.mesh import Surface
@@ -514,3 +515,58 @@ def _put(results: Results, rows: np.ndarray, draws: slice | np.ndarray, found: R
     """Put results of some rows and draws into those of all."""
     for name, values in found.items():
         results[name][rows if name in STATISTICS else (rows, draws)] = values
+
+
+class ShotsPlan(NamedTuple):
+    """Plans of shots of a flight."""
+
+    shots: np.ndarray  # places of the shots that see something
+    tile: np.ndarray  # index of the tile of each of these
+    plan: Plan  # Of the tiles
+
+    def selected(self, number: int) -> Selected:
+        """Effects simulated at that many shots; none where nothing is seen."""
+        selected = Selected(np.zeros(number, np.uint32), np.zeros(number))
+        selected.flags[self.shots] = flags_of(self.plan.kept)[self.tile]
+        selected.error[self.shots] = self.plan.error[self.tile]
+        return selected
+
+
+def plan_shots(
+    eyepoints: Eyepoints,
+    tiles: np.ndarray,
+    parameters: Mapping[str, Any],
+    surfaces: Sequence[Surface],
+    *,
+    modes: Mapping[str, str],
+    rotating: bool,
+    rays_by_tolerance: bool = False,
+) -> ShotsPlan | None:
+    """Plans of a flight's shots at one place along its axes; None where none sees anything.
+
+    ``tiles``: the number of the tile of each shot, rising.
+    """
+    from sweep.model.effects.planning import plan
+    from sweep.model.eyepoints import seen_ground
+
+    seen = eyepoints.seen.nonzero()[0]
+    if not seen.size:
+        return None
+    some = eyepoints if seen.size == len(tiles) else eyepoints.some(seen)
+    edges, tile = _stretches(tiles[seen])
+    shots, ground = seen_ground(some, DEFAULTS | dict(parameters), surfaces)
+    points = Points(shots, of_rays(ground), rotating=rotating)
+
+    def of_tiles(values: np.ndarray) -> np.ndarray:
+        return np.maximum.reduceat(np.broadcast_to(values, some.time.shape), edges[:-1])
+
+    rays = 0 if rays_by_tolerance else some.offset.shape[1]
+    planned = plan(points, of_tiles, modes, effects_tolerance(parameters, rays))
+    return ShotsPlan(seen, tile, planned)
+
+
+def _stretches(tiles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Edges of stretches of the same tile among some, one at least; index of each one's stretch."""
+    new = np.diff(tiles) != 0
+    edges = np.concatenate([[0], np.flatnonzero(new) + 1, [tiles.size]])
+    return edges, np.concatenate([[0], np.cumsum(new)])

@@ -21,9 +21,16 @@ from sweep.storage.locations import Location, eyepoints_path
 from sweep.tasks import cluster
 from sweep.tasks.eyepoint_study import EyepointStudy
 from sweep.tasks.flight_study import FlightStudy, Part
-from sweep.tasks.grid import TILE_SHOTS, EffectSelection, Selected, Value
-from sweep.tasks.grid_study import GridStudy, evaluate_points, select, with_few_draws
+from sweep.tasks.grid_study import (
+    EffectSelection,
+    GridStudy,
+    Selected,
+    evaluate_points,
+    select,
+    with_few_draws,
+)
 from sweep.tasks.studies import study_of
+from sweep.tasks.study import TILE_SHOTS, Value
 
 if TYPE_CHECKING:
     from sweep.model.eyepoints import Eyepoints

@@ -32,7 +32,6 @@ from sweep.spec.sections import Execution
 from sweep.storage.locations import Location, ObjectStoreError
 from sweep.storage.logs import read_receipts
 from sweep.tasks import journal, store
-from sweep.tasks.grid import seconds_a_point
 from sweep.tasks.journal import Failure, Journal, Lock, Look, Receipt, given_up
 from sweep.tasks.progress import (
     ClusterError,
@@ -44,7 +43,7 @@ from sweep.tasks.progress import (
     duration,
     working,
 )
-from sweep.tasks.study import Evaluate, Study, own_functions
+from sweep.tasks.study import Evaluate, Study, own_functions, seconds_a_point
 from sweep.tasks.worker import TICK, Answer, BlockQueue, Job, Seen, plain
 
 if TYPE_CHECKING:

@@ -26,11 +26,10 @@ from sweep.storage.opening import open_group
 from sweep.tasks import store
 from sweep.tasks.eyepoint_study import EyepointStudy
 from sweep.tasks.flight_study import FlightStudy
-from sweep.tasks.grid import TOLERANCE, Lattice, Value, canonical_rows
-from sweep.tasks.grid_study import GridStudy
+from sweep.tasks.grid_study import GridStudy, canonical_rows
 from sweep.tasks.journal import EXTENDS, committed, digests, read_recipe
 from sweep.tasks.progress import StoreError
-from sweep.tasks.study import DAMAGED, Results
+from sweep.tasks.study import DAMAGED, TOLERANCE, Lattice, Results, Value
 
 Declared = Spec | SceneSpec
 

@@ -28,6 +28,7 @@ import numpy as np
 
 if TYPE_CHECKING:
     from sweep.model.outputs import Output
+    from sweep.spec import Axis, SceneSpec, Spec
 
 Results = dict[str, np.ndarray]
 
@@ -230,6 +231,147 @@ class BlockGrid:
         order = [k for k in follows if k is not None]
         turned = own.transpose(np.argsort(np.argsort(order)))
         return turned.reshape([1 if k is None else self.along[k] for k in follows])
+
+
+Value = float | int | str | np.ndarray
+
+#: Parameters that move the beamlets over the target; every other one only scales or reads lines
+#: that are already placed, and is cheap once they are.
+GEOMETRIC = (
+    "target.range",
+    "target.grazing_angle",
+    "target.radial_velocity",
+    "target.transverse_velocity",
+    "target.pointing_jitter",
+)
+GEOMETRIC_PREFIXES = (
+    "instrument.laser.beam_", "instrument.laser.focus", "instrument.telescope.coupling",
+    "instrument.receiver.local_oscillator_waist", "footprint.",
+)  # fmt: skip
+
+TOLERANCE = "accuracy.tolerance"
+
+#: Shots of a flight that are planned together.
+TILE_SHOTS = 256
+
+#: Seconds that a block takes at the most, as :func:`seconds_a_point` has it: what is lost where a
+#: worker dies. It also bounds the counts of draws, one a point and batch, to some 100 MB.
+BLOCK_SECONDS = 60.0
+
+#: Points of a block at the most, and blocks beyond which it grows: a block is some 25 files, and
+#: what lists, copies or removes a store handles them one by one.
+BLOCK_POINTS = 1 << 16
+MOST_BLOCKS = 1 << 14
+
+
+def is_geometric(axis: Axis) -> bool:
+    """Tell whether any member of an axis changes where the beamlets fall."""
+    return any(
+        member.path in GEOMETRIC or member.path.startswith(GEOMETRIC_PREFIXES)
+        for member in axis.members
+    )
+
+
+def seconds_a_point(spec: Spec) -> float:
+    """Time of the dearest point of a study on one core, by the study alone [s].
+
+    Measured on one machine and rounded up: the content of a block must not depend on the
+    machine. Draws until a tolerance is met are reckoned with their limit.
+    """
+    dearest = {path: v for path, v in spec.parameters().items() if not isinstance(v, str)}
+    for axis in spec.axes:
+        for member in axis.members:
+            if isinstance(member.values, np.ndarray):
+                dearest[member.path] = member.values.max()
+    draws = spec.draws
+    once = 4e-5 + 2e-7 * float(dearest.get("footprint.beamlets", 0.0))
+    if draws.whole_spectra:
+        once += 2e-7 * float(dearest["instrument.processing.fft_size"])
+    return once * max(draws.number, draws.limit, 1)
+
+
+def block_shape(
+    sizes: tuple[int, ...], geometric: tuple[bool, ...], block_points: int
+) -> tuple[int, ...]:
+    """Points of a block along each axis, given whether each axis changes the geometry.
+
+    Radiometric axes are kept whole before geometric ones, and the last axis before the first,
+    as far as the block has room: it then holds every radiometric variation of its geometry.
+    """
+    order = sorted(range(len(sizes)), key=lambda k: (geometric[k], -k))
+    shape, room = [1] * len(sizes), block_points
+    for k in order:
+        shape[k] = min(sizes[k], room)
+        room //= shape[k]
+    return tuple(shape)
+
+
+def points_a_block(points: int) -> int:
+    """Points that a block holds at most in a study of so many, where it does not say."""
+    return max(BLOCK_POINTS, -(-points // MOST_BLOCKS))
+
+
+def most_points(spec: Spec, points: int) -> int:
+    """Points that a block may hold: as the spec says, or fits it; less where each takes long."""
+    asked = spec.storage.block_points or points_a_block(points)
+    return max(1, min(asked, int(BLOCK_SECONDS / seconds_a_point(spec))))
+
+
+class Lattice:
+    """Parameters along the axes of a study: those that are fixed, and those of each axis."""
+
+    def __init__(self, spec: Spec | SceneSpec) -> None:
+        self.fixed: dict[str, float | int | str] = dict(spec.parameters())
+        self._axes = tuple(spec.axes)
+        self.shape = tuple(int(axis.size) for axis in self._axes)
+        self.values = [{m.path: np.asarray(m.values) for m in axis.members} for axis in self._axes]
+        """Values along each dimension by the parameters that they set."""
+
+
+class LatticeGrid(Lattice, BlockGrid):
+    """Points along axes, and perhaps further dimensions, cut into blocks."""
+
+
+class Grid(LatticeGrid):
+    """Points of a study over a grid, their parameters, and the blocks they are computed in."""
+
+    def __init__(self, spec: Spec) -> None:
+        Lattice.__init__(self, spec)
+        self.spec = spec
+        self.geometric = tuple(is_geometric(axis) for axis in self._axes)
+        most = most_points(spec, math.prod(self.shape))
+        dims = tuple(axis.name for axis in self._axes)
+        BlockGrid.__init__(self, dims, self.shape, block_shape(self.shape, self.geometric, most))
+
+    def parameters(self, block: int) -> dict[str, Value]:
+        """Parameters of a block's points by path: scalars, or arrays (n,) in C order over it."""
+        slices = self.block(block)
+        index = [along.ravel() for along in np.indices(self.extent(block))]
+        return self._select([s.start + along for s, along in zip(slices, index, strict=True)])
+
+    def parameters_at(self, points: np.ndarray) -> dict[str, Value]:
+        """Parameters of points given by their numbers in C order over the whole grid, (n,)."""
+        return self._select(list(np.unravel_index(points, self.shape)) if self.shape else [])
+
+    def _select(self, indices: list[np.ndarray]) -> dict[str, Value]:
+        selected: dict[str, Value] = dict(self.fixed)
+        for values, along in zip(self.values, indices, strict=True):
+            for path, array in values.items():
+                selected[path] = array[along]
+        return selected
+
+    def geometry_order(self, block: int) -> np.ndarray:
+        """Order of a block's points, (n,) in C order over it, that brings equal geometry together.
+
+        Radiometric axes run fastest, and velocities slowest: a line's change within a
+        record follows them.
+        """
+        numbers = np.arange(self.block_size(block)).reshape(self.extent(block))
+        moving = ["target.radial_velocity" in {m.path for m in axis.members} for axis in self._axes]
+        axes = sorted(
+            range(len(self.shape)), key=lambda k: (not self.geometric[k], not moving[k], k)
+        )
+        return numbers.transpose(axes).ravel()
 
 
 class Content(Protocol):

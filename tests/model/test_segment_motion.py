@@ -19,7 +19,7 @@ from sweep.model.realisations import realise
 from sweep.model.returns import beamlet_lines, draw_returns
 from sweep.model.shot import prepare
 from sweep.model.waveform import GAP, ORDER, ORDERS, SEGMENTS, SIGNS
-from sweep.tasks.grid import plan_shots
+from sweep.tasks.flight_study import plan_shots
 
 MOVING = (*CORE, "segment_motion")
 

@@ -11,18 +11,18 @@ from small_flights import small_scene
 
 from sweep.model.effects.catalogue import EFFECTS, NAMES, flag_attributes, flags_of, names_of
 from sweep.tasks import plan as planned
-from sweep.tasks.grid import (
+from sweep.tasks.grid_study import (
     TILE_POINTS,
     EffectSelection,
-    Grid,
+    GridStudy,
     Selected,
     Tiles,
     _stretches,
     tile_shape,
 )
-from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.plan import effects_table
 from sweep.tasks.studies import study_of
+from sweep.tasks.study import Grid
 
 PROBABILITIES = ("pd_up", "pd_doppler", "pd_down", "pd_shot")
 WIDE = {

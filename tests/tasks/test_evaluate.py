@@ -16,8 +16,8 @@ from sweep.model.outputs import (
     RUNNING,
     RUNNING_COLUMNS,
 )
-from sweep.tasks.grid import Grid
 from sweep.tasks.grid_study import evaluate_points, select
+from sweep.tasks.study import Grid
 from sweep.tasks.summary import beyond_model
 
 RANDOM = (*CORE, "speckle", "pointing_jitter")

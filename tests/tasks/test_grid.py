@@ -8,12 +8,12 @@ from small_flights import small_scene
 
 from sweep.storage.locations import located
 from sweep.tasks.flight_study import FlightStudy
-from sweep.tasks.grid import (
+from sweep.tasks.grid_study import canonical_rows
+from sweep.tasks.study import (
     BLOCK_POINTS,
     MOST_BLOCKS,
     Grid,
     block_shape,
-    canonical_rows,
     points_a_block,
     seconds_a_point,
 )

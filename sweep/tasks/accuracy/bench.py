@@ -32,8 +32,8 @@ from sweep.model.lines import BLOCK, IM, PLACE, RE, place_lines
 from sweep.model.preparation import Shots
 from sweep.spec import Axis, Spec
 from sweep.tasks.accuracy.rungs import WRITTEN, Declared, Rung
-from sweep.tasks.grid import EffectSelection, Grid, Selected
-from sweep.tasks.grid_study import evaluate_points
+from sweep.tasks.grid_study import EffectSelection, Selected, evaluate_points
+from sweep.tasks.study import Grid
 
 Look = Callable[[Shots], np.ndarray]
 

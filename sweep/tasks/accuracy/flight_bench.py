@@ -35,8 +35,8 @@ from sweep.tasks.accuracy.bench import (
 from sweep.tasks.accuracy.rungs import Rung
 from sweep.tasks.eyepoint_study import world_of
 from sweep.tasks.flight_study import FlightStudy, Part
-from sweep.tasks.grid import TILE_SHOTS, Selected
-from sweep.tasks.study import Results
+from sweep.tasks.grid_study import Selected
+from sweep.tasks.study import TILE_SHOTS, Results
 
 #: Places along the axes at which each scanner is looked at.
 PLACES = 2
