@@ -21,7 +21,7 @@ _FIELDS = {
     "beam_acceleration": "acceleration",
     "beam_approach": "approach",
     "beam_turn_rate": "turn_rate",
-    **{name: name for name in BEAMLETS},
+    **dict(zip(BEAMLETS, BEAMLETS, strict=True)),
 }
 """Field of :class:`Eyepoints` that each array holds."""
 

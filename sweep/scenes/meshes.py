@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -83,9 +83,14 @@ def join(parts: Sequence[Facets]) -> Facets:
     )
 
 
-def _count(words: str) -> int:
-    """Return a count of `Report`, with its words for people."""
-    return field(default=0, metadata={"words": words})  # type: ignore[no-any-return]
+_MENDED = {
+    "non_finite": "{} faces without data dropped",
+    "degenerate": "{} faces without area dropped",
+    "duplicate": "{} duplicate faces dropped",
+    "merged": "{} coincident vertices merged",
+    "unreferenced": "{} unused vertices dropped",
+}
+"""Counts of `Report` in words for people."""
 
 
 @dataclass(frozen=True)
@@ -94,16 +99,16 @@ class Report:
 
     vertices: int
     faces: int
-    non_finite: int = _count("{} faces without data dropped")
-    degenerate: int = _count("{} faces without area dropped")  # corners that are one, or in line
-    duplicate: int = _count("{} duplicate faces dropped")  # in whatever winding
-    merged: int = _count("{} coincident vertices merged")
-    unreferenced: int = _count("{} unused vertices dropped")
+    non_finite: int = 0
+    degenerate: int = 0  # corners that are one, or in line
+    duplicate: int = 0  # in whatever winding
+    merged: int = 0
+    unreferenced: int = 0
 
     def text(self) -> str:
         """One line for people: what was given, and of the rest what is not zero."""
-        counts = [(each.metadata.get("words"), getattr(self, each.name)) for each in fields(self)]
-        said = [words.format(count) for words, count in counts if words and count]
+        counts = [(words, getattr(self, name)) for name, words in _MENDED.items()]
+        said = [words.format(count) for words, count in counts if count]
         given = f"{self.faces:,} faces on {self.vertices:,} vertices"
         return "; ".join([given, *(said or ["nothing to mend"])])
 

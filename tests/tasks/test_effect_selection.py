@@ -11,13 +11,13 @@ from small_flights import small_scene
 
 from sweep.model.effects.catalogue import EFFECTS, NAMES, flag_attributes, flags_of, names_of
 from sweep.tasks import plan as planned
+from sweep.tasks.flight_study import _stretches
 from sweep.tasks.grid_study import (
     TILE_POINTS,
     EffectSelection,
     GridStudy,
     Selected,
     Tiles,
-    _stretches,
     tile_shape,
 )
 from sweep.tasks.plan import effects_table
