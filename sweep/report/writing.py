@@ -27,7 +27,7 @@ from sweep.report import detector, flights
 from sweep.report.flights import Seen
 from sweep.report.page import Item, Page, Section, Table, Text, plot, rendered
 from sweep.spec import SceneSpec, Slices, Spec, Surface
-from sweep.spec.fields import parameter_rules
+from sweep.spec.sections import parameter_rules
 from sweep.storage.atomic_replace import draft
 from sweep.storage.locations import Location, located
 

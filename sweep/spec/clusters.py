@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple, get_args
 
 from pydantic import PrivateAttr, ValidationError
 
-import sweep.spec.declaring as of
+import sweep.spec.rules as of
 from sweep.spec.mistakes import ABSENT, Finding, SpecError, near_miss
 from sweep.spec.parts import Part
 from sweep.spec.reading import Document, findings_of, plain, read_document

@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
-import sweep.spec.declaring as of
+import sweep.spec.rules as of
 from sweep.model.outputs import (
     ACCURACY_OUTPUTS,
     DRAW_OUTPUTS,
@@ -24,13 +24,12 @@ from sweep.model.outputs import (
     XYZ,
 )
 from sweep.spec.axes import Axis
-from sweep.spec.fields import parameter_rules
 from sweep.spec.flight import AnyScanner, shots_a_cycle
 from sweep.spec.mistakes import Finding, Location, near_miss
 from sweep.spec.parts import Part, read_as
 from sweep.spec.rules import Choice, Special
 from sweep.spec.scene import SceneDraws
-from sweep.spec.sections import SPECTRA
+from sweep.spec.sections import SPECTRA, parameter_rules
 from sweep.units import QuantityError, read_number
 
 Selection = str | int | float | tuple[str | int | float, ...]
@@ -418,7 +417,11 @@ def _coordinate_findings(figure: Any, axes: tuple[Axis, ...], at: Location) -> I
         if name and name not in known:
             remedy = f"the coordinates are {', '.join(known)}" if known else "it has no axes"
             suggestion = near_miss(name, known, otherwise=remedy)
-            yield Finding(location, "is no coordinate of this study", suggestion, name)
+            if field in named and field not in figure.model_fields_set:
+                rule = f"is '{name}' by default, which is no coordinate of this study"
+                yield Finding(location, rule, suggestion)
+            else:
+                yield Finding(location, "is no coordinate of this study", suggestion, name)
         elif isinstance(values, tuple) and values and not of_grid:
             yield Finding(location, "must be one value", "make a figure for each")
         elif name in paths:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-import sweep.spec.declaring as of
+import sweep.spec.rules as of
 from sweep.model.ground import LAWS
 from sweep.scenes.rasters import MOST_CELLS, raster_digest, read_raster
 from sweep.spec.parts import Files, Part
@@ -108,14 +108,9 @@ class Ground(Material, ABC):
     craters: Craters | None = None
 
     def terrain(self, files: Files) -> Terrain:
-        """Return the ground in its own coordinates; files are found by `files`.
+        """Return the ground in its own coordinates.
 
-        Raises
-        ------
-        SceneError
-            For a file that is missing or unfit.
-        ValueError
-            For a grid that can not hold what it should.
+        A `SceneError` for an unfit file, a ValueError for a grid that can not hold what it should.
         """
         from sweep.scenes.terrain import Terrain, refine, smooth
 

@@ -19,7 +19,6 @@ from pydantic import BaseModel, ValidationError
 from sweep.model.effects.phase_errors import ERROR_TABLE, NO_TABLE
 from sweep.model.threshold import PROCESSING, WAYS
 from sweep.scenes.files import SceneError, read_columns
-from sweep.spec.fields import parameter_rules
 from sweep.spec.figures import Figure, SceneFigure
 from sweep.spec.mistakes import (
     ABSENT,
@@ -44,6 +43,7 @@ from sweep.spec.parts import (
     rules_of,
 )
 from sweep.spec.rules import BROKEN_RULE, Numeric
+from sweep.spec.sections import parameter_rules
 
 LARGEST_FILE = 1_000_000
 DEEPEST = 30
