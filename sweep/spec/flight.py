@@ -269,8 +269,7 @@ def rule_of_beam(beam: object) -> Several:
 _REACH = ("0 deg", "89 deg")
 
 
-def _rate() -> Any:
-    return of.frequency("Measurement cycles a second")
+_RATE = of.frequency("Measurement cycles a second")
 
 
 def _interval(default: str, value: float | None) -> Any:
@@ -291,7 +290,7 @@ class Cone(Part):
     beams: int = of.count("Beams", "3", at_most=str(MOST_BEAMS))
     half_angle: float = of.angle("From nadir", "22.5 deg", *_REACH)
     azimuth: float = of.angle("Of the first beam, from forward to the left", default=0.0)
-    rate: float = _rate()
+    rate: float = _RATE
     interval: float = _interval("0, all at once,", 0.0)
 
     def pattern(self) -> Scanner:
@@ -307,7 +306,7 @@ class FixedBeams(Part):
     beams: tuple[Vector, ...] = of.field(
         Beams(about="Angles towards forward and left, or vectors in the body frame, of each beam")
     )
-    rate: float = _rate()
+    rate: float = _RATE
     interval: float = _interval("0, all at once,", 0.0)
 
     def pattern(self) -> Scanner:
@@ -321,7 +320,7 @@ class Corners(Part):
 
     kind: Literal["corners"]
     angle: float = of.angle("Of both axes from nadir", "22.5 deg", *_REACH)
-    rate: float = _rate()
+    rate: float = _RATE
     interval: float | None = _interval("spread evenly over the cycle", None)
 
     def pattern(self) -> Scanner:
@@ -337,7 +336,7 @@ class Squares(Part):
         "Angle by which each element of an axis throws the beam to either side",
         "15 deg", "1e-6 deg", "45 deg", number=(1, 5),
     )  # fmt: skip
-    rate: float = _rate()
+    rate: float = _RATE
     interval: float | None = _interval("spread evenly over the cycle", None)
 
     def pattern(self) -> Scanner:
@@ -355,7 +354,7 @@ class RasterScan(Part):
     half_angles: Vector = _angles(
         "Reach to each side of nadir, across and along", "10 deg", *_REACH, number=(2, 2)
     )
-    rate: float = _rate()
+    rate: float = _RATE
     both_ways: bool = of.flag("Every other row runs backwards", default=True)
 
     def pattern(self) -> Scanner:
@@ -369,7 +368,7 @@ class Line(Part):
     kind: Literal["line"]
     half_angle: float = of.angle("Reach of the sweep to each side", "5 deg", *_REACH)
     line_rate: float = of.frequency("Lines a second; a sweep one way is a line")
-    rate: float = _rate()
+    rate: float = _RATE
     along: Vector = _angles(
         "Angle of each beam from nadir towards forward",
         "250 urad", "-89 deg", "89 deg", number=(1, 1000), default=(0.0,),

@@ -165,9 +165,9 @@ class Place(NamedTuple):
     """Models as one of which the part around it is read."""
 
 
-def place_of(location: Location, root: type[BaseModel]) -> Place:
+def place_of(location: Location, root: Any) -> Place:
     """Place of one of pydantic's locations, which name the kind of a part after its key."""
-    at: Any = root
+    at = root
     found: list[str | int] = []
     parents: Models = ()
     for part in location:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
 from sweep.model.effects.phase_errors import ERROR_TABLE, NO_TABLE
 from sweep.model.threshold import PROCESSING, WAYS
@@ -380,12 +380,12 @@ _DRAWN_BY = {
 """Whose studies make a kind of figure."""
 
 
-def findings_of(error: ValidationError, root: type[BaseModel]) -> list[Finding]:
-    """Everything pydantic found wrong with a mapping read as `root`."""
+def findings_of(error: ValidationError, root: Any) -> list[Finding]:
+    """Everything pydantic found wrong with a mapping read as `root`, one model or several."""
     return [_finding(dict(detail), root) for detail in error.errors(include_url=False)]
 
 
-def _finding(detail: dict[str, Any], root: type[BaseModel]) -> Finding:
+def _finding(detail: dict[str, Any], root: Any) -> Finding:
     """One error of pydantic's."""
     kind, written = detail["type"], detail["input"]
     place = place_of(detail["loc"], root)
@@ -439,18 +439,17 @@ def _remedy(place: Place) -> str:
     return f"write '{name}: ...'"
 
 
-def _sibling(place: Place, root: type[BaseModel]) -> str:
+def _sibling(place: Place, root: Any) -> str:
     """Field that an unknown one resembles: beside it, else anywhere."""
     name = str(place.location[-1])
     beside = [field for model in place.parents for field in fields_of(model)]
-    if name in _OTHER_STUDYS and place.parents == (root,):
+    if name in _OTHER_STUDYS and place.parents == models_at(root):
         return _OTHER_STUDYS[name]
     suggestion = near_miss(name, beside)
     if suggestion:
         return suggestion
-    elsewhere = [
-        p for p in (*parameter_rules(), *rules_of(root, "")) if p.rsplit(".", 1)[-1] == name
-    ]
+    of_root = (path for model in models_at(root) for path in rules_of(model, ""))
+    elsewhere = [p for p in (*parameter_rules(), *of_root) if p.rsplit(".", 1)[-1] == name]
     if elsewhere:
         return f"did you mean '{elsewhere[0]}'?"
     return f"the fields here are {', '.join(beside)}" if beside else ""

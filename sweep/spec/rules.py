@@ -252,7 +252,6 @@ class Choice(Rule):
         return {"type": "string", "enum": list(self.options)}
 
 
-@dataclass(frozen=True, kw_only=True)
 class Method(Choice):
     """One of several words, or ``module:function``, which reading does not import."""
 
@@ -270,7 +269,6 @@ class Method(Choice):
         return {"anyOf": [super()._json(), {"type": "string", "pattern": f"^{_FUNCTION}$"}]}
 
 
-@dataclass(frozen=True, kw_only=True)
 class Flag(Rule):
     """True or false."""
 
@@ -391,7 +389,6 @@ _FREQUENCY_ERROR = Numeric(
 MOST_ROWS = 4096
 
 
-@dataclass(frozen=True, kw_only=True)
 class SweepError(Rule):
     """A table of the sweep's frequency error over time; text inside, a row after the other."""
 
@@ -446,7 +443,6 @@ _WINDOW = re.compile(r"(?P<name>[a-z_]{1,40})\s*(?:\((?P<parameters>[-+.,eE\d\s]
 _KAISER = "write e.g. 'kaiser(8.6)'"
 
 
-@dataclass(frozen=True, kw_only=True)
 class Window(Rule):
     """Name of a window function, with its parameters: ``hamming``, ``kaiser(8.6)``."""
 

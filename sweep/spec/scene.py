@@ -170,17 +170,9 @@ class Boulders(Material):
         bounds = None
         if self.within is not None:
             bounds = square(ground, centre=self.centre, size=self.within)
-        return draw_boulders(
-            generator("boulders", self.seed),
-            self.law.law(),
-            ground,
-            bounds=bounds,
-            smallest=self.smallest,
-            largest=self.largest,
-            height_ratio=self.height_ratio,
-            elongation=self.elongation,
-            subdivisions=self.subdivisions,
-        )
+        shape = {"smallest", "largest", "height_ratio", "elongation", "subdivisions"}
+        random, law = generator("boulders", self.seed), self.law.law()
+        return draw_boulders(random, law, ground, bounds=bounds, **self.model_dump(include=shape))
 
 
 class TreeMeasures(Part):

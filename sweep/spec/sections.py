@@ -370,9 +370,8 @@ def sunlight(on: str) -> Any:
     )  # fmt: skip
 
 
-def share_scattered() -> Any:
-    """Field of a reflectance."""
-    return of.number("Fraction of light scattered back", "0.1", "0", "1")
+SHARE_SCATTERED = of.number("Fraction of light scattered back", "0.1", "0", "1")
+"""Field of a reflectance."""
 
 
 @with_parameters("target")
@@ -383,7 +382,7 @@ class Target(Part):
     grazing_angle: float = of.angle(
         "Angle between beam and surface, 90 deg along the normal", "15 deg", "1e-6 deg", "90 deg"
     )
-    reflectance: float = share_scattered()
+    reflectance: float = SHARE_SCATTERED
     reflectance_law: str = of.choice(
         "How it scatters: Lambertian, as regolith, or as the thesis has it", LAWS, "lambert"
     )

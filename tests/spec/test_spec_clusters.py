@@ -24,7 +24,7 @@ def changed(**changes):
 @pytest.mark.parametrize(
     ("mapping", "told"),
     [
-        ({}, "kind: is missing; write 'kind:' and one of local, scheduler, ssh"),
+        ({}, "lacks its kind; write kind: and one of local, scheduler, ssh"),
         (changed(kind="slrum"), "kind: must be one of local"),
         (changed(kind="slrum"), "did you mean 'slurm'?"),
         (changed(kind=3), "kind: must be one of local"),
