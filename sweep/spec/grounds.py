@@ -280,8 +280,9 @@ class SquareGround(PlacedGround):
     size: float = of.size("Side of the square", "3 km")
 
     def own_step(self) -> float:
-        """Grid step before refining [m]."""
-        return float(self.spacing)  # type: ignore[attr-defined]
+        """Grid step before refining [m]; one cell without a spacing."""
+        spacing = self.spacing  # type: ignore[attr-defined]
+        return float(self.size if spacing is None else spacing)
 
     def flat(self) -> Terrain:
         """Return the grid, with heights of 0."""
@@ -315,10 +316,6 @@ class Plane(SquareGround):
     spacing: float | None = of.size(
         "Grid step, for relief and craters; one cell by default", "5 m", default=None
     )
-
-    def own_step(self) -> float:
-        """Grid step before refining [m]."""
-        return self.size if self.spacing is None else self.spacing
 
     def grid(self, files: Files) -> Terrain:
         """Return the sloping plane."""

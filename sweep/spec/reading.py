@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from sweep.model.effects.phase_errors import ERROR_TABLE, NO_TABLE
 from sweep.model.threshold import PROCESSING, WAYS
@@ -400,7 +400,9 @@ def _finding(detail: dict[str, Any], root: Any) -> Finding:
     if kind == "missing":
         return Finding(location, "is missing", _remedy(place))
     if kind == "extra_forbidden":
-        return Finding(location, "is no field", _sibling(place, root))
+        several = {kind_of(model): model for model in models_at(root)}
+        model = several.get(detail["loc"][0], root)
+        return Finding(location, "is no field", _sibling(place, model))
     if kind == "union_tag_invalid":
         tag, kinds = detail["ctx"]["tag"], [kind_of(model) for model in place.models]
         rule = f"must be one of {', '.join(kinds)}"
@@ -439,17 +441,17 @@ def _remedy(place: Place) -> str:
     return f"write '{name}: ...'"
 
 
-def _sibling(place: Place, root: Any) -> str:
+def _sibling(place: Place, root: type[BaseModel]) -> str:
     """Field that an unknown one resembles: beside it, else anywhere."""
     name = str(place.location[-1])
     beside = [field for model in place.parents for field in fields_of(model)]
-    if name in _OTHER_STUDYS and place.parents == models_at(root):
+    if name in _OTHER_STUDYS and place.parents == (root,):
         return _OTHER_STUDYS[name]
     suggestion = near_miss(name, beside)
     if suggestion:
         return suggestion
-    of_root = (path for model in models_at(root) for path in rules_of(model, ""))
-    elsewhere = [p for p in (*parameter_rules(), *of_root) if p.rsplit(".", 1)[-1] == name]
+    known = (*parameter_rules(), *rules_of(root, ""))
+    elsewhere = [path for path in known if path.rsplit(".", 1)[-1] == name]
     if elsewhere:
         return f"did you mean '{elsewhere[0]}'?"
     return f"the fields here are {', '.join(beside)}" if beside else ""
