@@ -26,7 +26,7 @@ from sweep.model.segments import spectrum as segment_spectrum
 from sweep.model.shot import prepare
 from sweep.model.threshold import WAYS
 from sweep.spec import Spec
-from sweep.spec.fields import parameter_rules
+from sweep.spec.sections import parameter_rules
 
 Parameters = Mapping[str, float | int | str]
 

@@ -504,7 +504,7 @@ def extend(
       sweep extend s3://bucket/a.zarr larger.yaml --store s3://bucket/b.zarr
     """  # noqa: D301
     from sweep.spec import load
-    from sweep.spec.loading import written
+    from sweep.spec.study import written
     from sweep.tasks import driver
 
     if spec is None and not fields:

@@ -27,7 +27,7 @@ from sweep.report import detector, flights
 from sweep.report.flights import Seen
 from sweep.report.page import Item, Page, Section, Table, Text, plot, rendered
 from sweep.spec import SceneSpec, Slices, Spec, Surface
-from sweep.spec.fields import parameter_rules
+from sweep.spec.sections import parameter_rules
 from sweep.storage.locations import Location, draft, located
 
 PAGE = Room(parts=detector.MOST_PARTS, columns=500, rows=180, cells=400_000, abreast=1)

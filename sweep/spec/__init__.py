@@ -4,12 +4,10 @@ from sweep.spec.axes import Axis, Member
 from sweep.spec.clusters import AnyCluster, cluster_of, load_cluster
 from sweep.spec.figures import FalseAlarmTable, Figure, Slices, Surface, Table, ThresholdTable
 from sweep.spec.identity import difference
-from sweep.spec.loading import from_stored, load
 from sweep.spec.mistakes import Mistake, SpecError
-from sweep.spec.scene_spec import SceneSpec
 from sweep.spec.schema import json_schema
 from sweep.spec.sections import Draws
-from sweep.spec.study import Spec
+from sweep.spec.study import SceneSpec, Spec, from_stored, load
 
 __all__ = [
     "AnyCluster", "Axis", "Draws", "FalseAlarmTable", "Figure", "Member", "Mistake", "SceneSpec",

@@ -9,12 +9,12 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Annotated, Any, Literal, NamedTuple
 
-from pydantic import PrivateAttr, ValidationError
+from pydantic import Field, PrivateAttr, TypeAdapter, ValidationError
 
-import sweep.spec.declaring as of
-from sweep.spec.mistakes import ABSENT, Finding, SpecError, near_miss
+import sweep.spec.rules as of
+from sweep.spec.mistakes import Finding, SpecError
 from sweep.spec.parts import Part
 from sweep.spec.reading import Document, findings_of, plain, read_document
 from sweep.spec.rules import Numeric, Rule, Special, Text
@@ -260,11 +260,10 @@ class Kubernetes(Started):
     )
 
 
-AnyCluster = Local | Address | SSH | Slurm | PBS | Kubernetes
-
-KINDS: dict[str, type[Cluster]] = {
-    get_args(model.model_fields["kind"].annotation)[0]: model for model in get_args(AnyCluster)
-}
+AnyCluster = Annotated[
+    Local | Address | SSH | Slurm | PBS | Kubernetes, Field(discriminator="kind")
+]
+_CLUSTER: TypeAdapter[AnyCluster] = TypeAdapter(AnyCluster)
 
 
 def load_cluster(path: str | Path) -> AnyCluster:
@@ -278,30 +277,17 @@ def cluster_of(mapping: Mapping[str, Any], *, base: Path | str = ".") -> AnyClus
 
 
 def _cluster(document: Document, base: Path) -> AnyCluster:
-    kind = document.value.get("kind", ABSENT)
-    model = KINDS.get(kind) if isinstance(kind, str) else None
     findings = document.findings
-    if model is None:
-        raise SpecError(document.mistakes([*findings, _no_kind(kind)]))
-    cluster: Any = None
     try:
-        cluster = model.model_validate(document.value)
+        cluster = _CLUSTER.validate_python(document.value)
     except ValidationError as error:
-        findings += findings_of(error, model)
+        findings += findings_of(error, AnyCluster)
     else:
         cluster._base = base
         findings += _together(cluster)
     if findings:
         raise SpecError(document.mistakes(findings))
-    found: AnyCluster = cluster
-    return found
-
-
-def _no_kind(kind: object) -> Finding:
-    names = ", ".join(KINDS)
-    if kind is ABSENT:
-        return Finding(("kind",), "is missing", f"write 'kind:' and one of {names}")
-    return Finding(("kind",), f"must be one of {names}", near_miss(str(kind), KINDS), kind)
+    return cluster
 
 
 def _together(cluster: AnyCluster) -> Iterator[Finding]:

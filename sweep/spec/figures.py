@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
-import sweep.spec.declaring as of
+import sweep.spec.rules as of
 from sweep.model.outputs import (
     ACCURACY_OUTPUTS,
     DRAW_OUTPUTS,
@@ -24,13 +24,12 @@ from sweep.model.outputs import (
     XYZ,
 )
 from sweep.spec.axes import Axis
-from sweep.spec.fields import parameter_rules
 from sweep.spec.flight import AnyScanner, shots_a_cycle
 from sweep.spec.mistakes import Finding, Location, near_miss
 from sweep.spec.parts import Part, read_as
 from sweep.spec.rules import Choice, Special
 from sweep.spec.scene import SceneDraws
-from sweep.spec.sections import SPECTRA
+from sweep.spec.sections import SPECTRA, parameter_rules
 from sweep.units import QuantityError, read_number
 
 Selection = str | int | float | tuple[str | int | float, ...]
@@ -88,10 +87,6 @@ _PRINTED = Special(
 )
 
 
-def _where() -> Any:
-    return of.field(_WHERE, {})
-
-
 def _word(about: str, example: str, default: Any = ...) -> Any:
     """Name of something in a store."""
     pattern = r"[A-Za-z_][A-Za-z0-9_]{0,99}"
@@ -103,8 +98,7 @@ def _coordinate(default: Any = ...) -> Any:
     return _word("a coordinate: the last part of an axis's path", example, default)
 
 
-def _variable() -> Any:
-    return _word("a stored quantity, such as pd_shot", "a stored quantity, such as 'pd_shot'")
+_VARIABLE = _word("a stored quantity, such as pd_shot", "a stored quantity, such as 'pd_shot'")
 
 
 class Drawing(Part):
@@ -140,10 +134,10 @@ class Surface(GridDrawing):
 
     SHOWN = ("variable",)
     kind: Literal["surface"]
-    variable: str = _variable()
+    variable: str = _VARIABLE
     x: str = _coordinate()
     y: str = _coordinate()
-    where: dict[str, Selection] = _where()
+    where: dict[str, Selection] = of.field(_WHERE, {})
 
 
 class Slices(GridDrawing):
@@ -151,10 +145,10 @@ class Slices(GridDrawing):
 
     SHOWN = ("variable",)
     kind: Literal["slices"]
-    variable: str = _variable()
+    variable: str = _VARIABLE
     x: str = _coordinate()
     by: str = _coordinate("")
-    where: dict[str, Selection] = _where()
+    where: dict[str, Selection] = of.field(_WHERE, {})
 
 
 class Table(GridDrawing):
@@ -162,10 +156,10 @@ class Table(GridDrawing):
 
     SHOWN = ("variable",)
     kind: Literal["table"]
-    variable: str = _variable()
+    variable: str = _VARIABLE
     rows: str = _coordinate()
     columns: str = _coordinate("")
-    where: dict[str, Selection] = _where()
+    where: dict[str, Selection] = of.field(_WHERE, {})
     minimum_range: float = of.length(
         "Nearer ranges are left out", "5 m", "0 m", "1e15 m", default=0.0
     )
@@ -246,34 +240,27 @@ def _quantity(about: str, default: Any = ...) -> Any:
     return of.field(Choice(about=about, options=QUANTITIES, rule=rule, remedy=usual), default)
 
 
-def _scanner() -> Any:
-    return of.name("Scanner; the first by default", None)
-
-
-def _ranges() -> Any:
-    about = "By whole bins, or interpolated between them"
-    return of.choice(about, ("quantised", "interpolated"), "quantised")
-
-
-def _draw() -> Any:
-    return of.count("Number of the draw, from 0", "0", "0", "1e9", default=0)
-
-
 def _part(along: str) -> Any:
     """Part of the scene along an axis."""
     rule = of.measure("Coordinate", "m", "100 m")
     return of.several(rule, 2, 2, None, about=f"Part along {along}", rising=True)
 
 
-def _time() -> Any:
-    rule = of.measure("Time", "s", "10 s", "0 s", "1e8 s")
-    return of.several(rule, 2, 2, None, about="Part of the flight's time", rising=True)
+_SCANNER = of.name("Scanner; the first by default", None)
+_RANGES = of.choice(
+    "By whole bins, or interpolated between them", ("quantised", "interpolated"), "quantised"
+)
+_DRAW = of.count("Number of the draw, from 0", "0", "0", "1e9", default=0)
+_TIME = of.several(
+    of.measure("Time", "s", "10 s", "0 s", "1e8 s"), 2, 2, None,
+    about="Part of the flight's time", rising=True,
+)  # fmt: skip
 
 
 class SceneDrawing(Drawing):
     """Base of figures of scenes."""
 
-    where: dict[str, Selection] = _where()
+    where: dict[str, Selection] = of.field(_WHERE, {})
 
 
 class CloudFigure(SceneDrawing):
@@ -281,18 +268,18 @@ class CloudFigure(SceneDrawing):
 
     SHOWN = ("scanner", "colour")
     kind: Literal["cloud"]
-    scanner: str | None = _scanner()
+    scanner: str | None = _SCANNER
     colour: str = _quantity("What colours the points", "range")
-    ranges: str = _ranges()
+    ranges: str = _RANGES
     view: str | dict[str, float] = of.field(_FROM, "oblique")
     x: Crop | None = _part("x")
     y: Crop | None = _part("y")
     z: Crop | None = _part("z")
-    time: Crop | None = _time()
+    time: Crop | None = _TIME
     terrain: bool = of.flag("Whether to draw the ground", default=True)
     path: bool = of.flag("Whether to draw the flight path", default=False)
     dropouts: bool = of.flag("Whether to mark shots without a point", default=False)
-    draw: int = _draw()
+    draw: int = _DRAW
 
 
 class Scatter(SceneDrawing):
@@ -300,13 +287,13 @@ class Scatter(SceneDrawing):
 
     SHOWN = ("scanner", "y", "over", "x")
     kind: Literal["scatter"]
-    scanner: str | None = _scanner()
+    scanner: str | None = _SCANNER
     x: str = _quantity("Quantity along x", "time")
     y: str = _quantity("Quantity along y")
     colour: str = _quantity("What colours the points", "beam")
-    ranges: str = _ranges()
-    time: Crop | None = _time()
-    draw: int = _draw()
+    ranges: str = _RANGES
+    time: Crop | None = _TIME
+    draw: int = _DRAW
 
 
 class ShotSpectra(SceneDrawing):
@@ -314,12 +301,12 @@ class ShotSpectra(SceneDrawing):
 
     SHOWN = ("scanner", "shot")
     kind: Literal["shot_spectra"]
-    scanner: str | None = _scanner()
+    scanner: str | None = _SCANNER
     shot: int | str = of.count(
         "Number of the shot, from 0, or the first whose footprint has several surfaces",
         "0", "0", "1e15", word=SEVERAL_SURFACES, default=SEVERAL_SURFACES,
     )  # fmt: skip
-    draw: int = _draw()
+    draw: int = _DRAW
 
 
 class _OfNavigation(SceneDrawing):
@@ -418,7 +405,11 @@ def _coordinate_findings(figure: Any, axes: tuple[Axis, ...], at: Location) -> I
         if name and name not in known:
             remedy = f"the coordinates are {', '.join(known)}" if known else "it has no axes"
             suggestion = near_miss(name, known, otherwise=remedy)
-            yield Finding(location, "is no coordinate of this study", suggestion, name)
+            if field in named and field not in figure.model_fields_set:
+                rule = f"is '{name}' by default, which is no coordinate of this study"
+                yield Finding(location, rule, suggestion)
+            else:
+                yield Finding(location, "is no coordinate of this study", suggestion, name)
         elif isinstance(values, tuple) and values and not of_grid:
             yield Finding(location, "must be one value", "make a figure for each")
         elif name in paths:

@@ -7,13 +7,14 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-import sweep.spec.declaring as of
+import sweep.spec.rules as of
 from sweep.model.geometry import platform as laws
 from sweep.model.geometry import quaternion
 from sweep.model.geometry import scanner as patterns
 from sweep.model.geometry.scanner import Scanner
 from sweep.spec.parts import Files, Part
-from sweep.spec.rules import Beams
+from sweep.spec.rules import Json, Rule, Several, read_element
+from sweep.units import QuantityError
 
 Vector = tuple[float, ...]
 Span = tuple[float, float]
@@ -101,13 +102,7 @@ class Turn(Part):
     )
 
     def turn(self) -> np.ndarray:
-        """Return the unit quaternion (4,).
-
-        Raises
-        ------
-        ValueError
-            For a quaternion of length zero, or one given along with angles.
-        """
+        """Return the unit quaternion (4,); a ValueError for one of length 0, or beside angles."""
         if self.quaternion is None:
             return quaternion.from_heading(heading=self.heading, pitch=self.pitch, roll=self.roll)
         if any((self.heading, self.pitch, self.roll)):
@@ -233,12 +228,48 @@ class Platform(Motion):
 
 # Scan patterns
 
-MOST_BEAMS = "10000"
+MOST_BEAMS = 10_000
+STEERED = Several(
+    about="Angles of a beam towards forward and towards the left",
+    of=of.measure("Angle from nadir", "rad", "22.5 deg", "-89 deg", "89 deg"),
+    least=2,
+    most=2,
+)
+_POINTED = Several(
+    about="Direction of a beam in the body frame",
+    of=of.measure("Component", "", "-1", "-1e9", "1e9"),
+)
+
+
+class Beams(Rule):
+    """Directions of beams: angles towards forward and left, or vectors in the body frame."""
+
+    def read(self, written: object) -> tuple[tuple[float, ...], ...]:
+        """Angles [rad] (two of them) or components (three) of each beam."""
+        example = "write e.g. [[22.5 deg, 0 deg], [0 deg, 0 deg]]"
+        if not isinstance(written, list | tuple) or not 0 < len(written) <= MOST_BEAMS:
+            raise QuantityError(f"must be a list of 1 to {MOST_BEAMS} beams", example)
+        return tuple(read_element(rule_of_beam(b), i, b) for i, b in enumerate(written))
+
+    def written(self, value: Any) -> Any:
+        """Return lists that read back as exactly `value`."""
+        return [rule_of_beam(beam).written(beam) for beam in value]
+
+    def _json(self) -> Json:
+        beam = {"anyOf": [STEERED.schema(), _POINTED.schema()]}
+        number = {"minItems": 1, "maxItems": MOST_BEAMS}
+        return {"type": "array", "items": beam} | number
+
+
+def rule_of_beam(beam: object) -> Several:
+    """Rule of a beam, by how many numbers it has."""
+    return _POINTED if isinstance(beam, list | tuple) and len(beam) == 3 else STEERED
+
+
 _REACH = ("0 deg", "89 deg")
 
 
-def _rate() -> Any:
-    return of.frequency("Measurement cycles a second")
+_RATE = of.frequency("Measurement cycles a second")
 
 
 def _interval(default: str, value: float | None) -> Any:
@@ -256,10 +287,10 @@ class Cone(Part):
     """Beams evenly round nadir, all of them in every cycle."""
 
     kind: Literal["cone"]
-    beams: int = of.count("Beams", "3", at_most=MOST_BEAMS)
+    beams: int = of.count("Beams", "3", at_most=str(MOST_BEAMS))
     half_angle: float = of.angle("From nadir", "22.5 deg", *_REACH)
     azimuth: float = of.angle("Of the first beam, from forward to the left", default=0.0)
-    rate: float = _rate()
+    rate: float = _RATE
     interval: float = _interval("0, all at once,", 0.0)
 
     def pattern(self) -> Scanner:
@@ -275,7 +306,7 @@ class FixedBeams(Part):
     beams: tuple[Vector, ...] = of.field(
         Beams(about="Angles towards forward and left, or vectors in the body frame, of each beam")
     )
-    rate: float = _rate()
+    rate: float = _RATE
     interval: float = _interval("0, all at once,", 0.0)
 
     def pattern(self) -> Scanner:
@@ -289,7 +320,7 @@ class Corners(Part):
 
     kind: Literal["corners"]
     angle: float = of.angle("Of both axes from nadir", "22.5 deg", *_REACH)
-    rate: float = _rate()
+    rate: float = _RATE
     interval: float | None = _interval("spread evenly over the cycle", None)
 
     def pattern(self) -> Scanner:
@@ -305,7 +336,7 @@ class Squares(Part):
         "Angle by which each element of an axis throws the beam to either side",
         "15 deg", "1e-6 deg", "45 deg", number=(1, 5),
     )  # fmt: skip
-    rate: float = _rate()
+    rate: float = _RATE
     interval: float | None = _interval("spread evenly over the cycle", None)
 
     def pattern(self) -> Scanner:
@@ -318,12 +349,12 @@ class RasterScan(Part):
     """One steered beam that visits a grid of directions; a cycle is a frame."""
 
     kind: Literal["raster"]
-    columns: int = of.count("Directions across", "32", at_most=MOST_BEAMS)
-    rows: int = of.count("Directions along", "32", at_most=MOST_BEAMS)
+    columns: int = of.count("Directions across", "32", at_most=str(MOST_BEAMS))
+    rows: int = of.count("Directions along", "32", at_most=str(MOST_BEAMS))
     half_angles: Vector = _angles(
         "Reach to each side of nadir, across and along", "10 deg", *_REACH, number=(2, 2)
     )
-    rate: float = _rate()
+    rate: float = _RATE
     both_ways: bool = of.flag("Every other row runs backwards", default=True)
 
     def pattern(self) -> Scanner:
@@ -337,7 +368,7 @@ class Line(Part):
     kind: Literal["line"]
     half_angle: float = of.angle("Reach of the sweep to each side", "5 deg", *_REACH)
     line_rate: float = of.frequency("Lines a second; a sweep one way is a line")
-    rate: float = _rate()
+    rate: float = _RATE
     along: Vector = _angles(
         "Angle of each beam from nadir towards forward",
         "250 urad", "-89 deg", "89 deg", number=(1, 1000), default=(0.0,),

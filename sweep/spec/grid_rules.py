@@ -29,10 +29,9 @@ from sweep.model.estimators import DEFAULTS, DETECTOR, ESTIMATOR
 from sweep.model.preparation import RECORD
 from sweep.model.waveform import ENDS, RANGES, VELOCITIES
 from sweep.spec.axes import Axis, place_on_grid
-from sweep.spec.fields import default_of, parameter_rules
 from sweep.spec.mistakes import ABSENT, Finding
 from sweep.spec.parts import OFF, ON, rules_of
-from sweep.spec.sections import SPECTRA, Draws, Effects
+from sweep.spec.sections import SPECTRA, Draws, Effects, default_of, parameter_rules
 from sweep.units import QuantityError
 
 if TYPE_CHECKING:
@@ -68,20 +67,13 @@ class Grid:
     """Values of a study's parameters, as far as they can be read.
 
     Axes vary apart, and the members of one together.
-
-    Parameters
-    ----------
-    values : mapping
-        SI values of the parameters by dotted path; of those on axes, the value off the axis.
-    axes : tuple of Axis
-        The axes.
-    modes : mapping
-        Mode of each effect by its name.
     """
 
     values: Mapping[str, Any]
+    """SI values of the parameters by dotted path; of those on axes, the value off the axis."""
     axes: tuple[Axis, ...] = ()
     modes: Mapping[str, str] = field(default_factory=dict)
+    """Mode of each effect by its name."""
 
     @classmethod
     def of(cls, written: Mapping[str, Any], axes: tuple[Axis, ...]) -> Grid:

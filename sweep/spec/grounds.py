@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-import sweep.spec.declaring as of
+import sweep.spec.rules as of
 from sweep.model.ground import LAWS
 from sweep.scenes.rasters import MOST_CELLS, raster_digest, read_raster
 from sweep.spec.parts import Files, Part
-from sweep.spec.sections import share_scattered
+from sweep.spec.sections import SHARE_SCATTERED
 
 if TYPE_CHECKING:
     from sweep.scenes.terrain import Terrain
@@ -34,7 +34,7 @@ def generator(use: str, seed: int) -> np.random.Generator:
 class Material(Part):
     """Optical properties of a surface."""
 
-    reflectance: float = share_scattered()
+    reflectance: float = SHARE_SCATTERED
     reflectance_law: str = of.choice("How it scatters", LAWS, "lambert")
 
 
@@ -108,14 +108,9 @@ class Ground(Material, ABC):
     craters: Craters | None = None
 
     def terrain(self, files: Files) -> Terrain:
-        """Return the ground in its own coordinates; files are found by `files`.
+        """Return the ground in its own coordinates.
 
-        Raises
-        ------
-        SceneError
-            For a file that is missing or unfit.
-        ValueError
-            For a grid that can not hold what it should.
+        A `SceneError` for an unfit file, a ValueError for a grid that can not hold what it should.
         """
         from sweep.scenes.terrain import Terrain, refine, smooth
 
@@ -199,8 +194,7 @@ class Jacksboro(PlacedGround):
         return max(abs(step) for step in self.grid(None).spacing) / self.factor
 
 
-def _scale() -> Any:
-    return of.number("Metres to a unit of the file's heights", "0.5", "1e-9", "1e9", default=1.0)
+_SCALE = of.number("Metres to a unit of the file's heights", "0.5", "1e-9", "1e9", default=1.0)
 
 
 class RasterGround(Ground):
@@ -209,7 +203,7 @@ class RasterGround(Ground):
     kind: Literal["raster"]
     file: str = of.file("The raster, whatever rasterio reads", digest=raster_digest)
     band: int = of.count("Band that holds the heights", "1", default=1)
-    scale: float = _scale()
+    scale: float = _SCALE
     window: Vector | None = of.several(
         of.measure("Coordinate", "", "500000"), 4, 4, None,
         about="West, south, east and north of the part to read, in the raster's coordinates",
@@ -243,7 +237,7 @@ class ArrayGround(PlacedGround):
     )  # fmt: skip
     name: str | None = of.text("Array of an .npz that holds the heights", None)
     no_data: float | None = of.number("Value for a missing height", "-9999", default=None)
-    scale: float = _scale()
+    scale: float = _SCALE
 
     def grid(self, files: Files) -> Terrain:
         """Heights of the file."""
@@ -286,8 +280,9 @@ class SquareGround(PlacedGround):
     size: float = of.size("Side of the square", "3 km")
 
     def own_step(self) -> float:
-        """Grid step before refining [m]."""
-        return float(self.spacing)  # type: ignore[attr-defined]
+        """Grid step before refining [m]; one cell without a spacing."""
+        spacing = self.spacing  # type: ignore[attr-defined]
+        return float(self.size if spacing is None else spacing)
 
     def flat(self) -> Terrain:
         """Return the grid, with heights of 0."""
@@ -321,10 +316,6 @@ class Plane(SquareGround):
     spacing: float | None = of.size(
         "Grid step, for relief and craters; one cell by default", "5 m", default=None
     )
-
-    def own_step(self) -> float:
-        """Grid step before refining [m]."""
-        return self.size if self.spacing is None else self.spacing
 
     def grid(self, files: Files) -> Terrain:
         """Return the sloping plane."""

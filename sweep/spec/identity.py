@@ -14,12 +14,12 @@ import numpy as np
 from pydantic import BaseModel
 
 from sweep.spec.axes import Axis, Member
-from sweep.spec.fields import SECTIONS
-from sweep.spec.flight import AnyScanner, Platform
+from sweep.spec.flight import AnyScanner, Platform, rule_of_beam
 from sweep.spec.grounds import OPTICAL
 from sweep.spec.parts import Models, all_parts, fields_of, models_at, rule_of, values_of
-from sweep.spec.rules import Rule, rule_of_beam
+from sweep.spec.rules import Rule
 from sweep.spec.scene import ErrorFloor, Navigation, Scene, SceneDraws, SceneStorage
+from sweep.spec.sections import SECTIONS
 from sweep.units import read_unit
 
 LISTED_VALUES = 64

@@ -18,30 +18,18 @@ _LONGEST_VALUE = 60
 
 @dataclass(frozen=True, order=True)
 class Mistake:
-    """One mistake in a spec.
-
-    Parameters
-    ----------
-    path : str
-        Dotted path in the file, such as ``instrument.laser.power`` or ``axes.target.range[2]``;
-        empty for the file as a whole.
-    rule : str
-        The rule broken, as the end of a sentence about the path.
-    value : str
-        The value as the user wrote it; empty where there is none.
-    suggestion : str
-        A near miss or a remedy; empty where there is none.
-    line : int or None
-        Line in the file, from 1.
-    file : str
-        The file that holds the mistake; empty for a spec that came from no file.
-    """
+    """One mistake in a spec; texts are empty where there is nothing to tell."""
 
     path: str
+    """Dotted path in the file, such as ``instrument.laser.power`` or ``axes.target.range[2]``."""
     rule: str
+    """The rule broken, as the end of a sentence about the path."""
     value: str = ""
+    """The value as the user wrote it."""
     suggestion: str = ""
+    """A near miss or a remedy."""
     line: int | None = None
+    """Line in the file, from 1."""
     file: str = ""
 
     def __str__(self) -> str:
@@ -67,22 +55,14 @@ class SpecError(Exception):
 
 @dataclass(frozen=True)
 class Finding:
-    """A mistake whose place in the file is still to be looked up.
-
-    Parameters
-    ----------
-    location : tuple of str or int
-        Keys and list indices that lead to it.
-    rule, suggestion : str
-        As in `Mistake`.
-    written : object
-        The value as read from the file, if it is to be shown.
-    """
+    """A mistake whose place in the file is still to be looked up."""
 
     location: Location
+    """Keys and list indices that lead to it."""
     rule: str
     suggestion: str = ""
     written: object = ABSENT
+    """The value as read from the file, if it is to be shown."""
 
 
 class Rejected(Exception):

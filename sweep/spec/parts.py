@@ -17,7 +17,7 @@ from sweep.model.effects.catalogue import EFFECTS, PARAMETERS
 from sweep.model.effects.effect import MODES, Parameter
 from sweep.scenes.files import SceneError, file_digest
 from sweep.spec.mistakes import Location
-from sweep.spec.rules import Choice, File, Mode, Numeric, Rule, SweepError, Text
+from sweep.spec.rules import Choice, File, Numeric, Rule, SweepError, Text
 
 AUTO, ON, OFF = MODES
 Models = tuple[type[BaseModel], ...]
@@ -51,7 +51,7 @@ def with_parameters(path: str) -> Callable[[type[Section]], type[Section]]:
 
 def with_modes(section: type[Section]) -> type[Section]:
     """Add a mode for every effect to the section, `auto` by default."""
-    modes = {e.name: Mode(about=e.about[0].upper() + e.about[1:], options=MODES) for e in EFFECTS}
+    modes = {e.name: Choice(about=e.about[0].upper() + e.about[1:], options=MODES) for e in EFFECTS}
     return _completed(section, {n: (Annotated[str, mode], AUTO) for n, mode in modes.items()})
 
 
@@ -165,9 +165,9 @@ class Place(NamedTuple):
     """Models as one of which the part around it is read."""
 
 
-def place_of(location: Location, root: type[BaseModel]) -> Place:
+def place_of(location: Location, root: Any) -> Place:
     """Place of one of pydantic's locations, which name the kind of a part after its key."""
-    at: Any = root
+    at = root
     found: list[str | int] = []
     parents: Models = ()
     for part in location:
@@ -241,18 +241,12 @@ def fill(mapping: dict[str, Any], path: list[str], value: Any) -> bool:
 
 @dataclass(frozen=True)
 class Files:
-    """Files named in a spec.
-
-    Parameters
-    ----------
-    base : Path
-        Folder that their paths are relative to; ~ is the user's own.
-    digests : mapping
-        Digest of each file by its path as written.
-    """
+    """Files named in a spec."""
 
     base: Path
+    """Folder that their paths are relative to; ~ is the user's own."""
     digests: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    """Digest of each file by its path as written."""
 
     def path(self, written: str, digest: Callable[[Path], str] = file_digest) -> Path:
         """Path of a file; a `SceneError` if it has changed since the spec was loaded."""

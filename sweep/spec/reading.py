@@ -19,7 +19,6 @@ from pydantic import BaseModel, ValidationError
 from sweep.model.effects.phase_errors import ERROR_TABLE, NO_TABLE
 from sweep.model.threshold import PROCESSING, WAYS
 from sweep.scenes.files import SceneError, read_columns
-from sweep.spec.fields import parameter_rules
 from sweep.spec.figures import Figure, SceneFigure
 from sweep.spec.mistakes import (
     ABSENT,
@@ -44,6 +43,7 @@ from sweep.spec.parts import (
     rules_of,
 )
 from sweep.spec.rules import BROKEN_RULE, Numeric
+from sweep.spec.sections import parameter_rules
 
 LARGEST_FILE = 1_000_000
 DEEPEST = 30
@@ -380,12 +380,12 @@ _DRAWN_BY = {
 """Whose studies make a kind of figure."""
 
 
-def findings_of(error: ValidationError, root: type[BaseModel]) -> list[Finding]:
-    """Everything pydantic found wrong with a mapping read as `root`."""
+def findings_of(error: ValidationError, root: Any) -> list[Finding]:
+    """Everything pydantic found wrong with a mapping read as `root`, one model or several."""
     return [_finding(dict(detail), root) for detail in error.errors(include_url=False)]
 
 
-def _finding(detail: dict[str, Any], root: type[BaseModel]) -> Finding:
+def _finding(detail: dict[str, Any], root: Any) -> Finding:
     """One error of pydantic's."""
     kind, written = detail["type"], detail["input"]
     place = place_of(detail["loc"], root)
@@ -400,7 +400,9 @@ def _finding(detail: dict[str, Any], root: type[BaseModel]) -> Finding:
     if kind == "missing":
         return Finding(location, "is missing", _remedy(place))
     if kind == "extra_forbidden":
-        return Finding(location, "is no field", _sibling(place, root))
+        several = {kind_of(model): model for model in models_at(root)}
+        model = several.get(detail["loc"][0], root)
+        return Finding(location, "is no field", _sibling(place, model))
     if kind == "union_tag_invalid":
         tag, kinds = detail["ctx"]["tag"], [kind_of(model) for model in place.models]
         rule = f"must be one of {', '.join(kinds)}"
@@ -448,9 +450,8 @@ def _sibling(place: Place, root: type[BaseModel]) -> str:
     suggestion = near_miss(name, beside)
     if suggestion:
         return suggestion
-    elsewhere = [
-        p for p in (*parameter_rules(), *rules_of(root, "")) if p.rsplit(".", 1)[-1] == name
-    ]
+    known = (*parameter_rules(), *rules_of(root, ""))
+    elsewhere = [path for path in known if path.rsplit(".", 1)[-1] == name]
     if elsewhere:
         return f"did you mean '{elsewhere[0]}'?"
     return f"the fields here are {', '.join(beside)}" if beside else ""

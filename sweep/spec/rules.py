@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
+from pydantic import Field, GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from sweep.model.effects.phase_errors import NO_TABLE
@@ -41,15 +41,10 @@ def broken(rule: str, suggestion: str) -> PydanticCustomError:
 
 @dataclass(frozen=True, kw_only=True)
 class Rule:
-    """Rule of what a field may hold.
-
-    Parameters
-    ----------
-    about : str
-        Description of the field, for people.
-    """
+    """Rule of what a field may hold."""
 
     about: str
+    """Description of the field, for people."""
 
     @property
     def example(self) -> str:
@@ -77,7 +72,10 @@ class Rule:
 
     def schema(self) -> Json:
         """JSON Schema of what a user may write."""
-        return {"description": self.about}
+        return {"description": self.about} | self._json()
+
+    def _json(self) -> Json:
+        return {}
 
     def __get_pydantic_core_schema__(self, _: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         return core_schema.no_info_plain_validator_function(self._validated)
@@ -95,26 +93,19 @@ class Rule:
 
 @dataclass(frozen=True, kw_only=True)
 class Special(Rule):
-    """Rule of one kind of field alone.
-
-    Parameters
-    ----------
-    reader
-        Reads what the user wrote, or raises a `QuantityError`.
-    json : dict
-        JSON Schema of it.
-    """
+    """Rule of one kind of field alone."""
 
     reader: Callable[[Any], Any]
+    """Reads what the user wrote, or raises a `QuantityError`."""
     json: Json = dataclasses.field(default_factory=dict, compare=False)
+    """JSON Schema of it."""
 
     def read(self, written: object) -> Any:
         """Value of what the user wrote."""
         return self.reader(written)
 
-    def schema(self) -> Json:
-        """JSON Schema of what a user may write."""
-        return super().schema() | self.json
+    def _json(self) -> Json:
+        return self.json
 
 
 _BOUNDS = {
@@ -128,24 +119,11 @@ _BOUNDS = {
 
 @dataclass(frozen=True, kw_only=True)
 class Numeric(Rule):
-    """A number within bounds, with a unit where `si_unit` names one.
-
-    Parameters
-    ----------
-    si_unit : str
-        Unit of the value inside; ``"dB"`` for a power ratio that is written in decibels; empty
-        for a pure number.
-    above, at_least, below, at_most : str, optional
-        Bounds, as a user would write them.
-    whole : bool
-        Whether only whole numbers will do.
-    word : str
-        A word that may stand in place of a number, not along axes; empty for none.
-    means : int or float or str
-        Value that the word stands for, whatever the bounds.
-    """
+    """A number within bounds, which are as a user would write them."""
 
     si_unit: str = ""
+    """Unit of the value inside; ``"dB"`` for a power ratio that is written in decibels; empty for
+    a pure number."""
     example: str = ""
     above: str | None = None
     at_least: str | None = None
@@ -153,7 +131,9 @@ class Numeric(Rule):
     at_most: str | None = None
     whole: bool = False
     word: str = ""
+    """A word that may stand in place of a number, not along axes; empty for none."""
     means: float | str = 0
+    """Value that the word stands for, whatever the bounds."""
 
     @property
     def units(self) -> str:
@@ -221,8 +201,7 @@ class Numeric(Rule):
             return f"{repr(number).removesuffix('.0')} {self.si_unit}"
         return int(value) if self.whole else float(value)
 
-    def schema(self) -> Json:
-        """JSON Schema: text with a unit, or a number."""
+    def _json(self) -> Json:
         bounds = [f"{_BOUNDS[name][0]} {written}" for name, written in self.bounds.items()]
         about = "; ".join([self.about, *([", ".join(bounds)] if bounds else [])])
         common: Json = {"description": about, "examples": [self.example]}
@@ -251,33 +230,28 @@ _FUNCTION = r"[A-Za-z_][A-Za-z0-9_]*(\.[A-Za-z_][A-Za-z0-9_]*)*:[A-Za-z_][A-Za-z
 
 @dataclass(frozen=True, kw_only=True)
 class Choice(Rule):
-    """One of several words.
-
-    Parameters
-    ----------
-    options : tuple of str
-        The words.
-    rule, remedy : str
-        Message for other words; by default that they are none of the options.
-    """
+    """One of several words; of on and off, which YAML makes truth values of, these too."""
 
     options: tuple[str, ...]
     rule: str = ""
+    """Message for other words; by default that they are none of the options."""
     remedy: str = ""
 
     def read(self, written: object) -> str:
         """Return the word written."""
+        if isinstance(written, bool) and "on" in self.options:
+            return "on" if written else "off"
         if written in self.options and isinstance(written, str):
             return written
         rule = self.rule or f"must be one of {', '.join(self.options)}"
         raise QuantityError(rule, near_miss(str(written), self.options, otherwise=self.remedy))
 
-    def schema(self) -> Json:
-        """JSON Schema: the words."""
-        return {"description": self.about, "type": "string", "enum": list(self.options)}
+    def _json(self) -> Json:
+        if "on" in self.options:
+            return {"enum": [*self.options, True, False]}
+        return {"type": "string", "enum": list(self.options)}
 
 
-@dataclass(frozen=True, kw_only=True)
 class Method(Choice):
     """One of several words, or ``module:function``, which reading does not import."""
 
@@ -291,29 +265,10 @@ class Method(Choice):
             rule = f"{error.rule}, or a function as module:function"
             raise QuantityError(rule, error.suggestion) from None
 
-    def schema(self) -> Json:
-        """JSON Schema: the words, or a function's name."""
-        words = {"type": "string", "enum": list(self.options)}
-        function = {"type": "string", "pattern": f"^{_FUNCTION}$"}
-        return {"description": self.about, "anyOf": [words, function]}
+    def _json(self) -> Json:
+        return {"anyOf": [super()._json(), {"type": "string", "pattern": f"^{_FUNCTION}$"}]}
 
 
-@dataclass(frozen=True, kw_only=True)
-class Mode(Choice):
-    """One of several words, two of which YAML makes truth values of: a bare `on` or `off`."""
-
-    def read(self, written: object) -> str:
-        """Return the word; true and false stand for on and off."""
-        if isinstance(written, bool):
-            return "on" if written else "off"
-        return super().read(written)
-
-    def schema(self) -> Json:
-        """JSON Schema: the words, and what YAML makes of two of them."""
-        return {"description": self.about, "enum": [*self.options, True, False]}
-
-
-@dataclass(frozen=True, kw_only=True)
 class Flag(Rule):
     """True or false."""
 
@@ -323,25 +278,17 @@ class Flag(Rule):
             raise QuantityError("must be true or false", "write 'true' or 'false'")
         return written
 
-    def schema(self) -> Json:
-        """JSON Schema: true or false."""
-        return {"description": self.about, "type": "boolean"}
+    def _json(self) -> Json:
+        return {"type": "boolean"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Text(Rule):
-    """Words for people, or the name of something.
-
-    Parameters
-    ----------
-    pattern : str
-        Regular expression that the whole text matches.
-    remedy : str
-        Text to write instead.
-    """
+    """Words for people, or the name of something."""
 
     example: str = ""
     pattern: str = r"[^\x00-\x08\x0b-\x1f\x7f-\x9f]{0,5000}"
+    """Regular expression that the whole text matches."""
     remedy: str = "write at most 5000 characters that can be printed"
 
     def read(self, written: object) -> str:
@@ -352,22 +299,16 @@ class Text(Rule):
             raise QuantityError("is no text that can stand here", self.remedy)
         return str(written)
 
-    def schema(self) -> Json:
-        """JSON Schema: text."""
-        return {"description": self.about, "type": "string", "pattern": f"^{self.pattern}$"}
+    def _json(self) -> Json:
+        return {"type": "string", "pattern": f"^{self.pattern}$"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class File(Rule):
-    """Path of a file, relative to the one that names it.
-
-    Parameters
-    ----------
-    digest
-        Digest of what is read from the file.
-    """
+    """Path of a file, relative to the one that names it."""
 
     digest: Callable[[Path], str] = file_digest
+    """Digest of what is read from the file."""
 
     def read(self, written: object) -> str:
         """Return the path, as written."""
@@ -377,35 +318,23 @@ class File(Rule):
             raise QuantityError("holds a character that no path has")
         return written
 
-    def schema(self) -> Json:
-        """JSON Schema: text."""
-        return {"description": self.about, "type": "string", "minLength": 1}
+    def _json(self) -> Json:
+        return {"type": "string", "minLength": 1}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Several(Rule):
-    """A list of values, each held to the same rule.
-
-    Parameters
-    ----------
-    of : Rule
-        Rule of each value.
-    least, most : int
-        Number of values.
-    noun : str
-        Name of all values together.
-    rising : bool
-        Whether each must exceed the one before.
-    distinct : bool
-        Whether none may be there twice.
-    """
+    """A list of values, each held to the same rule."""
 
     of: Rule
     least: int = 3
     most: int = 3
     noun: str = "values"
+    """Name of all values together."""
     rising: bool = False
+    """Whether each must exceed the one before."""
     distinct: bool = False
+    """Whether none may be there twice."""
 
     @property
     def units(self) -> str:
@@ -424,7 +353,7 @@ class Several(Rule):
             number = f"{self.least} " if self.least == self.most else ""
             number = number or (f"at least {self.least} " if self.noun == "values" else "")
             raise QuantityError(f"must be a list of {number}{self.noun}", remedy)
-        values = tuple(_read_element(self.of, i, value) for i, value in enumerate(written))
+        values = tuple(read_element(self.of, i, value) for i, value in enumerate(written))
         if self.rising and any(b <= a for a, b in pairwise(values)):
             raise QuantityError("must begin below its end", "put the lower value first")
         if self.distinct and len(set(values)) < len(values):
@@ -435,15 +364,13 @@ class Several(Rule):
         """List that reads back as exactly `value`."""
         return [self.of.written(element) for element in value]
 
-    def schema(self) -> Json:
-        """JSON Schema: a list."""
+    def _json(self) -> Json:
         number = {"minItems": self.least, "maxItems": self.most}
         distinct = {"uniqueItems": True} if self.distinct else {}
-        items = {"type": "array", "items": self.of.schema()}
-        return {"description": self.about} | items | number | distinct
+        return {"type": "array", "items": self.of.schema()} | number | distinct
 
 
-def _read_element(rule: Rule, index: int, written: object) -> Any:
+def read_element(rule: Rule, index: int, written: object) -> Any:
     """One value of a list, or what is wrong with it."""
     try:
         return rule.read(written)
@@ -462,7 +389,6 @@ _FREQUENCY_ERROR = Numeric(
 MOST_ROWS = 4096
 
 
-@dataclass(frozen=True, kw_only=True)
 class SweepError(Rule):
     """A table of the sweep's frequency error over time; text inside, a row after the other."""
 
@@ -480,7 +406,7 @@ class SweepError(Rule):
             if not isinstance(row, list | tuple) or len(row) != 2:
                 raise QuantityError(f"has a row {i} that is no time with its error", remedy)
             rules = zip((_TIME, _FREQUENCY_ERROR), row, strict=True)
-            rows.append([_read_element(rule, i, value) for rule, value in rules])
+            rows.append([read_element(rule, i, value) for rule, value in rules])
         if any(b[0] <= a[0] for a, b in pairwise(rows)):
             raise QuantityError("has times that do not rise", "sort the rows by time")
         text = ", ".join(f"{time!r} {error!r}" for time, error in rows)
@@ -500,50 +426,10 @@ class SweepError(Rule):
             for row in value.split(",")
         ]
 
-    def schema(self) -> Json:
-        """JSON Schema: rows, or text."""
+    def _json(self) -> Json:
         pair = {"minItems": 2, "maxItems": 2, "items": {"type": "string"}}
         rows = {"type": "array", "minItems": 3, "items": {"type": "array"} | pair}
-        return {"description": self.about, "anyOf": [rows, {"type": "string"}]}
-
-
-_FROM_NADIR = Numeric(
-    about="Angle from nadir", si_unit="rad", example="22.5 deg", at_least="-89 deg",
-    at_most="89 deg",
-)  # fmt: skip
-_COMPONENT = Numeric(about="Component", example="-1", at_least="-1e9", at_most="1e9")
-STEERED = Several(
-    about="Angles of a beam towards forward and towards the left", of=_FROM_NADIR, least=2, most=2
-)
-_POINTED = Several(about="Direction of a beam in the body frame", of=_COMPONENT)
-MOST_BEAMS = 10_000
-
-
-@dataclass(frozen=True, kw_only=True)
-class Beams(Rule):
-    """Directions of beams: angles towards forward and left, or vectors in the body frame."""
-
-    def read(self, written: object) -> tuple[tuple[float, ...], ...]:
-        """Angles [rad] (two of them) or components (three) of each beam."""
-        example = "write e.g. [[22.5 deg, 0 deg], [0 deg, 0 deg]]"
-        if not isinstance(written, list | tuple) or not 0 < len(written) <= MOST_BEAMS:
-            raise QuantityError(f"must be a list of 1 to {MOST_BEAMS} beams", example)
-        return tuple(_read_element(rule_of_beam(b), i, b) for i, b in enumerate(written))
-
-    def written(self, value: Any) -> Any:
-        """Return lists that read back as exactly `value`."""
-        return [rule_of_beam(beam).written(beam) for beam in value]
-
-    def schema(self) -> Json:
-        """JSON Schema: a list of lists."""
-        beam = {"anyOf": [STEERED.schema(), _POINTED.schema()]}
-        number = {"minItems": 1, "maxItems": MOST_BEAMS}
-        return {"description": self.about, "type": "array", "items": beam} | number
-
-
-def rule_of_beam(beam: object) -> Several:
-    """Rule of a beam, by how many numbers it has."""
-    return _POINTED if isinstance(beam, list | tuple) and len(beam) == 3 else STEERED
+        return {"anyOf": [rows, {"type": "string"}]}
 
 
 WINDOWS = tuple(COSINE_SUMS)
@@ -557,7 +443,6 @@ _WINDOW = re.compile(r"(?P<name>[a-z_]{1,40})\s*(?:\((?P<parameters>[-+.,eE\d\s]
 _KAISER = "write e.g. 'kaiser(8.6)'"
 
 
-@dataclass(frozen=True, kw_only=True)
 class Window(Rule):
     """Name of a window function, with its parameters: ``hamming``, ``kaiser(8.6)``."""
 
@@ -578,10 +463,8 @@ class Window(Rule):
         _try_window(name, tuple(parameters))
         return f"{name}({','.join(map(repr, parameters))})" if parameters else name
 
-    def schema(self) -> Json:
-        """JSON Schema: a word, parameters in brackets."""
+    def _json(self) -> Json:
         return {
-            "description": self.about,
             "type": "string",
             "pattern": r"^\s*[A-Za-z_]+\s*(\([-+.,eE0-9\s]*\))?\s*$",
             "examples": ["hamming", "hann", "rectangular", "kaiser(8.6)"],
@@ -610,3 +493,150 @@ def _try_window(name: str, parameters: tuple[float, ...]) -> None:
         raise QuantityError("is no periodic window that scipy.signal makes", remedy) from None
     if not np.all(np.isfinite(values)) or not np.sum(values) > 0:
         raise QuantityError("has parameters that make no usable window")
+
+
+# Fields, each declared in a line. Bounds are as a user would write them; a field without a default
+# is required.
+
+# Far beyond all that flies, and near enough that squares and products stay within a float.
+_EITHER_WAY = {
+    "m": "1e9 m",
+    "rad": "1e6 deg",
+    "m/s": "1000 km/s",
+    "m/s^2": "1e6 m/s^2",
+    "rad/s": "1e6 deg/s",
+    "": "1e12",
+}
+"""Largest magnitude of a signed quantity, by its SI unit."""
+
+
+def field(rule: Rule, default: Any = ..., *, alias: str | None = None) -> Any:
+    """Field that holds what a rule says; required without a default."""
+    info = Field(default, alias=alias)
+    info.metadata.append(rule)
+    return info
+
+
+def measure(
+    about: str, unit: str, example: str, at_least: str = "", at_most: str = "", **more: Any
+) -> Numeric:
+    """Rule of a quantity within bounds, wide ones by default."""
+    bounds = {"at_least": at_least or f"-{_EITHER_WAY[unit]}"} if "above" not in more else {}
+    bounds |= {"at_most": at_most or _EITHER_WAY[unit]} if "below" not in more else {}
+    return Numeric(about=about, si_unit=unit, example=example, **bounds, **more)  # type: ignore[arg-type]
+
+
+def quantity(
+    about: str,
+    unit: str,
+    example: str,
+    at_least: str = "",
+    at_most: str = "",
+    *,
+    default: Any = ...,
+    word: str = "",
+    **more: Any,
+) -> Any:
+    """Declare a number with a unit; the word, if there is one, stands for the default."""
+    more |= {"word": word, "means": more.get("means", default)} if word else {}
+    return field(measure(about, unit, example, at_least, at_most, **more), default)
+
+
+def number(about: str, example: str = "0.5", *bounds: str, **more: Any) -> Any:
+    """Pure number."""
+    return quantity(about, "", example, *bounds, **more)
+
+
+def count(
+    about: str, example: str = "3", at_least: str = "1", at_most: str = "1e6", **more: Any
+) -> Any:
+    """Whole number."""
+    return quantity(about, "", example, at_least, at_most, whole=True, **more)
+
+
+def length(about: str, example: str = "10 m", *bounds: str, **more: Any) -> Any:
+    """Length of either sign."""
+    return quantity(about, "m", example, *bounds, **more)
+
+
+def size(about: str, example: str = "10 m", **more: Any) -> Any:
+    """Length above 0."""
+    return length(about, example, "1 um", **more)
+
+
+def angle(about: str, example: str = "10 deg", *bounds: str, **more: Any) -> Any:
+    """Angle of either sign."""
+    return quantity(about, "rad", example, *bounds, **more)
+
+
+def speed(about: str, **more: Any) -> Any:
+    """Speed, not signed."""
+    return quantity(about, "m/s", "30 m/s", "0 m/s", **more)
+
+
+def duration(
+    about: str, example: str = "10 s", at_least: str = "0 s", at_most: str = "1e8 s", **more: Any
+) -> Any:
+    """Time, 0 to some years by default."""
+    return quantity(about, "s", example, at_least, at_most, **more)
+
+
+def frequency(about: str, example: str = "20 Hz") -> Any:
+    """Rate above 0."""
+    return quantity(about, "Hz", example, "1e-6 Hz", "1e9 Hz")
+
+
+def several(of: Rule, least: int, most: int, default: Any = ..., **more: Any) -> Any:
+    """List of values, each held to the same rule, described by `about`."""
+    alias = more.pop("alias", None)
+    return field(Several(of=of, least=least, most=most, **more), default, alias=alias)
+
+
+def vector(about: str, unit: str, example: str, *, of: int = 3, **more: Any) -> Any:
+    """Components of a vector of so many dimensions."""
+    return several(measure("Component", unit, example), of, of, about=about, **more)
+
+
+def position(about: str, *, of: int = 3, **more: Any) -> Any:
+    """Position in so many dimensions."""
+    return vector(about, "m", "10 m", of=of, **more)
+
+
+def seed(about: str = "Seed of its random numbers") -> Any:
+    """Seed, 0 by default."""
+    return count(about, "1", "0", "2^63", default=0)
+
+
+def named(about: str, example: str = "ground") -> Text:
+    """Rule of the name of an object or a scanner."""
+    return Text(
+        about=about,
+        example=example,
+        pattern=r"[a-z][a-z0-9_]{0,59}",
+        remedy="take small letters, digits and '_', such as 'ground'",
+    )
+
+
+def name(about: str, default: Any = ...) -> Any:
+    """Name of an object or a scanner."""
+    return field(named(about), default)
+
+
+def text(about: str, default: Any = ..., **more: str) -> Any:
+    """Text for people, or of a pattern with a remedy."""
+    return field(Text(about=about, **more), default)
+
+
+def choice(about: str, options: tuple[str, ...], default: Any = ...) -> Any:
+    """One of several words."""
+    return field(Choice(about=about, options=options), default)
+
+
+def flag(about: str, *, default: bool) -> Any:
+    """Declare a field that is true or false."""
+    return field(Flag(about=about), default)
+
+
+def file(about: str, default: Any = ..., **more: Any) -> Any:
+    """Path of a file."""
+    return field(File(about=about, **more), default)

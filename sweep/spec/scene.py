@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self
 
+import numpy as np
 from pydantic import Field, model_validator
 
-import sweep.spec.declaring as of
-from sweep.spec.flight import Motion, Turn
+import sweep.spec.rules as of
+from sweep.scenes.files import SceneError
+from sweep.spec.flight import Motion, Span, Turn
 from sweep.spec.grounds import (
     ArrayGround,
+    Ground,
     Hills,
     ImageGround,
     Jacksboro,
     Material,
+    PlacedGround,
     Plane,
     RasterGround,
     ReliefGround,
@@ -25,9 +31,13 @@ from sweep.spec.rules import broken
 from sweep.spec.sections import SPECTRA, sunlight
 
 if TYPE_CHECKING:
+    from sweep.model.geometry.mesh import Mesh, Surface
+    from sweep.model.geometry.platform import Flight
+    from sweep.model.geometry.rays import Caster
     from sweep.scenes.meshes import Facets
     from sweep.scenes.scattered import Law
     from sweep.scenes.terrain import Terrain
+
 
 Vector = tuple[float, ...]
 
@@ -48,13 +58,7 @@ class Solid(Material, ABC):
     motion: Motion | None = None
 
     def facets(self, files: Files) -> Facets:
-        """Its facets, turned, about its own zero.
-
-        Raises
-        ------
-        SceneError
-            For a file that is missing or unfit.
-        """
+        """Its facets, turned, about its own zero; a `SceneError` for an unfit file."""
         return self.shape(files).placed(rotation=self.rotation.turn())
 
     @abstractmethod
@@ -158,10 +162,7 @@ class Boulders(Material):
     def facets(self, ground: Terrain) -> Facets:
         """Their facets on a ground in the scene's frame.
 
-        Raises
-        ------
-        ValueError
-            For too many of them, or none of the ground within the square.
+        A ValueError for too many of them, or none of the ground within the square.
         """
         from sweep.scenes.scattered import draw_boulders
         from sweep.scenes.terrain import square
@@ -169,17 +170,9 @@ class Boulders(Material):
         bounds = None
         if self.within is not None:
             bounds = square(ground, centre=self.centre, size=self.within)
-        return draw_boulders(
-            generator("boulders", self.seed),
-            self.law.law(),
-            ground,
-            bounds=bounds,
-            smallest=self.smallest,
-            largest=self.largest,
-            height_ratio=self.height_ratio,
-            elongation=self.elongation,
-            subdivisions=self.subdivisions,
-        )
+        shape = {"smallest", "largest", "height_ratio", "elongation", "subdivisions"}
+        random, law = generator("boulders", self.seed), self.law.law()
+        return draw_boulders(random, law, ground, bounds=bounds, **self.model_dump(include=shape))
 
 
 class TreeMeasures(Part):
@@ -215,10 +208,7 @@ class Trees(Part):
     def facets(self, ground: Terrain) -> Facets:
         """Leaves (surface 0) and trunks (1) on a ground in the scene's frame.
 
-        Raises
-        ------
-        ValueError
-            If there is no room for them, or one would stand off the ground.
+        A ValueError if there is no room for them, or one would stand off the ground.
         """
         from sweep.scenes.scattered import Tree, clump
 
@@ -390,3 +380,122 @@ class SceneStorage(Part):
 
     block_shots: int = of.count("Shots that one block holds at most", "4096", default=4096)
     block_draws: int = of.count("Draws that one block holds at most", "64", default=64)
+
+
+# The scene, built: its objects as bodies that rays can be cast at
+
+
+class World(NamedTuple):
+    """Bodies that rays are cast at, in the scene's frame."""
+
+    caster: Caster
+    """The bodies: all that rests is the first, if there is any, and each that moves another."""
+    surfaces: tuple[Surface, ...]
+    """Surfaces by their numbers."""
+    bodies: tuple[Flight | None, ...]
+    """Motion of each of the caster's bodies; None for one at rest."""
+    reports: tuple[str, ...]
+    """Report of what loading found and mended, a line an object."""
+    origin: np.ndarray
+    """(3,): what was subtracted from the objects' own coordinates [m]."""
+
+
+def surfaces_of(scene: Scene) -> tuple[Surface, ...]:
+    """Surfaces of a scene in the order of their numbers."""
+    from sweep.model.geometry.mesh import Surface
+
+    return tuple(
+        Surface(name, material.reflectance, material.reflectance_law)
+        for key, thing in scene.objects.items()
+        for name, material in materials(key, thing)
+    )
+
+
+def build(scene: Scene, files: Files, span: Span) -> World:
+    """Build a scene; a `SceneError` for an unfit file or object.
+
+    An object that stays in place does so for the `span` of the flight [s].
+    """
+    from sweep.model.geometry.mesh import merge
+    from sweep.model.geometry.rays import Caster
+
+    origin, grounds = _grounds(scene, files)
+    resting: list[Mesh] = []
+    moving: list[tuple[Mesh, Flight]] = []
+    reports = []
+    first = 0
+    for name, thing in scene.objects.items():
+        try:
+            facets = _facets(name, thing, grounds, origin, files)
+            surface = (facets.surface + first).astype(np.int16)
+            mesh, report = replace(facets, surface=surface).mesh()
+            motion = thing.motion if isinstance(thing, Solid) else None
+            if motion is None:
+                resting.append(mesh)
+            else:
+                moving.append((mesh, motion.flight(files, span)))
+        except (ValueError, ArithmeticError) as error:
+            raise _unfit(name, error) from None
+        reports.append(f"{name}: {report.text()}")
+        first += len(materials(name, thing))
+    meshes = [merge(resting)] if resting else []
+    return World(
+        Caster([*meshes, *(mesh for mesh, _ in moving)]),
+        surfaces_of(scene),
+        (*(None for _ in meshes), *(flight for _, flight in moving)),
+        tuple(reports),
+        origin,
+    )
+
+
+def _unfit(name: str, error: Exception) -> SceneError:
+    """Mistakes in an object, as users are told it."""
+    return SceneError(f"scene.objects.{name}", f"can not be made: {error}", "change it")
+
+
+def _grounds(scene: Scene, files: Files) -> tuple[np.ndarray, dict[str, Terrain]]:
+    """Return the scene's origin, and its grounds in the scene's frame."""
+    own: dict[str, Terrain] = {}
+    for name, thing in scene.objects.items():
+        if isinstance(thing, Ground):
+            try:
+                own[name] = thing.terrain(files)
+            except (ValueError, ArithmeticError) as error:
+                raise _unfit(name, error) from None
+    origin = np.zeros(3)
+    if scene.origin in own:
+        origin = _middle(scene.origin, own[scene.origin])
+    grounds = {}
+    for name, terrain in own.items():
+        # One without coordinates of its own stands where its position says, beside the origin.
+        beside = isinstance(scene.objects[name], PlacedGround) and name != scene.origin
+        shift = 0.0 if beside else origin
+        grounds[name] = replace(terrain, origin=terrain.origin - shift)
+    return origin, grounds
+
+
+def _middle(name: str, terrain: Terrain) -> np.ndarray:
+    """Middle of a ground, on it."""
+    centre = terrain.centre
+    if not np.isfinite(centre).all():
+        raise SceneError(
+            f"scene.objects.{name}",
+            "has a hole in its middle, which the scene's origin should be",
+            "take another origin, or 'world'",
+        )
+    return centre
+
+
+def _facets(
+    name: str, thing: Any, grounds: Mapping[str, Terrain], origin: np.ndarray, files: Files
+) -> Facets:
+    """Facets of an object in the scene's frame; of one that moves, in its own."""
+    if isinstance(thing, Ground):
+        return grounds[name].facets()
+    if isinstance(thing, Boulders | Trees):
+        return thing.facets(grounds[thing.on])
+    facets = thing.facets(files)
+    if thing.motion is not None:
+        return facets
+    place = -origin if thing.position is None else np.asarray(thing.position)
+    return replace(facets, origin=facets.origin + place)

@@ -11,13 +11,12 @@ from typing import Any
 
 import numpy as np
 
-import sweep.spec.declaring as of
+import sweep.spec.rules as of
 from sweep.model import beam
 from sweep.model.ground import pattern as pattern_of
 from sweep.model.outputs import CYCLES, NAVIGATION, POINTS, SHOTS, STATISTICS
 from sweep.model.resolution import PATTERN
 from sweep.scenes.files import SceneError
-from sweep.spec.fields import default_of
 from sweep.spec.flight import (
     AnyScanner,
     Motion,
@@ -33,6 +32,7 @@ from sweep.spec.grounds import Craters, Ground, Jacksboro
 from sweep.spec.mistakes import Finding, Location, near_miss
 from sweep.spec.parts import Files, named_files, read_as
 from sweep.spec.scene import WORLD, AnyObject, Boulders, Box, MeshObject, Solid, Sphere, Trees
+from sweep.spec.sections import default_of
 from sweep.units import QuantityError, read_unit
 
 RESERVED = ("map_height", "map_x", "map_y")
@@ -57,12 +57,7 @@ def _readable(section: Mapping[str, Any], kind: Any) -> dict[str, Any]:
 def scene_findings(written: Mapping[str, Any], base: Path | None) -> list[Finding]:
     """Mistakes in scene, platform and scanners beyond their single fields.
 
-    Parameters
-    ----------
-    written : mapping
-        The spec as written; what cannot be read is passed over.
-    base : Path or None
-        Folder that files are relative to; None leaves them alone.
+    What cannot be read is passed over; files are left alone without a base.
     """
     objects = _readable(_section(written, *OBJECTS), AnyObject)
     scanners = _readable(_section(written, "scanners"), AnyScanner)
@@ -168,9 +163,14 @@ def _object_findings(thing: Any, location: Location) -> Iterator[Finding]:
     if isinstance(thing, Boulders):
         yield from _size_findings(thing, location)
     if isinstance(thing, Trees) and not thing.tree.crown_base < thing.tree.height:
-        rule = f"must lie below the top, {thing.tree.height:g} m"
-        base = f"{thing.tree.crown_base:g} m"
-        yield Finding((*location, "tree", "crown_base"), rule, "lower it", base)
+        base, top = f"{thing.tree.crown_base:g} m", f"{thing.tree.height:g} m"
+        at = (*location, "tree", "crown_base")
+        if "crown_base" in thing.tree.model_fields_set:
+            yield Finding(at, f"must lie below the top, {top}", "lower it", base)
+        else:
+            yield Finding(
+                at, f"is {base} by default, and must lie below the top, {top}", "lower it"
+            )
 
 
 def _size_findings(thing: Boulders | Craters, location: Location) -> Iterator[Finding]:

@@ -8,12 +8,11 @@ from typing import Any
 from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
-from sweep.spec.fields import parameter_rules
 from sweep.spec.parts import all_parts, fields_of, rule_of
 from sweep.spec.reading import library
 from sweep.spec.rules import Json, Numeric, Rule
-from sweep.spec.scene_spec import SceneSpec
-from sweep.spec.study import Spec
+from sweep.spec.sections import parameter_rules
+from sweep.spec.study import SceneSpec, Spec
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 

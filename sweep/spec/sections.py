@@ -1,11 +1,365 @@
-"""Target, footprint, air and effects; accuracy, draws, storage and execution of a study."""
+"""Sections of a spec: the instrument, target, air and effects; accuracy, draws and execution.
 
-from typing import Any
+Values are SI inside; what users write carries units.
+"""
 
-import sweep.spec.declaring as of
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import cache
+from types import MappingProxyType
+from typing import Any, Self
+
+from pydantic import BaseModel, model_validator
+
+import sweep.spec.rules as of
+from sweep.model import waveform
 from sweep.model.accuracy import AUTOMATIC, COUNTED
+from sweep.model.beam import COUPLINGS, SINGLE_MODE
+from sweep.model.detectors import DETECTORS, FIXED
+from sweep.model.estimators import ESTIMATORS, PEAK_BIN
 from sweep.model.ground import LAWS
-from sweep.spec.parts import Part, with_modes, with_parameters
+from sweep.model.looks import COMBINED, COMMON, POWER, SPECKLES
+from sweep.model.threshold import PROCESSING, WAYS
+from sweep.spec.mistakes import near_miss
+from sweep.spec.parts import Part, rules_of, with_modes, with_parameters
+from sweep.spec.rules import Method, Rule, Window, broken
+
+ARCHITECTURES = ("homodyne", "heterodyne", "direct")
+_WATTS = ("1e-18 W", "1e9 W")
+_HERTZ = ("1 mHz", "1e15 Hz")
+_OHMS = ("1 uohm", "1e12 ohm")
+_WAIST = ("5 mm", "100 nm", "1 km")
+
+
+@with_parameters("instrument.laser")
+class Laser(Part):
+    """Transmitter: wavelength, power and beam."""
+
+    wavelength: float = of.length("Optical wavelength", "1550 nm", "1 nm", "100 m")
+    power: float = of.quantity("Transmitted optical power", "W", "1 W", *_WATTS)
+    beam_divergence: float = of.angle(
+        "Full angle of the beam, for a Gaussian beam between its 1/e^2 points; or give beam_waist",
+        "50 urad", "1e-12 rad", "90 deg", default=0.0, word="none",
+    )  # fmt: skip
+    beam_waist: float = of.length(
+        "1/e^2 radius of the beam as it leaves the telescope; or give beam_divergence",
+        *_WAIST, default=0.0, word="none",
+    )  # fmt: skip
+    beam_quality: float = of.number(
+        "M^2 of the sent beam; 1 for a beam at the limit of diffraction",
+        "1.2", "1", "1e6", default=1.0,
+    )  # fmt: skip
+    focus: float = of.length(
+        "Distance at which the telescope is focused; none: at infinity",
+        "20 m", "1 mm", "1e15 m", default=0.0, word="none",
+    )  # fmt: skip
+
+
+@with_parameters("instrument.chirp")
+class Chirp(Part):
+    """Segments of a shot: linear sweeps of the frequency, and the light without one."""
+
+    bandwidth: float = of.quantity("Frequency swept in one chirp", "Hz", "1 GHz", *_HERTZ)
+    start_frequency: float = of.quantity(
+        "Frequency at which the chirp starts", "Hz", "5.5 GHz", "0 Hz", "1e15 Hz"
+    )
+    duration: float = of.duration("Length of one segment", "500 us", "1 ps", "1e6 s")
+    segments: str = of.choice(
+        "Segments of a shot in the order of time: up- and down-chirp, and the light without a "
+        "chirp, which tells the Doppler shift alone. 'up down' is the triangle of automotive "
+        "lidars, whose beats are read as |f_d| < f_r. Direct detection has none without a chirp",
+        waveform.ORDERS,
+        waveform.ORDERS[0],
+    )
+    doppler_slope: float = of.number(
+        "Chirp rate of the segment 'doppler' over that of the segment 'up', with its sign: 0 for "
+        "light without a chirp",
+        "0.5", "-1000", "1000", default=0.0,
+    )  # fmt: skip
+    down_slope: float = of.number(
+        "Chirp rate of the segment 'down' over that of the segment 'up', with its sign: -1 for a "
+        "down-chirp as steep, 0.5 for a second up-chirp half as steep. With slopes other than 0 "
+        "and -1 range and velocity are a weighted least-squares fit to the beats of all segments "
+        "that are detected",
+        "-0.5", "-1000", "1000", default=-1.0,
+    )  # fmt: skip
+    gap: float = of.duration(
+        "Time from the end of a segment to the start of the next", "5 us", "0 s", "1e6 s",
+        default=0.0,
+    )  # fmt: skip
+
+
+@with_parameters("instrument.telescope")
+class Telescope(Part):
+    """Receiving optics."""
+
+    aperture: float = of.length("Diameter of the aperture", "25 mm", "1 um", "1 km")
+    optical_efficiency: float = of.number(
+        "Fraction of the collected light that reaches the detector", "0.8", "0", "1", default=1.0
+    )
+    coupling: str = of.choice(
+        "Light that mixes with the local oscillator: that of a single mode, or all in "
+        "the aperture, as the thesis has it; direct detection always has all",
+        COUPLINGS,
+        SINGLE_MODE,
+    )
+
+
+@with_parameters("instrument.receiver")
+class Receiver(Part):
+    """Detector, local oscillator and amplifiers."""
+
+    responsivity: float = of.quantity(
+        "Responsivity at unit gain", "A/W", "1.1 A/W", "1e-9 A/W", "1e3 A/W"
+    )
+    detector_bandwidth: float = of.quantity(
+        "Electrical bandwidth of the detector", "Hz", "400 MHz", *_HERTZ
+    )
+    optical_passband: float = of.length("Width of the optical filter", "25 nm", "0 m", "100 m")
+    noise_equivalent_power: float = of.quantity(
+        "Noise-equivalent power density of the detector",
+        "W/Hz^0.5", "5 pW/rtHz", "0 W/Hz^0.5", "100 W/Hz^0.5",
+    )  # fmt: skip
+    transimpedance: float = of.quantity(
+        "Gain of the transimpedance amplifier", "ohm", "7 kohm", *_OHMS
+    )
+    amplifier_bandwidth: float = of.quantity(
+        "Electrical bandwidth of the amplifier", "Hz", "400 MHz", *_HERTZ
+    )
+    amplifier_noise_current: float = of.quantity(
+        "Input-referred noise current of the amplifier, rms over its bandwidth",
+        "A", "25 nA", "0 A", "1 kA",
+    )  # fmt: skip
+    antialias_bandwidth: float = of.quantity(
+        "Bandwidth of a Butterworth low-pass between amplifier and ADC, 3 dB down there; none: no "
+        "filter but the poles of detector and amplifier. At most the sample rate",
+        "Hz", "250 MHz", *_HERTZ, default=0.0, word="none",
+    )  # fmt: skip
+    antialias_order: int = of.count(
+        "Order of that filter, whose stop band falls by 6 dB an octave and order", "6", "3", "12",
+        default=6,
+    )  # fmt: skip
+    noise_shape: str = of.choice(
+        "Density of the receiver's noise: shaped by its bandwidths as signals are, or "
+        "white over the record",
+        ("receiver", "white"),
+        "receiver",
+    )
+    architecture: str = of.choice("How the echo is detected", ARCHITECTURES, "homodyne")
+    record: str = of.choice(
+        "Samples of a record: real, or complex from I and Q behind a 90 deg hybrid, which keep the "
+        "beat's sign: no folding, twice as many bins, and the noise of two receivers in each; "
+        "coherent receivers only",
+        ("real", "complex"),
+        "real",
+    )
+    local_oscillator_power: float = of.quantity(
+        "Power of the local oscillator; direct detection has none", "W", "1 mW", *_WATTS,
+        default=1e-3,
+    )  # fmt: skip
+    local_oscillator_waist: float = of.length(
+        "1/e^2 radius at the telescope of the beam that the local oscillator would make; "
+        "none: the sent beam's. single_mode only",
+        *_WAIST, default=0.0, word="none",
+    )  # fmt: skip
+    mixing_efficiency: float = of.number(
+        "Heterodyne efficiency: share of the echo's power that mixes with the local "
+        "oscillator, as which it counts in the SNR",
+        "0.7", "1e-9", "1", default=1.0,
+    )  # fmt: skip
+    apd_gain: float = of.number("Avalanche gain; 1 for a PIN diode", "10", "1", "1e9", default=1.0)
+    excess_noise_factor: float = of.number(
+        "Excess noise factor of the avalanche", "2.5", "1", "1e9", default=1.0
+    )
+    noise_figure: float = of.quantity(
+        "Noise figure of the radio-frequency stages; heterodyne only",
+        "dB", "3 dB", "0 dB", "300 dB", default=1.0,
+    )  # fmt: skip
+    modulation_index: float = of.number(
+        "Depth of the intensity modulation; direct only", "0.9", "1e-9", "1", default=1.0
+    )
+    load_resistance: float = of.quantity(
+        "Load whose thermal noise limits direct detection; direct only",
+        "ohm", "50 ohm", *_OHMS, default=50.0,
+    )  # fmt: skip
+    temperature: float = of.quantity(
+        "Temperature of the load; direct only", "K", "290 K", "1 nK", "1e9 K", default=290.0
+    )
+
+
+class Detector(Part):
+    """Detector of bins in a spectrum, where whole spectra are drawn."""
+
+    kind: str = of.field(
+        Method(about="Detector: fixed threshold or CFAR", options=tuple(DETECTORS)), FIXED
+    )
+    training: int = of.count(
+        "Training cells of a CFAR detector, half of them on either side; even",
+        "32", "2", "100000", default=32,
+    )  # fmt: skip
+    guard: int = of.count(
+        "Guard cells on either side of the bin, which train nothing", "4", "0", "100000", default=4
+    )
+    rank: int = of.count(
+        "Rank of OS-CFAR's training cell, 1 for the least; auto: three quarters of them",
+        "24", "1", "100000", default=0, word="auto",
+    )  # fmt: skip
+    pfa: float = of.number(
+        "Design probability of a false alarm in a bin of noise, of CFAR detectors",
+        "1e-6", "1e-30", "0.5", default=1e-6,
+    )  # fmt: skip
+
+
+class Estimator(Part):
+    """Estimator that places a detected peak between bins, where whole spectra are drawn."""
+
+    kind: str = of.field(
+        Method(about="Estimator of the peak's frequency", options=tuple(ESTIMATORS)), PEAK_BIN
+    )
+
+
+def _looked_for(about: str, *rule: str) -> Any:
+    """Field of an end of the search band."""
+    whole = f"{about}, as a segment starts; a search band has all four ends, and without them the "
+    whole += "whole record is searched. What lies outside is neither detected nor a false alarm"
+    return of.quantity(whole, *rule, default=None)
+
+
+class Search(Part):
+    """Band of ranges and radial velocities that is searched: those bins that they put a beat in."""
+
+    min_range: float | None = _looked_for("Least range looked for", "m", "10 m", "0 m")
+    max_range: float | None = _looked_for("Largest range looked for", "m", "2 km", "0 m")
+    min_radial_velocity: float | None = _looked_for(
+        "Least radial velocity looked for, positive when closing", "m/s", "-5 m/s"
+    )
+    max_radial_velocity: float | None = _looked_for(
+        "Largest radial velocity looked for, positive when closing", "m/s", "40 m/s"
+    )
+
+
+def _design_pfa(where: str) -> Any:
+    """Field of a probability of a false alarm that the threshold is set by."""
+    about = f"Instead of tnr: probability that noise alone raises a false alarm in {where}"
+    return of.number(about, "1e-6", "1e-300", "0.99", default=None)
+
+
+@with_parameters("instrument.processing")
+class Processing(Part):
+    """Sampling, transform and threshold."""
+
+    sample_rate: float = of.quantity("Rate of the ADC", "Hz", "600 MHz", *_HERTZ)
+    fft_size: int = of.count("Points of the FFT", "2^17", "2", "2^30")
+    tnr: float | None = of.number(
+        "Threshold over the standard deviation of a noise-only bin's magnitude",
+        "10", "1e-6", "1e6", default=None,
+    )  # fmt: skip
+    threshold_to_mean: float | None = of.number(
+        "Instead of tnr: threshold over the mean of a noise-only bin's magnitude",
+        "4", "1e-6", "1e6", default=None,
+    )  # fmt: skip
+    design_pfa_bin: float | None = _design_pfa("a bin")
+    design_pfa_segment: float | None = _design_pfa("any bin of a segment, the up-chirp's")
+    design_pfa_shot: float | None = _design_pfa("any segment of a shot")
+    window: str = of.field(
+        Window(about="Window function, by scipy.signal's name, with its parameters"), "hamming"
+    )
+    acquisition_delay: float = of.duration(
+        "Time from the start of a segment to its first sample", "70 us", "0 s", "1e6 s", default=0.0
+    )
+    bins_counted: str = of.choice(
+        "Bins that may raise a false alarm: half the FFT, as a real record has, or all",
+        ("half", "all"),
+        "half",
+    )
+    detection: str = of.choice(
+        "Bins by which an echo is detected: any that it occupies, or the largest alone",
+        ("any_bin", "peak_bin"),
+        "any_bin",
+    )
+    shot_detection: str = of.choice(
+        "Segments in which a shot is detected: both chirps; or any two of three, which still tell "
+        "range and velocity where the third is missed",
+        waveform.SHOT_DETECTIONS,
+        waveform.BOTH_CHIRPS,
+    )
+    peaks: str = of.choice(
+        "Peaks of a segment that are reported: all that cross the threshold; or the strongest "
+        "alone, which may be another than the echo's (p_wrong_range); in grids without draws, and "
+        "in flights that draw whole spectra",
+        waveform.REPORTED_PEAKS,
+        waveform.ALL,
+    )
+    two_beats: str = of.choice(
+        "What is taken for granted where two beats of a real record tell range and velocity: far, "
+        "the range beat of a chirp exceeds the Doppler shift (and where one of them is of the "
+        "light without a chirp, the target is closing); fast, the Doppler shift exceeds them",
+        waveform.ASSUMPTIONS,
+        waveform.FAR_TARGET,
+    )
+    noise_bins: str = of.choice(
+        "Noise of bins: correlated as window and padding make it, and real at DC and "
+        "Nyquist; or independent and circular, as the thesis takes it",
+        ("correlated", "independent"),
+        "correlated",
+    )
+    search: Search = Search()
+    detector: Detector = Detector()
+    estimator: Estimator = Estimator()
+
+    @model_validator(mode="after")
+    def _one_threshold(self) -> Self:
+        """Refuse a threshold that is not set, or that is set in several ways."""
+        ways = [way.removeprefix(PROCESSING) for way in WAYS]
+        given = [way for way in ways if getattr(self, way) is not None]
+        if len(given) != 1:
+            rule = (
+                f"sets the threshold by {' and by '.join(given)}" if given else "has no threshold"
+            )
+            remedy = "keep one of them" if given else f"write 'tnr: 10', or {', '.join(ways[1:])}"
+            raise broken(rule, remedy)
+        return self
+
+
+class LooksOfShot(Part):
+    """Several records of each segment, from which a shot is detected: the waveform N times over."""
+
+    number: int = of.count(
+        "Records of each segment. A shot lasts so many times as long, and false alarms are those "
+        "of all its records together",
+        "8", "1", "256", default=1,
+    )  # fmt: skip
+    combine: str = of.choice(
+        "Detection from several records: by their mean power, by the number of those that cross, "
+        "or by their sum in amplitude, with the phases that a steady velocity makes put right. "
+        "tnr and threshold_to_mean are over the noise of one record, or of the mean of a sum",
+        COMBINED,
+        POWER,
+    )
+    votes: int = of.count(
+        "Records that must cross in a bin; binary only", "3", "1", "256", default=1
+    )
+    speckle: str = of.choice(
+        "Speckle of the records: common to all, as they follow one another at once; or "
+        "independent, where the beam moves on by its own width from one to the next",
+        SPECKLES,
+        COMMON,
+    )
+
+
+class Instrument(Part):
+    """A Doppler lidar."""
+
+    laser: Laser
+    chirp: Chirp
+    telescope: Telescope
+    receiver: Receiver
+    processing: Processing
+    looks: LooksOfShot = LooksOfShot()
+
+
+# Target, footprint, air and effects; accuracy, draws, storage and execution of a study
 
 
 def sunlight(on: str) -> Any:
@@ -16,9 +370,8 @@ def sunlight(on: str) -> Any:
     )  # fmt: skip
 
 
-def share_scattered() -> Any:
-    """Field of a reflectance."""
-    return of.number("Fraction of light scattered back", "0.1", "0", "1")
+SHARE_SCATTERED = of.number("Fraction of light scattered back", "0.1", "0", "1")
+"""Field of a reflectance."""
 
 
 @with_parameters("target")
@@ -29,7 +382,7 @@ class Target(Part):
     grazing_angle: float = of.angle(
         "Angle between beam and surface, 90 deg along the normal", "15 deg", "1e-6 deg", "90 deg"
     )
-    reflectance: float = share_scattered()
+    reflectance: float = SHARE_SCATTERED
     reflectance_law: str = of.choice(
         "How it scatters: Lambertian, as regolith, or as the thesis has it", LAWS, "lambert"
     )
@@ -161,3 +514,54 @@ class Execution(Part):
         remedy="an address is no part of a spec, which a stranger may have written: "
         "say --scheduler ADDRESS, or --cluster FILE",
     )
+
+
+# Fields by dotted path: what an axis may vary
+
+SECTIONS: dict[str, type[BaseModel]] = {
+    "instrument": Instrument,
+    "target": Target,
+    "atmosphere": Atmosphere,
+    "footprint": Footprint,
+    "accuracy": Accuracy,
+}
+
+
+@cache
+def parameter_rules() -> MappingProxyType[str, Rule]:
+    """Rule of every parameter that an axis may vary, by dotted path."""
+    rules: dict[str, Rule] = {}
+    for section, model in SECTIONS.items():
+        rules |= rules_of(model, section)
+    return MappingProxyType(rules)
+
+
+def default_of(path: str) -> Any:
+    """Default of a parameter, SI; None where it has none."""
+    section, *rest = path.split(".")
+    model: Any = SECTIONS[section]
+    for name in rest[:-1]:
+        model = model.model_fields[name].annotation
+    field = model.model_fields[rest[-1]]
+    return None if field.is_required() else field.default
+
+
+def short_name(path: str) -> str:
+    """Last part of a parameter's path; of what a part is, the part's own name."""
+    *parts, last = path.split(".")
+    return parts[-1] if last == "kind" and parts else last
+
+
+def parameter_suggestion(path: str, known: Iterable[str] | None = None) -> str:
+    """Suggestion for a path that names no parameter; of those known, all by default."""
+    rules = list(parameter_rules() if known is None else known)
+    tail = short_name(path)
+    same_tail = [known for known in rules if short_name(known) == tail]
+    if len(same_tail) == 1:
+        return f"did you mean '{same_tail[0]}'?"
+    by_tail = {short_name(known): known for known in rules}
+    suggestion = near_miss(path, rules) or near_miss(tail, by_tail)
+    for short, known in by_tail.items():
+        suggestion = suggestion.replace(f"'{short}'", f"'{known}'")
+    *others, last = SECTIONS
+    return suggestion or f"axes take fields of {', '.join(others)} and {last}"

@@ -1,53 +1,85 @@
-"""A study of a flat target over a grid, and what every study has, however it is declared."""
+"""A study of a flat target over a grid, or of a flight over a scene; and what both have."""
 
 from __future__ import annotations
 
 import copy
 import json
 import math
-from collections.abc import Iterator, Mapping
-from functools import cached_property
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from pydantic import ConfigDict, Field, PrivateAttr, ValidationError
 
-import sweep.spec.declaring as of
-from sweep.model import VERSION, looks, waveform
+import sweep.spec.rules as of
+from sweep.model import VERSION, accuracy, beam, looks, waveform
 from sweep.model.effects import circulator_leak
+from sweep.model.ground import pattern as pattern_of
 from sweep.model.outputs import STRONGEST_OUTPUTS
+from sweep.model.resolution import BEAMLETS, is_open, rays_needed
 from sweep.model.threshold import WAYS
 from sweep.model.waveform import ENDS
-from sweep.spec.axes import Axis, Member, paths_on_axes, read_axes
-from sweep.spec.fields import SECTIONS, parameter_rules, parameter_suggestion, short_name
-from sweep.spec.figures import Figure, figure_findings
-from sweep.spec.generators import in_units
+from sweep.spec.axes import Axis, Member, in_units, paths_on_axes, read_axes
+from sweep.spec.figures import Figure, SceneFigure, figure_findings, scene_figure_findings
+from sweep.spec.flight import AnyScanner, Platform, shots_a_cycle
 from sweep.spec.grid_rules import (
     Condition,
     Grid,
     grid_findings,
     is_method,
+    not_in_flights,
     spectra_findings,
     without_draws,
 )
-from sweep.spec.identity import axis_identity, digest
-from sweep.spec.instrument import Instrument
+from sweep.spec.identity import axis_identity, digest, geometry_of
 from sweep.spec.mistakes import Finding, Location, Mistake, SpecError, dotted, shown
-from sweep.spec.parts import Part, fill, leaves, read_as, values_of
-from sweep.spec.reading import Document, findings_of, plain, resolve_instrument
+from sweep.spec.parts import Files, Part, fill, leaves, named_files, read_as, values_of
+from sweep.spec.reading import (
+    Document,
+    findings_of,
+    parsed,
+    plain,
+    read_document,
+    resolve_instrument,
+)
 from sweep.spec.rules import Numeric, Rule, Special
+from sweep.spec.scene import (
+    ErrorFloor,
+    Interface,
+    Navigation,
+    Scene,
+    SceneDraws,
+    SceneStorage,
+    World,
+    build,
+    surfaces_of,
+)
+from sweep.spec.scene_check import axis_findings, parameter_findings, scene_findings, why_not
 from sweep.spec.sections import (
+    SECTIONS,
     Accuracy,
     Atmosphere,
     Draws,
     Effects,
     Execution,
     Footprint,
+    Instrument,
     Storage,
     Target,
+    parameter_rules,
+    parameter_suggestion,
+    short_name,
 )
 from sweep.units import QuantityError
+
+if TYPE_CHECKING:
+    from sweep.model.geometry.mesh import Surface
+    from sweep.model.geometry.platform import Flight
+    from sweep.model.geometry.scanner import PointingJitter, Scanner
+
 
 LARGEST_GRID = 10**15
 FILES = "files"
@@ -217,13 +249,7 @@ class Study(Part):
         return []
 
     def member(self, name: str) -> Member:
-        """Parameter on an axis, by its coordinate's name or dotted path.
-
-        Raises
-        ------
-        KeyError
-            Where no axis has it.
-        """
+        """Parameter on an axis, by its coordinate's name or dotted path; or a KeyError."""
         for axis in self.axes:
             for member in axis.members:
                 if name in (member.name, member.path):
@@ -233,12 +259,7 @@ class Study(Part):
     def coordinate_value(self, name: str, written: object) -> float | int | str:
         """Written value of a coordinate, in the unit that the coordinate is displayed in.
 
-        Raises
-        ------
-        KeyError
-            Where no axis has the coordinate.
-        QuantityError
-            Where the value cannot be read.
+        A KeyError where no axis has it, a `QuantityError` where the value cannot be read.
         """
         member = self.member(name)
         rule = parameter_rules()[member.path]
@@ -252,18 +273,18 @@ class Study(Part):
         Title, question, figures and execution are no part of it, nor are values that an axis
         overrides. The order of the axes is: it lays out the arrays.
         """
-        sections = [
-            name
-            for name in ("draws", "error_floor", "navigation", "storage")
-            if name in type(self).model_fields
-        ]
+        sections = ("draws", "error_floor", "navigation", "storage")
         return {
             "model": VERSION,
             "parameters": self.parameters_off_axes(),
             "axes": [axis_identity(axis) for axis in self.axes],
             "effects": self.modes(),
             "seed": self.seed,
-        } | {name: values_of(getattr(self, name)) for name in sections}
+        } | {
+            name: values_of(getattr(self, name))
+            for name in sections
+            if name in type(self).model_fields
+        }
 
     def parameters_off_axes(self) -> dict[str, float | int | str]:
         """SI values of the parameters that no axis overrides, by dotted path."""
@@ -380,7 +401,11 @@ class Spec(Study):
                 rule = "has chances in closed form alone, and the study has draws"
                 findings.append(grid.finding(waveform.PEAKS, rule, "take all, or no draws"))
             findings += () if draws.any else without_draws(grid)
-            findings += _number_findings(draws)
+            if draws.number and draws.limit:
+                rule = f"stands beside draws.number, {draws.number}: only one of them can say "
+                remedy = "keep limit to draw until accuracy.tolerance is met, or number to draw "
+                rule, remedy = f"{rule}how much to draw", f"{remedy}so many times"
+                findings.append(Finding(("draws", "limit"), rule, remedy, draws.limit))
         return findings
 
     @cached_property
@@ -405,9 +430,210 @@ class Spec(Study):
         return identity
 
 
-def _number_findings(draws: Draws) -> Iterator[Finding]:
-    """Report a fixed number of draws given along with a limit."""
-    if draws.number and draws.limit:
-        rule = f"stands beside draws.number, {draws.number}: only one of them can say how much to "
-        remedy = "keep limit to draw until accuracy.tolerance is met, or number to draw so many "
-        yield Finding(("draws", "limit"), f"{rule}draw", f"{remedy}times", draws.limit)
+class SceneSpec(Study):
+    """A study of a flight over a scene, every value read and checked.
+
+    Made by `load` from a file and by `from_mapping` from plain data; values are SI.
+    """
+
+    scene: Scene
+    platform: Platform
+    scanners: dict[str, AnyScanner] = Field(description="Scan patterns by name")
+    draws: SceneDraws = SceneDraws()
+    error_floor: ErrorFloor = ErrorFloor()
+    navigation: Navigation = Navigation()
+    interface: Interface = Interface()
+    storage: SceneStorage = SceneStorage()
+    figures: tuple[SceneFigure, ...] = Field(
+        default=(), description="Figures and tables of the results"
+    )
+
+    @classmethod
+    def from_document(cls, document: Document, base: Path | None) -> Self:
+        """Spec from a document, which is changed, or all of its mistakes at once."""
+        spec = super().from_document(document, base)
+        if base is not None:
+            files = Files(base)
+            spec._base = base
+            named = [(file, rule) for _, rule, file in named_files(spec)]
+            spec._digests = {file: rule.digest(files.path(file)) for file, rule in named}
+        return spec
+
+    @classmethod
+    def further_findings(
+        cls, written: Mapping[str, Any], grid: Grid, base: Path | None, axes_are_whole: bool
+    ) -> list[Finding]:
+        """Mistakes in scene, flight, files, random effects and figures."""
+        draws = read_as(SceneDraws, written.get("draws", {})) or SceneDraws()
+        return [
+            *scene_findings(written, base),
+            *axis_findings(grid),
+            *not_in_flights(grid, draws),
+            *scene_figure_findings(written, grid.axes if axes_are_whole else None),
+        ]
+
+    @classmethod
+    def may_vary(cls, path: str) -> bool:
+        """Return true if an axis of this kind of study may set the parameter at a path."""
+        return not why_not(path)[0]
+
+    def unvaried(self, path: str, value: object, location: Location) -> list[Finding]:
+        """Mistakes in a parameter taking a value without the geometry changing."""
+        return parameter_findings(self.parameters(), path, [value], location)
+
+    @property
+    def base(self) -> Path:
+        """Folder that the scene's files are relative to."""
+        return self._base
+
+    @property
+    def files(self) -> Files:
+        """The scene's files."""
+        return Files(self._base, self._digests)
+
+    def parameters(self) -> dict[str, float | int | str]:
+        """SI values of all parameters by dotted path; of those on axes, the value off the axis."""
+        parameters = super().parameters()
+        if not self.draws.whole_spectra:
+            parameters = {p: v for p, v in parameters.items() if not is_method(p)}
+        rays = rays_needed(parameters, accuracy.Accuracy.of(parameters))
+        return parameters | {
+            "target.solar_irradiance": self.scene.solar_irradiance,
+            BEAMLETS: self.footprint.beamlets or rays,
+        }
+
+    @property
+    def rays_by_tolerance(self) -> bool:
+        """True if the tolerance says how many rays there are of each shot."""
+        return self.footprint.beamlets == 0 and is_open(self.parameters())
+
+    def surfaces(self) -> tuple[Surface, ...]:
+        """Surfaces by their numbers; no file is looked at."""
+        return surfaces_of(self.scene)
+
+    def world(self) -> World:
+        """Build the scene; a `SceneError` for an unfit file or object."""
+        flight = self.flight()
+        return build(self.scene, self.files, (flight.start, flight.stop))
+
+    def flight(self) -> Flight:
+        """Movement of the instrument in the scene's frame; a `SceneError` for an unfit table."""
+        return self.platform.flight(self.files)
+
+    def scan(self, name: str) -> Scanner:
+        """Return the scan pattern of a scanner."""
+        return self.scanners[name].pattern()
+
+    def shots_a_cycle(self, name: str) -> int:
+        """Shots of a measurement cycle of a scanner."""
+        return shots_a_cycle(self.scan(name))
+
+    def cycles(self, name: str) -> int:
+        """Whole measurement cycles of a scanner, all of whose shots begin during the flight."""
+        flight, scan = self.flight(), self.scan(name)
+        return scan.number(flight.stop - flight.start) // shots_a_cycle(scan)
+
+    @property
+    def pattern(self) -> str:
+        """Arrangement of the beamlets, `sweep.model.footprint.beamlets`'s word."""
+        return pattern_of(self.parameters())
+
+    def footprint_angles(self) -> Callable[[np.ndarray], beam.Angles] | None:
+        """Angles of the beam's footprint by range; None where its divergence says all."""
+        p = self.parameters()
+        return None if beam.is_thesis(p) else partial(beam.angles, p)
+
+    def interface_with(self, fields: Mapping[str, object]) -> Interface:
+        """Return the unit's interface with some fields set anew, written as in a spec."""
+        written = {path[-1]: rule.written(v) for path, rule, v in leaves(self.interface)}
+        try:
+            return Interface.model_validate({**written, **fields})
+        except ValidationError as error:
+            findings = findings_of(error, Interface)
+        placed = [replace(each, location=("interface", *each.location)) for each in findings]
+        raise SpecError(map(Document({}).mistake, placed))
+
+    def pointing_jitter(self) -> PointingJitter | None:
+        """Random turns of the beams; None where there are none."""
+        from sweep.model.geometry.scanner import PointingJitter
+
+        sigma = self.platform.jitter
+        return PointingJitter(sigma, self.seed) if sigma else None
+
+    @property
+    def rotating(self) -> bool:
+        """True if any body of the scene turns."""
+        moving = (getattr(thing, "motion", None) for thing in self.scene.objects.values())
+        return any(motion is not None and motion.attitude.kind != "fixed" for motion in moving)
+
+    def geometry(self, name: str) -> dict[str, Any]:
+        """Content of what is seen through one scanner: all that rays depend on, and no more.
+
+        Names are no part of it, nor are reflectances, nor where files are: they count by content.
+        """
+        p = self.parameters()
+        seen = geometry_of(self.scene, self.platform, self.scanners[name], self._digests)
+        return seen | {
+            "model": VERSION,
+            "beamlets": p[BEAMLETS],
+            "pattern": self.pattern,
+            "beam": {beam.DIVERGENCE: p[beam.DIVERGENCE]} if beam.is_thesis(p) else beam.shape(p),
+            "seed": self.seed if self.platform.jitter else 0,
+            "rotation": self.modes()["rotation"] != "off",
+        }
+
+    def geometry_id(self, name: str) -> str:
+        """Hash of the geometry, 32 hexadecimal digits."""
+        return digest(self.geometry(name))
+
+    def identity(self) -> dict[str, Any]:
+        """Content that makes the study this one, in SI values.
+
+        Files count by content, and not by where they are. The order of objects is part of it: it
+        numbers the surfaces. A number of rays that follows from the tolerance counts as 0.
+        """
+        digests, counted = self._digests, {BEAMLETS: 0} if self.rays_by_tolerance else {}
+        return super().identity() | {
+            "parameters": self.parameters_off_axes() | counted,
+            "objects": list(self.scene.objects),
+            "scene": values_of(self.scene, digests=digests),
+            "platform": values_of(self.platform, digests=digests),
+            "scanners": {
+                path: value
+                for name, scanner in self.scanners.items()
+                for path, value in values_of(scanner, (name,), digests).items()
+            },
+        }
+
+
+# Studies from files and from what a store holds, whichever their kind
+
+
+def load(path: str | Path) -> Spec | SceneSpec:
+    """Study in a YAML file: one of a flat target, or of a scene where it has a ``scene``.
+
+    Raises
+    ------
+    SpecError
+        With every mistake in it, each with its path, its line and a remedy.
+    """
+    document = read_document(Path(path))
+    return _kind(document.value).from_document(document, Path(path).parent)
+
+
+def from_stored(text: str, base: Path | str | None = None) -> Spec | SceneSpec:
+    """Study from the JSON that its `to_json` gave, as `Study.from_stored`."""
+    return _kind(json.loads(text)).from_stored(text, base)
+
+
+def _kind(written: Any) -> type[Spec] | type[SceneSpec]:
+    return SceneSpec if isinstance(written, dict) and "scene" in written else Spec
+
+
+def written(fields: Mapping[str, str]) -> dict[str, Any]:
+    """Values as a file has them, from text by path: ``{"axes.target.range": "[1 km, 2 km]"}``."""
+    text = "".join(f"{json.dumps(path)}: {value}\n" for path, value in fields.items())
+    document = parsed(text, Path("--set"))
+    if document.findings:
+        raise SpecError(map(document.mistake, document.findings))
+    return document.value

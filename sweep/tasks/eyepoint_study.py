@@ -22,7 +22,7 @@ from sweep.tasks.study import FILLS, TILE_SHOTS, ArrayLayout, BlockGrid, Results
 if TYPE_CHECKING:
     from sweep.model.eyepoints import Eyepoints
     from sweep.spec import SceneSpec
-    from sweep.spec.world import World
+    from sweep.spec.scene import World
 
 #: Shots and beamlets of a block, as far as whole cycles allow.
 BLOCK_SHOTS = 4096

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from sweep.model.eyepoints import Eyepoints
     from sweep.model.geometry.mesh import Surface
     from sweep.spec import SceneSpec
-    from sweep.spec.world import World
+    from sweep.spec.scene import World
 
     Cloud = Callable[[tuple[str, ...], Eyepoints, np.ndarray, np.ndarray], Results]
     """Results of shots with some effects, by their eyepoints, numbers and flags."""

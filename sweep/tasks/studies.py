@@ -17,9 +17,9 @@ import numpy as np
 
 from sweep.scenes.files import SceneError
 from sweep.spec import SceneSpec, Spec, SpecError, difference, from_stored
-from sweep.spec.fields import parameter_rules
 from sweep.spec.grid_rules import is_method
 from sweep.spec.mistakes import Mistake
+from sweep.spec.sections import parameter_rules
 from sweep.storage import logs, opening
 from sweep.storage.locations import Location, located, real
 from sweep.storage.opening import open_group

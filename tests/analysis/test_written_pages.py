@@ -19,7 +19,7 @@ from sweep.model.outputs import (
     SPECTRA_OUTPUTS,
 )
 from sweep.spec import Draws, Spec
-from sweep.spec.instrument import Detector
+from sweep.spec.sections import Detector
 from sweep.tasks.spectra_export import TOLD
 
 DRAWS_PAGE, DETECTORS, EFFECTS_PAGE = (

@@ -13,9 +13,9 @@ from random_studies import CHEAP, TIMING, axes_of, drop, plain_paths, rules
 from sweep.spec import SceneSpec, SpecError
 from sweep.spec.flight import Platform
 from sweep.spec.grounds import Ground
-from sweep.spec.instrument import Instrument
 from sweep.spec.parts import Files, kind_of, models_at
 from sweep.spec.scene import AnyObject
+from sweep.spec.sections import Instrument
 
 GROUND_KINDS = frozenset(kind_of(m) for m in models_at(AnyObject) if issubclass(m, Ground))
 FILES = {

@@ -12,9 +12,9 @@ from written_values import STYLES, Style, cheaper, inside, numbers, spelled, uni
 
 from sweep.model import beam
 from sweep.spec import Spec, SpecError
-from sweep.spec.fields import default_of, parameter_rules
 from sweep.spec.grid_rules import DELAY, DURATION, RANGE, SAMPLE_RATE
 from sweep.spec.rules import Numeric, Rule
+from sweep.spec.sections import default_of, parameter_rules
 from sweep.units import QuantityError
 
 CHEAP: dict[str, Any] = {
@@ -209,7 +209,7 @@ def generator(draw: st.DrawFn, rule: Numeric, kind: str, spread: float) -> Any:
 
 def _all_distinct(rule: Numeric, listed: list[Any]) -> bool:
     """Whether a mixed list holds no value twice."""
-    from sweep.spec.generators import read_pieces
+    from sweep.spec.axes import read_pieces
     from sweep.spec.mistakes import Rejected
 
     try:

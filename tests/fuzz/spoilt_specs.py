@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import yaml
 from hypothesis import strategies as st
 
-from sweep.spec.fields import parameter_rules
 from sweep.spec.rules import Numeric
+from sweep.spec.sections import parameter_rules
 
 
 class Spoilt(NamedTuple):

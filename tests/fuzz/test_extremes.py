@@ -5,8 +5,8 @@ from judging import judge
 from plain_study import plain
 from spoilt_specs import dumped
 
-from sweep.spec.fields import parameter_rules
 from sweep.spec.rules import Numeric
+from sweep.spec.sections import parameter_rules
 
 RULES = {path: rule for path, rule in parameter_rules().items() if isinstance(rule, Numeric)}
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 
-from sweep.spec import rules
+from sweep.spec import flight, rules
 from sweep.spec.rules import Choice, Method, Numeric, Rule, Text
 from sweep.units import _PREFIXED, QuantityError, Unit
 
@@ -241,9 +241,9 @@ def several(rule: rules.Several, decades: float) -> st.SearchStrategy[list[Any]]
     return listed.filter(lambda written: _reads(rule, written))
 
 
-def _beams(rule: rules.Beams, decades: float) -> st.SearchStrategy[list[Any]]:
+def _beams(rule: flight.Beams, decades: float) -> st.SearchStrategy[list[Any]]:
     """A few beams, by angles or by vectors."""
-    steered = several(rules.STEERED, min(decades, 0.3))
+    steered = several(flight.STEERED, min(decades, 0.3))
     pointed = st.lists(st.sampled_from(["-1", 0.25, "−0.5", 0]), min_size=2, max_size=2)
     return st.lists(st.one_of(steered, pointed.map(lambda two: [*two, -1])), min_size=1, max_size=4)
 
@@ -272,7 +272,7 @@ def values(rule: Rule, decades: float) -> st.SearchStrategy[Any]:
         return texts(rule)
     if isinstance(rule, rules.Flag):
         return st.booleans()
-    if isinstance(rule, rules.Beams):
+    if isinstance(rule, flight.Beams):
         return _beams(rule, decades)
     if isinstance(rule, rules.Several):
         return several(rule, decades)

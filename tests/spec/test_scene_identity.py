@@ -13,10 +13,10 @@ from written_scenes import BOULDERS, RELIEF, RICH, with_object, written
 
 from sweep.scenes.files import SceneError
 from sweep.spec import SceneSpec, difference, from_stored
-from sweep.spec.fields import SECTIONS
 from sweep.spec.grounds import OPTICAL
 from sweep.spec.identity import ROOTS, field_rules
 from sweep.spec.parts import all_parts, fields_of, leaves, rule_of
+from sweep.spec.sections import SECTIONS
 
 
 def spec_of(mapping, base="."):

@@ -83,6 +83,8 @@ OBJECTS = [
     (TREES, {"on": "thing"}, "on", "is no ground (you wrote 'thing'); the grounds are ground"),
     (TREES, {"trunk": ...}, "trunk", "is missing; write 'trunk:' with reflectance"),
     (TREES, {"tree": {"crown_base": "12 m"}}, "tree.crown_base", "must lie below the top, 12 m"),
+    (TREES, {"tree": {"height": "2 m"}}, "tree.crown_base",
+     "is 3 m by default, and must lie below the top, 2 m; lower it"),
     (BOULDERS, {"largest": "0.5 m"}, "largest", "must exceed the smallest diameter, 0.5 m"),
     (SPHERE, {"motion": MOVING}, "position", "stands beside a motion"),
     (BOX, {"motion": SHORT}, "motion.path", "lasts from 0 to 9 s, and the flight from 0 to 10 s"),
@@ -207,8 +209,8 @@ def test_an_axis_of_radiometry_is_read_and_stands_in_for_its_field():
 
 
 def test_no_parameter_that_may_vary_bears_the_name_of_an_array():
-    from sweep.spec.fields import parameter_rules
     from sweep.spec.scene_check import STORED
+    from sweep.spec.sections import parameter_rules
 
     free = {p.rsplit(".", 1)[-1] for p in parameter_rules() if SceneSpec.may_vary(p)}
     assert len(free) > 20 and not free & STORED

@@ -13,11 +13,11 @@ from written_specs import written
 from sweep.model import window as model_window
 from sweep.model.ground import LAWS
 from sweep.spec import SceneSpec, Spec, SpecError, json_schema, load
-from sweep.spec.fields import parameter_rules
 from sweep.spec.identity import digest
 from sweep.spec.parts import all_parts, fields_of, rule_of
 from sweep.spec.reading import read_document
 from sweep.spec.rules import WINDOWS, Numeric
+from sweep.spec.sections import parameter_rules
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 IDS = {

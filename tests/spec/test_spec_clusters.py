@@ -24,7 +24,7 @@ def changed(**changes):
 @pytest.mark.parametrize(
     ("mapping", "told"),
     [
-        ({}, "kind: is missing; write 'kind:' and one of local, scheduler, ssh"),
+        ({}, "lacks its kind; write kind: and one of local, scheduler, ssh"),
         (changed(kind="slrum"), "kind: must be one of local"),
         (changed(kind="slrum"), "did you mean 'slurm'?"),
         (changed(kind=3), "kind: must be one of local"),
@@ -50,7 +50,8 @@ def changed(**changes):
         (changed(environment={"A B": "1"}), "environment: holds 'A B', which is no name"),
         (changed(environment={"A": "it's"}), "environment: holds a quote"),
         (changed(security={"ca": "/no/ca"}), "security.certificate: is missing"),
-        (changed(hosts=["a"]), "hosts: is no field"),
+        (changed(hosts=["a"]), "hosts: is no field; the fields here are security, environment"),
+        (changed(walltime="1 h"), "walltime: is no field; did you mean 'job.walltime'?"),
         ({"kind": "scheduler", "address": "10.0.0.5"}, "write e.g. 'tcp://10.0.0.5:8786'"),
         ({"kind": "scheduler", "address": "tls://a:1"}, "address: is encrypted, and no certif"),
         ({"kind": "local", "worker": {"memory": "lots"}}, "worker.memory: must be a number"),

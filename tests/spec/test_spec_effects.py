@@ -16,13 +16,11 @@ from sweep.model.effects.catalogue import EFFECTS, NAMES, PARAMETERS
 from sweep.model.effects.effect import Parameter
 from sweep.spec import SceneSpec, Spec, SpecError, difference, from_stored, json_schema
 from sweep.spec.axes import read_axes
-from sweep.spec.fields import parameter_rules
 from sweep.spec.grid_rules import Grid
-from sweep.spec.instrument import Laser
 from sweep.spec.parts import Part, rule_of, with_modes, with_parameters
 from sweep.spec.reading import read_document
 from sweep.spec.rules import Numeric
-from sweep.spec.sections import Effects
+from sweep.spec.sections import Effects, Laser, parameter_rules
 
 BROUGHT = pytest.mark.parametrize("parameter", PARAMETERS, ids=lambda p: p.path)
 RANDOM = {"target.roughness": "speckle", "target.pointing_jitter": "pointing_jitter",
@@ -133,7 +131,7 @@ def test_a_new_parameter_or_effect_touches_no_section(monkeypatch):
 
 
 def test_a_section_keeps_its_name_and_words():
-    assert (Laser.__name__, Laser.__module__) == ("Laser", "sweep.spec.instrument")
+    assert (Laser.__name__, Laser.__module__) == ("Laser", "sweep.spec.sections")
     assert Laser.__doc__ == "Transmitter: wavelength, power and beam."
     assert next(iter(Laser.model_fields)) == "wavelength"
 

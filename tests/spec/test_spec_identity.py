@@ -12,9 +12,9 @@ import sweep.spec.study
 from sweep.model.threshold import PFA_BIN, PFA_SEGMENT, PFA_SHOT, TNR, WAYS
 from sweep.model.waveform import ENDS, PEAKS
 from sweep.spec import Spec, difference
-from sweep.spec.fields import SECTIONS, default_of, parameter_rules
 from sweep.spec.grid_rules import is_method
 from sweep.spec.rules import Choice
+from sweep.spec.sections import SECTIONS, default_of, parameter_rules
 
 AXES = {"target.range": {"step": ["1 m", "100 m", "1 m"]}, "instrument.laser.power": ["1 W", "3 W"]}
 

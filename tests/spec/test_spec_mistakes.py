@@ -2,8 +2,8 @@ import pytest
 from written_specs import written
 
 from sweep.spec import Spec, SpecError, load
-from sweep.spec.fields import parameter_rules
 from sweep.spec.rules import Numeric
+from sweep.spec.sections import parameter_rules
 
 
 def mistakes_of(mapping):
@@ -184,6 +184,10 @@ FIGURES = [
      "must be a mapping of coordinates"),
     ({"kind": "slices", "variable": "pd_shot", "x": "range", "name": "../x"}, "figures[0].name",
      "take letters"),
+    ({"kind": "threshold_table"}, "figures[0].by",
+     "by: is 'tnr' by default, which is no coordinate of this study; the coordinates are range"),
+    ({"kind": "threshold_table", "by": "tnr"}, "figures[0].by",
+     "by: is no coordinate of this study (you wrote 'tnr'); the coordinates are range"),
     ({"kind": "threshold_table", "by": "range", "printed": [[1, "x"]]}, "figures[0].printed",
      "must be a number"),
     ("surface", "figures[0]", "must be a mapping"),

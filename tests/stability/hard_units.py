@@ -12,8 +12,8 @@ from cases import Family
 from table_shots import ROOT
 
 from sweep.spec import Spec
-from sweep.spec.fields import parameter_rules
 from sweep.spec.rules import Numeric
+from sweep.spec.sections import parameter_rules
 from sweep.units import read_quantity
 
 FAMILY = Family(

@@ -5,8 +5,8 @@ import pytest
 from table_shots import ROOT, study
 
 from sweep.spec import Spec, SpecError
-from sweep.spec.fields import parameter_rules
 from sweep.spec.rules import Numeric
+from sweep.spec.sections import parameter_rules
 
 MEANINGLESS = {
     "0": ("at least 1", (

@@ -9,9 +9,9 @@ import numpy as np
 import xarray as xr
 
 from sweep.spec import SceneSpec, Spec, from_stored
-from sweep.spec.fields import parameter_rules
-from sweep.spec.generators import in_units
+from sweep.spec.axes import in_units
 from sweep.spec.rules import Numeric
+from sweep.spec.sections import parameter_rules
 from sweep.units import QuantityError, read_quantity
 
 CLOSE = 1e-9
