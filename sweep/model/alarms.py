@@ -63,23 +63,9 @@ def _correlation(window: Window, fft_size: int, apart: int) -> float:
 def independent_bins(
     bins: ArrayLike, *, level: ArrayLike, correlation: float, looks: Looks = ONE
 ) -> np.ndarray:
-    """Return the number of independent bins that raise an alarm as often as n adjacent ones.
+    """Return the number, 0..n, of independent bins that raise an alarm as often as n adjacent ones.
 
-    Parameters
-    ----------
-    bins : array_like
-        Number n of bins, >= 0. Broadcast against `level`.
-    level : array_like
-        Threshold over sigma, > 0.
-    correlation : float
-        Correlation of neighbouring bins, 0..1 (:func:`neighbour_correlation`).
-    looks : Looks
-        Records by which a bin is detected.
-
-    Returns
-    -------
-    ndarray
-        0..n; n itself for a correlation of 0.
+    By the threshold over sigma, and the correlation of neighbours (:func:`neighbour_correlation`).
     """
     bins = np.asarray(bins, float)
     share = _share(np.asarray(level, float), correlation, looks)
@@ -130,14 +116,8 @@ def noise_filter(window: Window, fft_size: int, bins: int) -> tuple[np.ndarray, 
     """Weights that make the noise of adjacent bins of independent numbers, one each fs/L.
 
     The noise of a bin at y [bins of fs/L] is sum_j W(y - j) z_j, as the transform of a record is
-    that of its own bins. In phase with the middle of a line's main lobe W is real.
-
-    Returns
-    -------
-    weights : (bins, TAPS) ndarray
-        Of bins 0 .., their squares' sum 1.
-    start : (bins,) int64 ndarray
-        Number of each bin's first.
+    that of its own bins. In phase with the middle of a line's main lobe W is real. Returns weights
+    (bins, TAPS), their squares' sum 1, and the number of each bin's first (bins,).
     """
     length = min(window.length, 512) // 2 * 2
     taper = samples(window.name, max(length, 1))

@@ -28,18 +28,10 @@ from sweep.model.waveform import RANGES, VELOCITIES
 def band_of(p: Mapping[str, Any], points: int | None = None) -> np.ndarray | None:
     """First bin and number of bins that are searched, (3, 2, points) int64; None for all.
 
-    By segment: up, Doppler, down. Bins are 0..N/2, of a complex record -N/2 .. N/2 - 1.
+    By segment: up, Doppler, down. Bins are 0..N/2, of a complex record -N/2 .. N/2 - 1. Points
+    share their words and sizes, and have all or none of :data:`ENDS`. Without ``points``: (3, 2,
+    ...).
 
-    Parameters
-    ----------
-    p : mapping
-        Dotted path to SI scalar or array, of points that share their words and sizes; all or none
-        of :data:`ENDS` [m; m/s, positive when closing].
-    points : int, optional
-        Number of points, where the values may be those of all; (3, 2, ...) without it.
-
-    Examples
-    --------
     >>> given = {
     ...     "instrument.receiver.architecture": "homodyne", "instrument.laser.wavelength": 1.55e-6,
     ...     "instrument.chirp.start_frequency": 0.0, "instrument.chirp.bandwidth": 1e9,

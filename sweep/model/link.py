@@ -108,18 +108,16 @@ def receiver_noise(
     """Noise of receivers of an architecture, from :data:`NOISY`, (n,) or scalars.
 
     The local oscillator's shot noise, the detector's own (M Re NEP)^2 B_e, the amplifier's rms
-    current squared. Direct detection has no local oscillator and adds its load's thermal noise
-    4 k T B_e / R_L [T 2.22]. Noise of light from outside is added by effects.
-
-    A heterodyne receiver mixes an IF down: noise from both sides of the IF lands in the record,
-    which makes the shot-limited SNR Re P / (2 q B_e) [T 2.23], half the homodyne's. Its RF noise
-    figure multiplies all of it.
+    current squared. Direct detection has no local oscillator and adds its load's thermal noise 4 k
+    T B_e / R_L [T 2.22]. A heterodyne receiver mixes an IF down: noise from both sides of the IF
+    lands in the record, which makes the shot-limited SNR Re P / (2 q B_e) [T 2.23], half the
+    homodyne's. Its RF noise figure multiplies all of it.
 
     ``in_quadrature``: of two receivers that sample I and Q, as the noise of a bin of a real record.
-    A 90 degree hybrid gives each of them half of echo and local oscillator. The bins of I + iQ then
-    show a line as those of a real record do. Shot noise of half the light each is the same
-    altogether, each one's own noise twice as much. Noise of currents which go with the light, a
-    quarter of the variance each, is half as much.
+    A 90 degree hybrid gives each of them half of echo and local oscillator, and the bins of I + iQ
+    show a line as those of a real record do. Shot noise is the same altogether, each one's own
+    noise twice as much; that of currents which go with the light, a quarter of the variance each,
+    is half.
     """
     noise = _noise(architecture, values)
     if not in_quadrature:

@@ -456,15 +456,7 @@ class Shots:
     def searched_bins(
         self, exempted: np.ndarray, points: np.ndarray | slice = slice(None)
     ) -> np.ndarray:
-        """Bins that can raise a false alarm.
-
-        Parameters
-        ----------
-        exempted : (3, m) ndarray
-            Bins searched that the detection of some points occupies, by segment.
-        points
-            Which points these are.
-        """
+        """Bins that can raise a false alarm, less the ``exempted``, (3, m), by segment."""
         searched: Any = self.fft_size if self.complex_record else self.fft_size // 2
         if self.real_ends:
             searched += 1 - 2 * self.searched_from
@@ -480,10 +472,7 @@ class Shots:
     def counted_bins(
         self, exempted: np.ndarray, points: np.ndarray | slice = slice(None)
     ) -> np.ndarray:
-        """Independent bins that would raise a false alarm as often as those that can.
-
-        Parameters are those of :meth:`searched_bins`.
-        """
+        """Independent bins that would raise a false alarm as often as those that can."""
         bins = self.searched_bins(exempted, points)
         if self.noise_bins == "independent":
             return bins
@@ -543,13 +532,7 @@ def as_arrays(parameters: Parameters) -> dict[str, np.ndarray]:
 
 
 def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
-    """Points of one category with nothing but the echo on the beam's axis and receiver noise.
-
-    Parameters
-    ----------
-    p, size, ground : mapping, int, Ground
-        Of :func:`categories`; points n; what their beams meet.
-    """
+    """Points of one category with nothing but the echo on the beam's axis and receiver noise."""
     architecture, in_quadrature = str(p[RECEIVER + "architecture"]), str(p[RECORD]) == "complex"
     echo_scale, current_scale = link_scales(architecture, p)
     noise = link.receiver_noise(architecture, link.receiver_values(p, RECEIVER), in_quadrature)

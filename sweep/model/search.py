@@ -85,21 +85,11 @@ def _find_outside(numbers, band, period, inside):
 def _cut(numbers, where, levels, how, magnitudes, exempts, chances):
     """Cut runs to the band, in place.
 
-    Parameters
-    ----------
-    numbers : (5, segments, m) int64
-        Low, count, peak, exempted and start of each run.
-    where : tuple
-        Band (3, 2, m), N of complex records or 0, places of lines (m, 3, beamlets), and runs whose
-        largest bin is searched (3, m).
-    levels : (4, m) float64
-        Noise under lines, threshold, noise of other bins, floor of leakage over that.
-    how : tuple
-        :attr:`sweep.model.preparation.Shots.echo_rule`; segments (3,) whose leakage is looked at.
-    magnitudes, exempts : ndarray
-        Of all runs.
-    probabilities : (3, segments, m) float64
-        pd, miss and leakage.
+    ``numbers`` (5, segments, m) are low, count, peak, exempted and start of runs; ``where`` the
+    band (3, 2, m), N of complex records or 0, places of lines (m, 3, beamlets), and whether a run's
+    largest bin is searched; ``levels`` (4, m) noise under lines, threshold, noise of other bins,
+    and floor of leakage over that; ``how`` the rule of detection and segments whose leakage is
+    looked at; ``chances`` (3, segments, m) pd, miss and leakage.
     """
     (band, period, lines, inside), (rule, leaks) = where, how
     low, count, peak, exempted, start = numbers

@@ -150,25 +150,11 @@ def runs_of(
     keep: bool = True,
     whole: bool = False,
 ) -> Iterator[Runs]:
-    """Yield runs of all points, some points at a time, in any order.
+    """Yield runs of all points, or of those in ``points``, some points at a time, in any order.
 
-    Parameters
-    ----------
-    shots : Shots
-        Prepared points.
-    points : (m,) ndarray, optional
-        Numbers of the points to look at, by default all.
-    least : (n,) ndarray, optional
-        Level [V, summed over the record] below which bins may be left out, by default the
-        threshold; 0 gives all.
-    leakage : bool
-        Look at leakage where shots have it.
-    every_bin : bool
-        Look at each bin by itself where leakage could be summed as an integral.
-    keep : bool
-        Hand the bins' magnitudes on.
-    whole : bool
-        Look at bins that are not searched as well.
+    Bins below ``least`` (n,) [V, summed over the record], by default the threshold, may be left
+    out. With ``every_bin`` each bin is looked at by itself where leakage could be summed as an
+    integral; ``keep`` hands magnitudes on; ``whole`` has bins that are not searched as well.
     """
     table = shots.point_table()
     levels = table[11] if least is None else np.broadcast_to(least, shots.size)
@@ -209,19 +195,7 @@ def _of_looks(shots: Shots, runs: Runs, leakage: bool) -> Runs:
 def spectrum(shots: Shots, i: int, segment: int, *, level: float = 0.0) -> tuple:
     """Bins of a segment in which the echo stands above a level, and |X| there, without noise.
 
-    Parameters
-    ----------
-    shots : Shots
-        Prepared points.
-    i, segment : int
-        Point; 0 up, 1 Doppler, 2 down.
-    level : float
-        Magnitude [V, summed over the record] below which bins may be left out; 0 gives all.
-
-    Returns
-    -------
-    bins : (m,) int ndarray
-    magnitude : (m,) ndarray
+    Bins below the level [V, summed over the record] may be left out; 0 gives all.
     """
     shots = replace(shots, leak_amplitude=None)
     (runs,) = runs_of(

@@ -66,34 +66,10 @@ def excess_density(
     local_oscillator_power: ArrayLike,
     line_width: ArrayLike,
 ) -> np.ndarray:
-    """Relative variance of the leaked beat's noise within a bandwidth, of a gain M Re of 1.
+    """Variance [W^2] of the leaked beat's noise within B_e [Hz], of a gain M Re of 1.
 
-    Parameters
-    ----------
-    leaked, local_oscillator_power : array_like
-        Powers P_l and P_lo [W].
-    beat : array_like
-        Amplitude i of the beat over M Re [W].
-    delay, line_width : array_like
-        Delay tau [s]; width v of the Lorentzian line [Hz], 0 for none.
-    electrical_bandwidth : array_like
-        B_e [Hz].
-    relative_intensity_noise, common_mode_rejection : array_like
-        One-sided density [1/Hz]; ratio of powers.
-
-    Returns
-    -------
-    ndarray
-        Variance [W^2], to be multiplied by (M Re)^2.
-
-    Examples
-    --------
-    10 uW that leak over 1 m, of a laser of 100 kHz: as much as the shot noise of 0.9 W.
-
-    >>> laser = {"line_width": 1e5, "relative_intensity_noise": 0.0, "common_mode_rejection": 1.0}
-    >>> light = {"leaked": 1e-5, "local_oscillator_power": 1e-3, "beat": 2e-4}
-    >>> f"{excess_density(**light, **laser, delay=3.34e-9, electrical_bandwidth=1e8):.3g}"
-    '2.8e-11'
+    Of powers P_l and P_lo [W]; the beat's amplitude i / (M Re) [W]; its delay tau [s]; RIN [1/Hz],
+    CMRR (a ratio of powers), and the width v of the Lorentzian line [Hz], 0 for none.
     """
     half, width = np.square(beat) / 2, np.asarray(line_width, float)
     band, time = np.asarray(electrical_bandwidth, float), np.asarray(delay, float)
@@ -206,16 +182,9 @@ def line_of(shots: Shots, i: int, segment: int, at: float | None = None) -> tupl
 
 
 def alarm(looks: Looks, line: Line, bins: np.ndarray, *, scale: float, level: float) -> float:
-    """Probability that a line raises an alarm in some bins where noise alone does not.
+    """Probability that a line raises an alarm in some of its bins where noise alone does not.
 
-    Parameters
-    ----------
-    looks : Looks
-        How records are combined.
-    bins : (m,) int ndarray
-        Bins of the line that are looked at.
-    scale, level : float
-        Half of the line's amplitude, and the threshold, over the noise per quadrature.
+    ``scale`` and ``level`` are half of the line's amplitude and the threshold, over the noise.
     """
     one, other = scale * line.terms[:, bins]
     phases = np.pi * (np.arange(_PHASES) + 0.5) / _PHASES  # its magnitude has this period
@@ -231,21 +200,8 @@ def raised(
 ) -> np.ndarray:
     """|X| of an echo's bins that cross as often as those with the line in them do, (m,).
 
-    Parameters
-    ----------
-    own, line : (m,) ndarray
-        |X| of the echo and root mean square |L| of the line [V].
-    deviation, level : float
-        Noise per quadrature and threshold [V].
-    fades : bool
-        Whether ``own`` is the root mean square of an echo that fades; the line never does.
-
-    Examples
-    --------
-    Without noise to speak of a steady echo and a line of 3 and 4 V come to 5 V.
-
-    >>> float(raised(np.array([3.0]), np.array([4.0]), deviation=1.0, level=9.0, fades=False)[0])
-    5.0
+    ``own`` is |X| of the echo, the root mean square of one that ``fades``; ``line`` the root mean
+    square of the line's [V]; ``deviation`` and ``level`` noise per quadrature and threshold [V].
     """
     from sweep.model.marcum import marcum_q1  # needs the compiler, too
 

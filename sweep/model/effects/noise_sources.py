@@ -52,11 +52,6 @@ def sunlight(*, wavelength: ArrayLike, distance: ArrayLike, elevation: ArrayLike
     """Spectral irradiance [W/m^3] of a level surface by a black sun; 0 for a distance of 0.
 
     Planck's radiance pi B(wavelength, T) (R / d)^2 sin(elevation).
-
-    Parameters
-    ----------
-    wavelength, distance, elevation : array_like
-        [m]; from the sun [m]; of the sun above the surface [rad].
     """
     x, d = np.asarray(wavelength, float), np.asarray(distance, float)
     exponent = PLANCK * SPEED_OF_LIGHT / (x * BOLTZMANN * SUN_TEMPERATURE)
@@ -167,20 +162,9 @@ def current_variance(
     """Compute the current variance [A^2] from intensity noise of the local oscillator.
 
     One diode sees (M Re P_lo)^2 RIN B_e. The two diodes of a balanced receiver see the same
-    fluctuation and subtract it, all but their mismatch. The common-mode rejection (in dB 20 log10
+    fluctuation and subtract it, all but their mismatch: the common-mode rejection (in dB 20 log10
     of the ratio of their currents) divides the variance. Both are taken to be flat over the
     electrical bandwidth. The echo's own is left out: it is below that by P / P_lo.
-
-    Parameters
-    ----------
-    relative_intensity_noise : array_like
-        One-sided density of dP/P [1/Hz], >= 0; -150 dB/Hz is 1e-15/Hz. (n,) or scalar, as all.
-    common_mode_rejection : array_like
-        Ratio of powers, >= 1; 1 for a single diode, 25 dB is 316.
-    local_oscillator_power : array_like
-        Power [W] on the detector; 0 for direct detection.
-    apd_gain, responsivity, electrical_bandwidth : array_like
-        As for :func:`sweep.model.link.shot_noise`.
     """
     current = (
         np.asarray(apd_gain, float)
