@@ -129,23 +129,3 @@ def noise_filter(window: Window, fft_size: int, bins: int) -> tuple[np.ndarray, 
     weights = (np.cos(2 * np.pi * angles) * taper).sum(axis=-1)
     weights /= np.sqrt((weights**2).sum(axis=1, keepdims=True))
     return weights[which.ravel()], start
-
-
-def log_segment_pfa(bins: ArrayLike, *, level: ArrayLike, correlation: float) -> np.ndarray:
-    """Natural logarithm of the probability that noise alone crosses in any of n adjacent bins.
-
-    Parameters are those of :func:`independent_bins`. It keeps its digits where the probability
-    itself leaves float64's range; -inf for no bins.
-
-    Examples
-    --------
-    >>> from sweep.model.window import window
-    >>> hann = neighbour_correlation(window("hann", 1024), 1024)
-    >>> bool(log_segment_pfa(511, level=3.9, correlation=hann) < np.log(511) - 3.9**2 / 2)
-    True
-    """
-    from sweep.model.marcum import log_at_least_one
-
-    level = np.asarray(level, float)
-    number = independent_bins(bins, level=level, correlation=correlation)
-    return log_at_least_one(-0.5 * np.square(level), number)

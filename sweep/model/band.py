@@ -31,16 +31,6 @@ def band_of(p: Mapping[str, Any], points: int | None = None) -> np.ndarray | Non
     By segment: up, Doppler, down. Bins are 0..N/2, of a complex record -N/2 .. N/2 - 1. Points
     share their words and sizes, and have all or none of :data:`ENDS`. Without ``points``: (3, 2,
     ...).
-
-    >>> given = {
-    ...     "instrument.receiver.architecture": "homodyne", "instrument.laser.wavelength": 1.55e-6,
-    ...     "instrument.chirp.start_frequency": 0.0, "instrument.chirp.bandwidth": 1e9,
-    ...     "instrument.chirp.duration": 1e-3, "instrument.processing.sample_rate": 100e6,
-    ...     "instrument.processing.fft_size": 2**16,
-    ... }
-    >>> band = dict(zip(ENDS, (100.0, 200.0, -1.0, 1.0)))
-    >>> [[int(v) for v in segment] for segment in band_of(given | band)]
-    [[436, 1721], [0, 847], [436, 1721]]
     """
     if RANGES[0] not in p:
         return None

@@ -64,16 +64,12 @@ class PhaseError(NamedTuple):
     values: dict[str, Any]
     """Arguments by name, (n,) or scalars; a tuple holds one for each segment."""
 
-    def chosen(
-        self, segment: int, index: np.ndarray, *, once: bool = False
-    ) -> dict[str, np.ndarray]:
-        """Arguments of some points in a segment, as many each; or one where all have it."""
-        found, size = {}, 1 if once else index.size
+    def chosen(self, segment: int, index: np.ndarray) -> dict[str, np.ndarray]:
+        """Arguments of some points in a segment, as many each."""
+        found = {}
         for name, value in self.values.items():
             value = value[segment] if isinstance(value, tuple) else value
-            found[name] = value[index] if np.ndim(value) else np.full(size, float(value))
-            if once and (found[name] == found[name][:1]).all():
-                found[name] = found[name][:1]
+            found[name] = value[index] if np.ndim(value) else np.full(index.size, float(value))
         return found
 
 

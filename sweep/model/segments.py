@@ -43,15 +43,12 @@ from sweep.model.spectrum import (
     A_IM,
     A_RE,
     COMPLEX,
-    F_IM,
-    F_RE,
     FOLDED,
     IMAGED,
     MOST_CELLS,
     OUT,
     ROOM,
     detect,
-    field,
 )
 from sweep.model.window import Window
 
@@ -204,33 +201,6 @@ def spectrum(shots: Shots, i: int, segment: int, *, level: float = 0.0) -> tuple
     low = int(runs.low[segment, 0])
     magnitude = runs.run(segment, 0).copy()
     return np.arange(low, low + magnitude.size), magnitude
-
-
-def tones(window: Window, fft_size: int, place: np.ndarray, first: int, count: int) -> np.ndarray:
-    """|W| that lone tones at places of bin 0 show in bins ``first`` .., (count, m)."""
-    shapes = (
-        line_shape.shapes(window, fft_size, False, 0)
-        if line_shape.has_modes(window, fft_size)
-        else _plain(window, fft_size, False, 1)
-    )
-    room, found = (
-        np.empty((ROOM, max(count, LEAST_WIDTH, MOST_CELLS) + 16)),
-        np.empty((count, place.size)),
-    )
-    table = np.empty((2, line_shape.places_of(shapes.sizes)))
-    form = np.zeros((7, shapes.reach.shape[1]))
-    modes = np.zeros((1, 1, 2, 1))
-    modes[..., 0, :] = 1.0
-    parts = np.zeros((1, 1)), modes, np.ones((1, 1), np.int64), np.empty((1, 2, 0))
-    line_shape.build(0, (0, -1), parts, shapes, table, form)
-    room[RE, 0], room[IM, 0] = 1.0, 0.0
-    for i, at in enumerate(place):
-        room[PLACE, 0] = at
-        field(
-            first, count, (1, at, at, 0, 0.0), table, form, shapes.sizes, tangents(fft_size), room
-        )
-        found[:, i] = np.hypot(room[F_RE, :count], room[F_IM, :count])
-    return found
 
 
 def _bin(shots: Shots, number: np.ndarray) -> np.ndarray:

@@ -134,11 +134,7 @@ def order_of(architecture: str, segments: str) -> tuple[str, ...]:
 def segment_starts(
     order: tuple[str, ...], *, duration: np.ndarray, gap: np.ndarray | float = 0.0
 ) -> tuple[np.ndarray, ...]:
-    """Return times [s] from the shot's start to that of up, Doppler and down segment; 0 for none.
-
-    >>> [float(start) for start in segment_starts(("up", "down"), duration=32e-6, gap=1e-6)]
-    [0.0, 0.0, 3.3e-05]
-    """
+    """Return times [s] from the shot's start to each segment's: up, Doppler, down; 0 for none."""
     step = np.asarray(duration, float) + gap
     return tuple(step * (order.index(name) if name in order else 0) for name in SEGMENTS)
 

@@ -37,7 +37,6 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from sweep.model import link
 from sweep.model.constants import SPEED_OF_LIGHT
@@ -55,31 +54,6 @@ _PHASES = 16
 PATH, ISOLATION = TELESCOPE + "leak_path", TELESCOPE + "isolation"
 
 
-def excess_density(
-    *,
-    leaked: ArrayLike,
-    beat: ArrayLike,
-    delay: ArrayLike,
-    electrical_bandwidth: ArrayLike,
-    relative_intensity_noise: ArrayLike,
-    common_mode_rejection: ArrayLike,
-    local_oscillator_power: ArrayLike,
-    line_width: ArrayLike,
-) -> np.ndarray:
-    """Variance [W^2] of the leaked beat's noise within B_e [Hz], of a gain M Re of 1.
-
-    Of powers P_l and P_lo [W]; the beat's amplitude i / (M Re) [W]; its delay tau [s]; RIN [1/Hz],
-    CMRR (a ratio of powers), and the width v of the Lorentzian line [Hz], 0 for none.
-    """
-    half, width = np.square(beat) / 2, np.asarray(line_width, float)
-    band, time = np.asarray(electrical_bandwidth, float), np.asarray(delay, float)
-    light, oscillator = np.asarray(leaked, float), np.asarray(local_oscillator_power, float)
-    common = (2 * oscillator + light) * light / np.asarray(common_mode_rejection, float)
-    intensity = np.asarray(relative_intensity_noise, float) * band * (common + half)
-    phase = 2 * np.pi * width * time * np.minimum(2 * time * band, 1.0)
-    return np.asarray(intensity + half * phase)
-
-
 def _leaked(p: Mapping[str, np.ndarray], architecture: str) -> tuple[np.ndarray, np.ndarray]:
     """Leaked light [W], and amplitude of its beat's photocurrent [A]."""
     power = np.asarray(p[LASER + "power"] / p[ISOLATION])
@@ -91,23 +65,21 @@ def _leaked(p: Mapping[str, np.ndarray], architecture: str) -> tuple[np.ndarray,
     return power, np.asarray(link.beat_scale(architecture, echo_power_scale=power, **own))
 
 
-def _variance(p: Mapping[str, np.ndarray], architecture: str, shape: str) -> np.ndarray:
+def excess(p: Mapping[str, np.ndarray], architecture: str, shape: str) -> np.ndarray:
     """Compute the current variance [A^2] of the beat's noise; direct detection has no beat."""
     if architecture == "direct":
         return np.zeros(())
-    power, current = _leaked(p, architecture)
+    light, current = _leaked(p, architecture)
     scale = p[RECEIVER + "apd_gain"] * p[RECEIVER + "responsivity"]
-    width = p[LASER + "line_width"] if shape == "lorentzian" else 0.0
-    return scale**2 * excess_density(
-        leaked=power,
-        beat=current / scale,
-        delay=p[PATH] / SPEED_OF_LIGHT,
-        electrical_bandwidth=link.electrical_bandwidth(p, RECEIVER),
-        relative_intensity_noise=p[LASER + "relative_intensity_noise"],
-        common_mode_rejection=p[RECEIVER + "common_mode_rejection"],
-        local_oscillator_power=p[RECEIVER + "local_oscillator_power"],
-        line_width=width,
-    )
+    band, delay = link.electrical_bandwidth(p, RECEIVER), p[PATH] / SPEED_OF_LIGHT
+    half = np.square(current / scale) / 2
+    common = (2 * p[RECEIVER + "local_oscillator_power"] + light) * light
+    common = common / p[RECEIVER + "common_mode_rejection"]
+    variance = p[LASER + "relative_intensity_noise"] * band * (common + half)
+    if shape == "lorentzian":
+        phase = 2 * np.pi * p[LASER + "line_width"] * delay * np.minimum(2 * delay * band, 1.0)
+        variance = variance + half * phase
+    return np.asarray(scale**2 * variance)
 
 
 def leak_size(points: Points) -> Size | None:
@@ -117,7 +89,7 @@ def leak_size(points: Points) -> Size | None:
     p, own = points.parameters, points.receiver
     noise = _leaked(p, points.architecture)[0] * own.per_watt
     shape = points.word(LASER + "line_shape")
-    noise = noise + _variance(p, points.architecture, shape) * own.per_ampere
+    noise = noise + excess(p, points.architecture, shape) * own.per_ampere
     return Size(noise=noise / points.noise_variance, chance=1.0)
 
 
@@ -125,8 +97,8 @@ def add_leak(shots: Shots, scene: Scene) -> Shots:
     """Add the leaked light's noise and its line."""
     p = scene.parameters
     power, current = _leaked(p, shots.architecture)
-    excess = _variance(p, shots.architecture, str(p[LASER + "line_shape"])) * shots.noise_scale
-    shots = noisier(shots, leak_shot=shots.shot_noise_scale * power, leak_excess=excess)
+    beat = excess(p, shots.architecture, str(p[LASER + "line_shape"])) * shots.noise_scale
+    shots = noisier(shots, leak_shot=shots.shot_noise_scale * power, leak_excess=beat)
     return replace(
         shots,
         leak_amplitude=current * p[RECEIVER + "transimpedance"],
