@@ -14,7 +14,7 @@ With rho^2 = |W2/W2(0)|^2 of neighbours
     p - p11 = p (Q_1(s b, s rho b) - Q_1(s rho b, s b)),    s^2 = 1 / (1 - rho^2).
 
 A real record's noise is real at DC and Nyquist and nearly so next to them, where it alarms far more
-often (7,550 times in bin 0 at TNR 10). Bins whose noise is not circular are not searched for them.
+often. Bins whose noise is not circular are not searched for alarms.
 
 So n bins alarm as 1 + (n - 1) ln(1 - h) / ln(1 - p) independent ones do: everything that is known
 of independent bins serves, in logarithms too. At TNR 6 it is within 2 % of drawn noise for

@@ -5,14 +5,10 @@ A target of the band, range R0 .. R1 as a segment starts and velocity v0 .. v1, 
     f_seg beta - s S (2 R / c) (1 + beta),    beta = 2 v / c
 
 (:mod:`sweep.model.waveform`) between the least and the largest at the band's four corners, as it is
-monotonic in R and in v. The bins searched are those nearest to all these beats, the outermost ones
-included. A real record folds this interval: it begins at 0 if it holds a whole multiple of the
-sample rate, and ends at N/2 if it holds an odd multiple of half of it. In a complex record it goes
-round the circle of signed bins.
-
-An echo is in the band where its strongest bin is. It is then detected as without a band, by those
-of its bins that are searched. Else it is not detected, and what it shows in searched bins is
-leakage. Bins outside raise no alarm of any kind.
+monotonic in R and in v. The bins searched are those nearest to all these beats; real records fold
+this interval, complex ones take it round the circle of signed bins (docs/physics.md, *Search
+band*). An echo is in the band where its strongest bin is, and is then detected by those of its bins
+that are searched. Else it is not detected, and what it shows in searched bins is leakage.
 """
 
 from collections.abc import Mapping

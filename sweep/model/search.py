@@ -19,12 +19,14 @@ def cut(shots: Any, runs: Any) -> Any:
     """
     if shots.band is None:
         return runs
-    part, inside = runs.part, np.ones(runs.low.shape, np.bool_)
+    part = runs.part
     numbers = np.array([runs.low, runs.bins, runs.peak, runs.exempted, runs.start])
     chances = np.array([runs.pd, runs.miss, runs.leakage])
     period = shots.fft_size if shots.complex_record else 0
     band = np.ascontiguousarray(shots.band[:, :, part])
-    _find_outside(numbers, band, period, inside)
+    apart = runs.low + runs.peak - band[:, 0]
+    apart = apart % period if period else apart
+    inside = (runs.bins == 0) | ((apart >= 0) & (apart < band[:, 1]))
     lines = np.empty((part.size, 3, 0)) if inside.all() else beamlet_lines(shots)[part]
     each = shots.line_deviation, shots.threshold, shots.bin_deviation, shots.floor
     levels = np.array([np.broadcast_to(column, shots.size)[part] for column in each])
@@ -69,16 +71,6 @@ def _is_in(bin_, band, period):
     if period > 0:
         apart %= period
     return 0 <= apart < band[1]
-
-
-@njit(cache=True, error_model="numpy")
-def _find_outside(numbers, band, period, inside):
-    """Unmark the runs whose largest bin is not searched."""
-    low, count, peak, _, _ = numbers
-    for s in range(low.shape[0]):
-        for j in range(low.shape[1]):
-            if count[s, j] > 0:
-                inside[s, j] = _is_in(low[s, j] + peak[s, j], band[s, :, j], period)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

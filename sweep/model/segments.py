@@ -439,23 +439,6 @@ def _take_lines(p, where, footprint, centre, shift, window_sum, limits, sizes, r
     return origin, n, total, lowest, highest
 
 
-@njit(cache=True, error_model="numpy")
-def _used(shift):
-    """Shifts of a point that have any weight."""
-    number = 0
-    while number < shift.shape[1] and shift[1, number] > 0.0:
-        number += 1
-    return shift[:, :number]
-
-
-@njit(cache=True, error_model="numpy")
-def _keep(at, count, room, exempt, magnitudes, exempts):
-    """Hands a run on, from ``at`` on; where the next one begins."""
-    for k in range(count):
-        magnitudes[at + k], exempts[at + k] = room[OUT, k], exempt[k]
-    return at + count
-
-
 @njit(cache=True, nogil=True, error_model="numpy")
 def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, work, out):
     """Compute runs of points; return the number of points that there was room for.
@@ -502,7 +485,7 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
         for s in range(segments.size):
             if not segments[s]:
                 continue
-            shift = _used(shifts[i, s])
+            shift = shifts[i, s][:, : np.count_nonzero(shifts[i, s, 1])]  # zeros are last
             origin, n, total, lowest, highest = _take_lines(
                 p, (s, row), footprint, centre[s, which], shift, window_sum, limits, sizes, room
             )
@@ -521,7 +504,9 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
                 if at + count > magnitudes.size:
                     return i
                 numbers[4, s, i] = at
-                at = _keep(at, count, room, exempt, magnitudes, exempts)
+                for k in range(count):
+                    magnitudes[at + k], exempts[at + k] = room[OUT, k], exempt[k]
+                at += count
             found, missed = found_pair(room[OUT, :count], exempt, peak, low, rule, (p[13], level))
             if leaks[s] == BIN_BY_BIN:
                 leakage = of_bins(count, noise, p[12], room, exempt, series)

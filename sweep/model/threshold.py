@@ -102,13 +102,7 @@ def segment_bins(p: Mapping[str, Any], level: np.ndarray, segment: str = "up") -
             number = number_of(band, size, 1, is_signed=in_quadrature)[row]
             return number + np.zeros(np.shape(level))
         return np.full(np.shape(level), float(size if is_all else size // 2))
-    record = record_length(
-        fft_size=np.asarray(size),
-        duration=p["instrument.chirp.duration"],
-        acquisition_delay=p[PROCESSING + "acquisition_delay"],
-        sample_rate=p[PROCESSING + "sample_rate"],
-    )
-    taper = window(canonical_name(str(p[PROCESSING + "window"])), int(np.max(record)))
+    taper = window(canonical_name(str(p[PROCESSING + "window"])), int(np.max(record_length(p))))
     first = 1 if in_quadrature else alarms.first_circular(taper, size)
     bins = size if is_all else max(size // 2 + 1 - 2 * first, 0)
     if band is not None:

@@ -125,7 +125,6 @@ def analytic_record(
         np.array(beat),
         detector_bandwidth=_at(shots.detector_bandwidth, i),
         amplifier_bandwidth=_at(shots.amplifier_bandwidth, i),
-        transimpedance=np.array(1.0),
     )
     amplitude = _at(shots.beat_scale, i) * shots.amplitude[shots.row[i], beamlet]
     amplitude = amplitude * shots.whitening[segment][i]

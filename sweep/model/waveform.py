@@ -16,11 +16,8 @@ Table 4.1 by 0.2 bins at 150 m/s. The terms in t^2 are range walk, an effect of 
 segment starts with the target at range R; that it moves on in between is an effect too.
 
 A shot has an up- and a down-chirp, in any order, and may have a Doppler segment before, between or
-behind them: the lander's ``up doppler down``, the triangle ``up down`` of automotive lidars. All
-last as long, with equal gaps. Without a Doppler segment two beats tell of two unknowns, and
-half sum and half difference could be exchanged. The target is taken to be further away than
-|v_r| c / (lambda S), so that |f_d| < f_r, and no beat to be folded. Complex records (I and Q) keep
-the sign of each beat, and two tell both unknowns.
+behind them. All last as long, with equal gaps. Two beats of real records tell both unknowns by an
+assumption (docs/physics.md, *A segment that is missed*); complex records keep the sign of each.
 """
 
 from collections.abc import Mapping, Sequence
@@ -152,16 +149,11 @@ def beat_frequency(
     return carrier * beta - slope * chirp_rate * (2 * range / SPEED_OF_LIGHT) * (1 + beta)
 
 
-def record_length(
-    *,
-    fft_size: np.ndarray,
-    duration: np.ndarray,
-    acquisition_delay: np.ndarray,
-    sample_rate: np.ndarray,
-) -> np.ndarray:
+def record_length(p: Mapping[str, Any]) -> np.ndarray:
     """Return the record's length [samples]: the FFT's, or what the chirp leaves after the delay."""
-    available = np.floor((duration - acquisition_delay) * sample_rate + 1e-6)
-    return np.minimum(fft_size, available).astype(np.int64)
+    left = p["instrument.chirp.duration"] - p["instrument.processing.acquisition_delay"]
+    available = np.floor(left * p["instrument.processing.sample_rate"] + 1e-6)
+    return np.minimum(p["instrument.processing.fft_size"], available).astype(np.int64)
 
 
 def fold(frequency: np.ndarray, sample_rate: np.ndarray) -> np.ndarray:

@@ -61,7 +61,8 @@ def current_variance(p: Mapping[str, np.ndarray], amplified: str) -> np.ndarray:
         mixed = mixed + oscillator / rejected
     scale = (p[RECEIVER + "apd_gain"] * p[RECEIVER + "responsivity"]) ** 2
     light = oscillator * (emission(p) * mixed)
-    return np.asarray(4 * scale * light * link.electrical_bandwidth(p, RECEIVER))
+    bandwidth = link.electrical_bandwidth(link.receiver_values(p))
+    return np.asarray(4 * scale * light * bandwidth)
 
 
 def emission_size(points: Points) -> Size | None:

@@ -43,7 +43,7 @@ from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.effect import Effect, Parameter, Scene, Size, noisier
 from sweep.model.effects.points import Points
 from sweep.model.looks import Looks
-from sweep.model.preparation import LASER, RECEIVER, TELESCOPE, Shots
+from sweep.model.preparation import LASER, RECEIVER, TELESCOPE, Shots, beat_current
 from sweep.model.window import Window, samples
 
 MASKED_FROM = 0.5
@@ -57,12 +57,7 @@ PATH, ISOLATION = TELESCOPE + "leak_path", TELESCOPE + "isolation"
 def _leaked(p: Mapping[str, np.ndarray], architecture: str) -> tuple[np.ndarray, np.ndarray]:
     """Leaked light [W], and amplitude of its beat's photocurrent [A]."""
     power = np.asarray(p[LASER + "power"] / p[ISOLATION])
-    names = (
-        "local_oscillator_power", "mixing_efficiency", "apd_gain", "responsivity",
-        "modulation_index",
-    )  # fmt: skip
-    own = {name: p[RECEIVER + name] for name in names}
-    return power, np.asarray(link.beat_scale(architecture, echo_power_scale=power, **own))
+    return power, beat_current(architecture, p, power)
 
 
 def excess(p: Mapping[str, np.ndarray], architecture: str, shape: str) -> np.ndarray:
@@ -71,7 +66,7 @@ def excess(p: Mapping[str, np.ndarray], architecture: str, shape: str) -> np.nda
         return np.zeros(())
     light, current = _leaked(p, architecture)
     scale = p[RECEIVER + "apd_gain"] * p[RECEIVER + "responsivity"]
-    band, delay = link.electrical_bandwidth(p, RECEIVER), p[PATH] / SPEED_OF_LIGHT
+    band, delay = link.electrical_bandwidth(link.receiver_values(p)), p[PATH] / SPEED_OF_LIGHT
     half = np.square(current / scale) / 2
     common = (2 * p[RECEIVER + "local_oscillator_power"] + light) * light
     common = common / p[RECEIVER + "common_mode_rejection"]
@@ -143,9 +138,10 @@ def line_of(shots: Shots, i: int, segment: int, at: float | None = None) -> tupl
     )
     beat = -shots.waveform[segment].slope * rate * delay
     gain = link.transfer(
-        np.array(beat), detector_bandwidth=np.array(detector),
-        amplifier_bandwidth=np.array(amplifier), transimpedance=np.array(1.0),
-    )  # fmt: skip
+        np.array(beat),
+        detector_bandwidth=np.array(detector),
+        amplifier_bandwidth=np.array(amplifier),
+    )
     whitened = shots.whitened(np.array(beat), None if at is None else np.array(at))
     own = float(np.broadcast_to(whitened, shots.size)[i])
     scale = 0.5 * amplitude * abs(complex(gain)) * own

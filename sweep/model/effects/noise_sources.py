@@ -142,7 +142,8 @@ def current_variance(p: Mapping[str, np.ndarray]) -> np.ndarray:
     current = p[RECEIVER + "apd_gain"] * p[RECEIVER + "responsivity"]
     current = current * p[RECEIVER + "local_oscillator_power"]
     seen = p[_RIN] / p[_REJECTION]
-    return np.asarray(current**2 * seen * link.electrical_bandwidth(p, RECEIVER))
+    bandwidth = link.electrical_bandwidth(link.receiver_values(p))
+    return np.asarray(current**2 * seen * bandwidth)
 
 
 def intensity_size(points: Points) -> Size | None:
