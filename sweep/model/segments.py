@@ -443,26 +443,14 @@ def _take_lines(p, where, footprint, centre, shift, window_sum, limits, sizes, r
 def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, work, out):
     """Compute runs of points; return the number of points that there was room for.
 
-    Parameters
-    ----------
-    points : (m, COMMON + OWN segments) float64
-        :meth:`sweep.model.preparation.Shots.point_table`.
-    where : (2, m) int64
-        Rows in the footprints; shapes.
-    footprint : (3 or 3 + segments, rows, beamlets) float64
-    modes, shapes
-        Of :class:`Together`, with shifts (m, segments, 2, k); sizes with the view and half of the
-        echo's main lobe at their end.
-    tables : tuple
-        Limits of nodes; tangents.
-    how : tuple
-        Segments that there are; levels below which bins may be left out; each segment's way to look
-        at leakage; the window's sum; rule of detection.
-    made, work : tuple
-        Room for shapes; for spectra.
-    out : tuple
-        Results: low, count, peak, exempted and start (5, segments, m); pd, miss, magnitude and
-        leakage (4, segments, m); magnitudes and exempt bins of runs, which may have no room at all.
+    ``points`` are rows of :meth:`sweep.model.preparation.Shots.point_table`; ``where`` (2, m) rows
+    in the footprints, and shapes; ``modes`` and ``shapes`` those of :class:`Together`, with shifts
+    (m, segments, 2, k) and with sizes that end in the view and half of the echo's main lobe;
+    ``tables`` limits of nodes, and tangents; ``how`` segments that there are, levels below which
+    bins may be left out, each segment's way to look at leakage, the window's sum, and the rule of
+    detection. ``made`` and ``work`` are room for shapes and for spectra. Results (``out``): low,
+    count, peak, exempted and start (5, segments, m); pd, miss, magnitude and leakage (4, segments,
+    m); magnitudes and exempt bins of runs, which may have no room at all.
     """
     centre, shifts = modes[0], modes[3]
     sizes, limits, tangent = shapes[0], tables[0], tables[1]
