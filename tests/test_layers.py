@@ -34,7 +34,7 @@ NOT_IN_THE_MODEL = {
 """Pure physics: arrays in, arrays out."""
 
 LARGEST_HOUSE = {
-    "lines": 49_069, "modules": 182, "lines of the model": 19_101, "modules of the model": 77,
+    "lines": 49_068, "modules": 182, "lines of the model": 19_100, "modules of the model": 77,
     "compiled functions": 133, "arguments of a compiled function": 10,
 }  # fmt: skip
 """Upper limits on the size of sweep/."""

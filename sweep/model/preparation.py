@@ -526,8 +526,7 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
     """Points of one category with nothing but the echo on the beam's axis and receiver noise."""
     architecture, in_quadrature = str(p[RECEIVER + "architecture"]), str(p[RECORD]) == "complex"
     echo_scale, current_scale = link_scales(architecture, p)
-    receiver = link.receiver_values(p)
-    noise = link.receiver_noise(architecture, receiver, in_quadrature)
+    noise = link.receiver_noise(architecture, link.receiver_values(p), in_quadrature)
     row, offset, doppler, echo = ground.axis(size)
     everywhere, accuracy, looks = np.zeros(size), Accuracy.of(p), Looks.of(p)
     return Shots(
@@ -571,7 +570,7 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
         doppler=doppler,
         amplitude=relative_amplitude(architecture, echo),
         incoherent=architecture != "direct",
-        antialias=link.antialias_of(receiver),
+        antialias=link.antialias_of(link.receiver_values(p)),
         complex_record=in_quadrature,
         looks=looks,
     )
