@@ -34,8 +34,8 @@ NOT_IN_THE_MODEL = {
 """Pure physics: arrays in, arrays out."""
 
 LARGEST_HOUSE = {
-    "lines": 49_068, "modules": 182, "lines of the model": 19_100, "modules of the model": 77,
-    "compiled functions": 133, "arguments of a compiled function": 10,
+    "lines": 49_074, "modules": 182, "lines of the model": 19_106, "modules of the model": 77,
+    "compiled functions": 134, "arguments of a compiled function": 10,
 }  # fmt: skip
 """Upper limits on the size of sweep/."""
 LARGEST_MODULE = 660

@@ -439,6 +439,14 @@ def _take_lines(p, where, footprint, centre, shift, window_sum, limits, sizes, r
     return origin, n, total, lowest, highest
 
 
+@njit(cache=True, error_model="numpy")
+def _keep(at, count, room, exempt, magnitudes, exempts):
+    """Hands a run on, from ``at`` on; where the next one begins."""
+    for k in range(count):
+        magnitudes[at + k], exempts[at + k] = room[OUT, k], exempt[k]
+    return at + count
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, work, out):
     """Compute runs of points; return the number of points that there was room for.
@@ -492,9 +500,7 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
                 if at + count > magnitudes.size:
                     return i
                 numbers[4, s, i] = at
-                for k in range(count):
-                    magnitudes[at + k], exempts[at + k] = room[OUT, k], exempt[k]
-                at += count
+                at = _keep(at, count, room, exempt, magnitudes, exempts)
             found, missed = found_pair(room[OUT, :count], exempt, peak, low, rule, (p[13], level))
             if leaks[s] == BIN_BY_BIN:
                 leakage = of_bins(count, noise, p[12], room, exempt, series)
