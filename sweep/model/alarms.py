@@ -14,7 +14,7 @@ With rho^2 = |W2/W2(0)|^2 of neighbours
     p - p11 = p (Q_1(s b, s rho b) - Q_1(s rho b, s b)),    s^2 = 1 / (1 - rho^2).
 
 A real record's noise is real at DC and Nyquist and nearly so next to them, where it alarms far more
-often (7,550 times in bin 0 at TNR 10). Bins whose noise is not circular are not searched for them.
+often. Bins whose noise is not circular are not searched for alarms.
 
 So n bins alarm as 1 + (n - 1) ln(1 - h) / ln(1 - p) independent ones do: everything that is known
 of independent bins serves, in logarithms too. At TNR 6 it is within 2 % of drawn noise for
@@ -63,23 +63,9 @@ def _correlation(window: Window, fft_size: int, apart: int) -> float:
 def independent_bins(
     bins: ArrayLike, *, level: ArrayLike, correlation: float, looks: Looks = ONE
 ) -> np.ndarray:
-    """Return the number of independent bins that raise an alarm as often as n adjacent ones.
+    """Return the number, 0..n, of independent bins that raise an alarm as often as n adjacent ones.
 
-    Parameters
-    ----------
-    bins : array_like
-        Number n of bins, >= 0. Broadcast against `level`.
-    level : array_like
-        Threshold over sigma, > 0.
-    correlation : float
-        Correlation of neighbouring bins, 0..1 (:func:`neighbour_correlation`).
-    looks : Looks
-        Records by which a bin is detected.
-
-    Returns
-    -------
-    ndarray
-        0..n; n itself for a correlation of 0.
+    By the threshold over sigma, and the correlation of neighbours (:func:`neighbour_correlation`).
     """
     bins = np.asarray(bins, float)
     share = _share(np.asarray(level, float), correlation, looks)
@@ -130,14 +116,8 @@ def noise_filter(window: Window, fft_size: int, bins: int) -> tuple[np.ndarray, 
     """Weights that make the noise of adjacent bins of independent numbers, one each fs/L.
 
     The noise of a bin at y [bins of fs/L] is sum_j W(y - j) z_j, as the transform of a record is
-    that of its own bins. In phase with the middle of a line's main lobe W is real.
-
-    Returns
-    -------
-    weights : (bins, TAPS) ndarray
-        Of bins 0 .., their squares' sum 1.
-    start : (bins,) int64 ndarray
-        Number of each bin's first.
+    that of its own bins. In phase with the middle of a line's main lobe W is real. Returns weights
+    (bins, TAPS), their squares' sum 1, and the number of each bin's first (bins,).
     """
     length = min(window.length, 512) // 2 * 2
     taper = samples(window.name, max(length, 1))
@@ -149,23 +129,3 @@ def noise_filter(window: Window, fft_size: int, bins: int) -> tuple[np.ndarray, 
     weights = (np.cos(2 * np.pi * angles) * taper).sum(axis=-1)
     weights /= np.sqrt((weights**2).sum(axis=1, keepdims=True))
     return weights[which.ravel()], start
-
-
-def log_segment_pfa(bins: ArrayLike, *, level: ArrayLike, correlation: float) -> np.ndarray:
-    """Natural logarithm of the probability that noise alone crosses in any of n adjacent bins.
-
-    Parameters are those of :func:`independent_bins`. It keeps its digits where the probability
-    itself leaves float64's range; -inf for no bins.
-
-    Examples
-    --------
-    >>> from sweep.model.window import window
-    >>> hann = neighbour_correlation(window("hann", 1024), 1024)
-    >>> bool(log_segment_pfa(511, level=3.9, correlation=hann) < np.log(511) - 3.9**2 / 2)
-    True
-    """
-    from sweep.model.marcum import log_at_least_one
-
-    level = np.asarray(level, float)
-    number = independent_bins(bins, level=level, correlation=correlation)
-    return log_at_least_one(-0.5 * np.square(level), number)

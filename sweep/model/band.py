@@ -5,14 +5,10 @@ A target of the band, range R0 .. R1 as a segment starts and velocity v0 .. v1, 
     f_seg beta - s S (2 R / c) (1 + beta),    beta = 2 v / c
 
 (:mod:`sweep.model.waveform`) between the least and the largest at the band's four corners, as it is
-monotonic in R and in v. The bins searched are those nearest to all these beats, the outermost ones
-included. A real record folds this interval: it begins at 0 if it holds a whole multiple of the
-sample rate, and ends at N/2 if it holds an odd multiple of half of it. In a complex record it goes
-round the circle of signed bins.
-
-An echo is in the band where its strongest bin is. It is then detected as without a band, by those
-of its bins that are searched. Else it is not detected, and what it shows in searched bins is
-leakage. Bins outside raise no alarm of any kind.
+monotonic in R and in v. The bins searched are those nearest to all these beats; real records fold
+this interval, complex ones take it round the circle of signed bins (docs/physics.md, *Search
+band*). An echo is in the band where its strongest bin is, and is then detected by those of its bins
+that are searched. Else it is not detected, and what it shows in searched bins is leakage.
 """
 
 from collections.abc import Mapping
@@ -28,27 +24,9 @@ from sweep.model.waveform import RANGES, VELOCITIES
 def band_of(p: Mapping[str, Any], points: int | None = None) -> np.ndarray | None:
     """First bin and number of bins that are searched, (3, 2, points) int64; None for all.
 
-    By segment: up, Doppler, down. Bins are 0..N/2, of a complex record -N/2 .. N/2 - 1.
-
-    Parameters
-    ----------
-    p : mapping
-        Dotted path to SI scalar or array, of points that share their words and sizes; all or none
-        of :data:`ENDS` [m; m/s, positive when closing].
-    points : int, optional
-        Number of points, where the values may be those of all; (3, 2, ...) without it.
-
-    Examples
-    --------
-    >>> given = {
-    ...     "instrument.receiver.architecture": "homodyne", "instrument.laser.wavelength": 1.55e-6,
-    ...     "instrument.chirp.start_frequency": 0.0, "instrument.chirp.bandwidth": 1e9,
-    ...     "instrument.chirp.duration": 1e-3, "instrument.processing.sample_rate": 100e6,
-    ...     "instrument.processing.fft_size": 2**16,
-    ... }
-    >>> band = dict(zip(ENDS, (100.0, 200.0, -1.0, 1.0)))
-    >>> [[int(v) for v in segment] for segment in band_of(given | band)]
-    [[436, 1721], [0, 847], [436, 1721]]
+    By segment: up, Doppler, down. Bins are 0..N/2, of a complex record -N/2 .. N/2 - 1. Points
+    share their words and sizes, and have all or none of :data:`ENDS`. Without ``points``: (3, 2,
+    ...).
     """
     if RANGES[0] not in p:
         return None

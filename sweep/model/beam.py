@@ -18,13 +18,10 @@ and the light that counts lies within w_T w_L / sqrt(w_T^2 + w_L^2): what lies a
 two equal beams counts by its square, and the footprint is narrower by sqrt(2).
 
 Two laws (``instrument.telescope.coupling``): ``single_mode`` is this one; ``aperture`` is that of
-[T 4.4], where all light in the aperture mixes. Direct detection has no local oscillator: it always
-has the latter. There, a beam given by its divergence alone is as wide as divergence times range, as
-in [T]; one with a waist or a focus has its own radius.
-
-A ray stands for the light of a place, and for a direction: far away both spread alike. Near the
-telescope, and near a focus, they don't. Ranges follow places, w(R) / R; Doppler shifts follow
-directions, which spread at every range as they do far away.
+[T 4.4], where all light in the aperture mixes, as it always does in direct detection. A ray stands
+for the light of a place, and for a direction, which near the telescope and near a focus spread
+unlike: ranges follow places, w(R) / R; Doppler shifts follow directions, which spread at every
+range as they do far away.
 """
 
 import math

@@ -28,16 +28,7 @@ def quiet_below(*, chance: np.ndarray, level: np.ndarray, bins: int) -> np.ndarr
 
         x y e^-y / (1 - e^-y) e^(a^2 b^2 / 8)
 
-    (:mod:`sweep.model.leakage`), here with a b <= 1.
-
-    Parameters
-    ----------
-    chance : (n,) ndarray
-        Leakage of all those bins together that may be left out, 0..1.
-    level : (n,) ndarray
-        Threshold b over sigma, > 0.
-    bins : int
-        Number of bins.
+    (:mod:`sweep.model.leakage`), here with a b <= 1; all of them together with ``chance`` (n,).
     """
     y = 0.5 * np.square(level)
     with np.errstate(divide="ignore", over="ignore", under="ignore", invalid="ignore"):
@@ -74,30 +65,17 @@ class Fading(NamedTuple):
 def fading_together(
     one: np.ndarray, other: np.ndarray, level: np.ndarray, alike: np.ndarray
 ) -> np.ndarray:
-    """Probability that two segments in developed speckle are both detected.
+    """Probability that two segments in developed speckle are both detected; nan where one lacks.
 
     Two correlated Rayleigh magnitudes [Schwartz, Bennett and Stein, Communication Systems and
-    Techniques, 1966, appendix A]. With A, B = Th^2 over the mean powers and r the square of the
-    correlation that noise leaves,
+    Techniques, 1966, appendix A]. With A, B = Th^2 over the mean powers, e^-A and e^-B the
+    probabilities that either is detected, and r the square of the correlation that noise leaves of
+    the signals' (``alike``),
 
         e^-A (1 - Q_1(sqrt(2 B / (1-r)), sqrt(2 r A / (1-r))))
             + e^-B Q_1(sqrt(2 r B / (1-r)), sqrt(2 A / (1-r)))
 
     An echo of many bins, any of which detects, counts as the one that is detected as often.
-
-    Parameters
-    ----------
-    one, other : ndarray
-        Probabilities e^-A and e^-B that either is detected, 0..1.
-    level : ndarray
-        Threshold over the noise per quadrature.
-    alike : ndarray
-        Size of the correlation of the signals' amplitudes, 0..1.
-
-    Returns
-    -------
-    ndarray
-        nan where a segment is not there.
     """
     there, y = np.isfinite(one) & np.isfinite(other), 0.5 * level**2
     with np.errstate(divide="ignore"):
@@ -113,13 +91,8 @@ def fading_together(
 def any_two(chances: np.ndarray, others: np.ndarray) -> np.ndarray:
     """Probability that at least two of three independent events happen.
 
-    Parameters
-    ----------
-    chances, others : (3, ...) ndarray
-        Probabilities of each, and of its contrary.
+    Of the probabilities of each, and of its contrary, (3, ...).
 
-    Examples
-    --------
     >>> round(float(any_two(np.array([0.9, 0.8, 0.5]), np.array([0.1, 0.2, 0.5]))), 6)
     0.85
     """
@@ -129,28 +102,13 @@ def any_two(chances: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 @njit(cache=True, error_model="numpy")
 def mark(magnitude, count, level, exempt, beside):
-    """Find the detection in a run of bins, and mark the bins that can't raise a false alarm.
+    """Find the detection in a run of bins, and mark those that can't raise a false alarm.
 
     Adjacent bins at or above the threshold form a group; its largest bin is the detection. The bins
     of a group and the two next to it can't raise a false alarm, nor can the strongest bin and its
-    neighbours, group or not. If any bin of the echo detects, bins within a main lobe of one that
-    has half of the largest magnitude can't either.
-
-    Parameters
-    ----------
-    magnitude : (>= count,) float64
-        |X| of the bins, without noise.
-    level : float
-        Threshold.
-    exempt : (>= count,) bool
-        Result: bins that can't raise a false alarm.
-    beside : int
-        Half of a main lobe [bins] where any bin of the echo detects, else 0.
-
-    Returns
-    -------
-    peak, exempted : int
-        Index of the largest bin; number of exempt bins.
+    neighbours, group or not. If any bin of the echo detects, bins within a main lobe (half of it
+    ``beside``, else 0) of one that has half of the largest magnitude can't either. Returns the
+    index of the largest bin, and the number of exempt bins.
     """
     largest, above = _survey(magnitude[:count], level)
     peak = 0
@@ -228,18 +186,8 @@ def any_pair(magnitude, echo, low, ends, deviation, level, pairs):
 
         1 / (2 pi) int_0^{asin rho} exp(-(s^2 + t^2 - 2 s t sin u) / (2 cos^2 u)) du
 
-    to the product [Owen, Ann. Math. Statist. 27, 1956]; bins are a Markov chain of first order.
-
-    Parameters
-    ----------
-    magnitude, echo : (m,) float64, (m,) bool
-        |X| of a run of bins; those that are of the echo.
-    low, ends : int
-        First bin; N where noise at DC and Nyquist is real, else 0.
-    deviation, level : float
-        Noise per quadrature; threshold.
-    pairs : (3, k) float64
-        :func:`sweep.model.alarms.pair_nodes`; k is 0 where bins are taken as independent.
+    to the product [Owen, Ann. Math. Statist. 27, 1956], by the rule ``pairs`` of
+    :func:`sweep.model.alarms.pair_nodes`; bins are a Markov chain of first order.
     """
     found, missed, before, t_before = 0.0, 1.0, -1.0, 0.0
     for i in range(magnitude.size):
@@ -376,22 +324,10 @@ def _exempt(first, last, count, exempt):
 
 @njit(cache=True, error_model="numpy")
 def detect_rows(magnitude, first, bins, rule, deviation, level, out):
-    """Detect in spectra without noise that are given bin by bin.
+    """Detect in runs of spectra without noise, (m, count), into ``out`` (6, m).
 
-    Parameters
-    ----------
-    magnitude : (m, count) float64
-        |X| of runs of bins.
-    first : (m,) int64
-        Number of each run's first bin.
-    bins : (int, float)
-        Last bin of the spectrum, N/2, and bin width [Hz]; bins outside 0..N/2 are passed over.
-    rule : (int, int, (3, k) float64)
-        :attr:`sweep.model.preparation.Shots.echo_rule`.
-    deviation, level : (m,) float64
-        Noise per quadrature of bins that hold lines; threshold.
-    out : (6, m) float64
-        Result, by the names of :data:`sweep.model.segments.SEGMENT_FIELDS`; no leakage.
+    Its rows are those of :data:`sweep.model.segments.SEGMENT_FIELDS`; no leakage. ``bins`` are the
+    last bin of the spectrum and the bin width [Hz]; bins outside 0..N/2 are passed over.
     """
     half, width = bins
     exempt = np.empty(magnitude.shape[1], np.bool_)

@@ -16,15 +16,11 @@ vibration  of the instrument along the                     vibration          fr
            beam [m/s]
 ========== ============================= ================= ================== =================
 
-A beat's frequency is measured by the sampling clock: range and Doppler frequency scale with it. The
-wavelength turns the Doppler frequency into a velocity, v_r = lambda f_d / 2. If a beam is thought
-to point along u + d, its velocity along u is off by -v . d from that of a beam along u + d, and its
-points lie R d away. A range is that along the light's own way, however it is known to run.
-
-Common errors are one number each of a draw, for the whole flight; the pointing's, two of each beam
-and draw, which turn with the beam; vibration's, one of each shot and draw. Common errors leave no
-residual between beams: they scale the velocity's vector and the altitude, and add the outer product
-of the velocity, times their variance, to its covariance (:mod:`sweep.model.navigation`).
+A range is that along the light's own way, however it is known to run; the point lies there along
+the direction that the beam is thought to have. Common errors are one number each of a draw; the
+pointing's, two of each beam and draw, which turn with the beam; vibration's, one of each shot and
+draw. Common errors scale the velocity's vector and the altitude, and add the outer product of the
+velocity, times their variance, to its covariance (:mod:`sweep.model.navigation`).
 """
 
 from __future__ import annotations

@@ -62,25 +62,14 @@ def gaussian_rule(number: int) -> tuple[np.ndarray, np.ndarray]:
 
 @lru_cache(maxsize=32)
 def beamlets(number: int, pattern: str = "hexagonal") -> tuple[np.ndarray, np.ndarray]:
-    """Directions and weights of a Gaussian beam's beamlets.
+    """Directions (2, number) and weights (number,) of a Gaussian beam's beamlets.
 
-    Parameters
-    ----------
-    number : int
-        Beamlets, at least 1; [T 3.3.1] uses 109, a full hexagonal lattice in a circle.
-    pattern : str
-        One of :data:`PATTERNS`, or ``3 lines`` for as many parallel ones. A square has the whole
-        root of as many on each side.
-
-    Returns
-    -------
-    offsets : (2, number) ndarray
-        Angles off the axis in units of the beam's standard deviation (Theta/4), across the
-        plane's slope and along it. Their weighted mean is 0 and, from three beamlets on, their
-        covariance the identity; but that those of lines all lie to the same side, which has the
-        mean square of both sides.
-    weights : (number,) ndarray
-        Power fractions; they sum to 1.
+    Directions are angles off the axis in units of the beam's standard deviation (Theta/4), across
+    the plane's slope and along it. Their weighted mean is 0 and, from three beamlets on, their
+    covariance the identity; but that those of lines all lie to the same side, which has the mean
+    square of both sides. [T 3.3.1] uses 109, a full hexagonal lattice. The pattern is one of
+    :data:`PATTERNS`, or ``3 lines`` for as many parallel ones; a square has the whole root of the
+    number on each side.
     """
     if number == 1:
         return np.zeros((2, 1)), np.ones(1)
@@ -150,28 +139,13 @@ def plane_footprint(
 
     A plane's footprint scales with range, so one row serves every range. A beamlet y off the axis
     towards the plane's near side, and x across, sees the velocity (v_r + v_t y) / |d| with
-    |d|^2 = 1 + x^2 + y^2.
+    |d|^2 = 1 + x^2 + y^2. Angles are the axis's to the plane, 0 < . <= pi/2, and full 1/e^2 ones of
+    the beam, with ``directions`` for those that velocities are seen along [rad]; v_r is positive
+    closing, v_t towards the near side [m/s].
 
-    Parameters
-    ----------
-    grazing_angle, beam_divergence : (n,) ndarray
-        Angle between axis and plane, 0 < . <= pi/2; full 1/e^2 angle [rad].
-    number, pattern
-        Of :func:`beamlets`.
-    radial, transverse : (n,) array_like
-        Velocity along the axis, positive closing, and across it towards the near side [m/s].
-    directions : (n,) ndarray, optional
-        Full 1/e^2 angle of the directions that velocities are seen along [rad]; as of the places
-        by default (:class:`sweep.model.beam.Angles`).
-
-    Returns
-    -------
-    offset, cos_incidence
-        (R_b - R_0) / R_0, formed without subtracting the two ranges; cosine of the incidence angle.
-    weights
-        Power fractions; 0, with offset 0, for a beamlet that passes over the horizon.
-    closing
-        Closing speed of each beamlet less that of the beam's axis [m/s].
+    Returns (R_b - R_0) / R_0, formed without subtracting the two ranges; cosine of the incidence
+    angle; power fractions, 0, with offset 0, for a beamlet that passes over the horizon; and
+    closing speed less that of the beam's axis [m/s].
     """
     (across, along), share = beamlets(number, pattern)
     sigma = np.asarray(beam_divergence, float)[:, None] / 4

@@ -63,6 +63,9 @@ SMOOTHNESS = 1e-7
 MOST_POINTS = 200
 """Gauss points on one side of the lines, at the most."""
 
+WHOLE, HALF = np.bool_(False), np.bool_(True)
+"""As arguments, of NumPy because Python's would compile what takes them once more."""
+
 _LARGEST_ORDER = 12
 _GAUSS = np.zeros((2, _LARGEST_ORDER + 1, _LARGEST_ORDER))
 for _n in range(1, _LARGEST_ORDER + 1):
@@ -99,7 +102,10 @@ def inspect(origin, lines, noise, table, form, sizes, tangent, room, exempt, ser
         count = high - low + 1
         magnitudes(low, count, origin, known, room[:2, :0], table, form, sizes, tangent, room)
         peak, exempted = mark(room[OUT], count, noise[1], exempt, sizes[8])
-        chance = _of_run(count, left, noise, room, exempt, series)
+        chance = 0.0
+        if not (left > 0.0 and _at_most(count, noise, exempt, room) <= left):
+            _chances(count, noise, room, exempt, series)
+            chance = any_crossing(room[CHANCE], ZERO, count)
         return low, count, peak, exempted, chance
     near_low, near_high = run_of(float(beside), place, sizes)
     reach = _least_reach(afar, highest - lowest, noise, crossing, form, sizes)
@@ -186,15 +192,6 @@ def _at_most(count, noise, exempt, room):
     if a * a > b * b - 4.0:
         return np.inf
     return 1.2 * squares / (most * most) * math.exp(-0.5 * (b - a) * (b - a))
-
-
-@njit(cache=True, error_model="numpy")
-def _of_run(count, left, noise, room, exempt, series):
-    """Leakage of a run of bins; 0 where it is sure to be no more than is ``left`` to leave out."""
-    if left > 0.0 and _at_most(count, noise, exempt, room) <= left:
-        return 0.0
-    _chances(count, noise, room, exempt, series)
-    return any_crossing(room[CHANCE], ZERO, count)
 
 
 @njit(cache=True, error_model="numpy")
@@ -330,7 +327,7 @@ def _points_beyond(side, last, centre, steepness, sizes, tangent, room, points):
     goes_on = sizes[7] != IMAGED and last_bin < half_size
     half = half or goes_on
     far = max(_cotangent(last_bin, half, fft_size, tangent), 1e-9)
-    near = _cotangent(last, True, fft_size, tangent)
+    near = _cotangent(last, HALF, fft_size, tangent)
     start, least = near, max(far, 0.5)
     while start > far:
         if start > 8.0 * least:
@@ -347,7 +344,7 @@ def _points_beyond(side, last, centre, steepness, sizes, tangent, room, points):
     bin_ = math.pi / fft_size
     if goes_on:
         for k in range(2):
-            at = _cotangent(last_bin + k, False, fft_size, tangent)
+            at = _cotangent(last_bin + k, WHOLE, fft_size, tangent)
             room[POINT, points] = side * at
             room[WEIGHT, points] = (1.0 - 2.0 * k) / 24.0 * bin_ * (1.0 + at * at)
             points += 1

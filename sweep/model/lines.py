@@ -96,18 +96,8 @@ def place_lines(p, segment, footprint, row, sizes, room):
 
     C_b is half the amplitude, with the receiver's gain and the phase in the record's middle, in a
     spectrum whose noise is white. Returns the origin: the bin nearest to the beam's centre, -N/2 ..
-    N/2.
-
-    Parameters
-    ----------
-    p : (COMMON + OWN segments,) float64
-        The point (:meth:`sweep.model.preparation.Shots.point_table`).
-    footprint : (3 or 3 + segments, rows, beamlets) float64
-        (R_b - R_0)/R_0, beta_b - beta_0, relative amplitude; phases [cycles] by segment.
-    row : int
-        The point's row there.
-    sizes : (6,) int64
-        Of :class:`sweep.model.line_shape.Shapes`.
+    N/2. ``p`` is a column of :meth:`sweep.model.preparation.Shots.point_table`, ``footprint`` and
+    ``row`` of :attr:`~sweep.model.preparation.Shots.footprint`.
     """
     power, fft_size, length = sizes[4] != 0, sizes[0], sizes[1]
     own, start = COMMON + OWN * segment, p[7]

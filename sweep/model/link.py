@@ -1,4 +1,4 @@
-"""Link budget and receiver: the echo's beat and the noise in the photocurrent."""
+"""Receiver: its poles and filter, and the noise in the photocurrent and at the ADC."""
 
 import math
 from collections.abc import Mapping
@@ -9,55 +9,13 @@ from numpy.typing import ArrayLike
 
 from sweep.model.constants import BOLTZMANN, ELEMENTARY_CHARGE
 
+RECEIVER = "instrument.receiver."
 ARCHITECTURES = ("homodyne", "heterodyne", "direct")
 
 
 def aperture_area(aperture: np.ndarray) -> np.ndarray:
     """Area of a circular aperture [m^2] from its diameter [m], [T 4.3]."""
     return math.pi * (np.asarray(aperture) / 2) ** 2
-
-
-def echo_power_scale(
-    *,
-    power: np.ndarray,
-    area: np.ndarray,
-    optical_efficiency: np.ndarray,
-    reflectance: np.ndarray,
-    range: np.ndarray,
-) -> np.ndarray:
-    """Echo power [W] for a backscatter of 1/sr with the whole beam at one range.
-
-    [T 4.4] without its 1/(2 pi): that belongs to the reflectance law; `area` [m^2] is that of
-    :func:`sweep.model.beam.collecting_area`. A beamlet's echo is this times its power fraction, its
-    backscatter [1/sr] and what :func:`sweep.model.beam.dimming` says of its range.
-    """
-    return power * area * optical_efficiency * reflectance / range**2
-
-
-def beat_scale(
-    architecture: str,
-    *,
-    echo_power_scale: np.ndarray,
-    local_oscillator_power: np.ndarray,
-    mixing_efficiency: np.ndarray,
-    apd_gain: np.ndarray,
-    responsivity: np.ndarray,
-    modulation_index: np.ndarray,
-) -> np.ndarray:
-    """Amplitude of the beat photocurrent [A] that one unit of relative echo makes.
-
-    Coherent architectures: 2 M Re sqrt(eta P_lo P), to be multiplied by the square root of a
-    beamlet's relative echo power; eta is the heterodyne efficiency, a share of power. Direct
-    detection: m M Re P, to be multiplied by the relative echo power itself, hence 2 dB of SNR for
-    each dB of light.
-
-    [T 2.22] takes 2 Re^2 P^2 as the mean square current, which is the peak of a fully modulated
-    echo. With P the mean echo power the mean square is m^2 Re^2 P^2 / 2, a quarter of it.
-    """
-    if architecture == "direct":
-        return modulation_index * apd_gain * responsivity * echo_power_scale
-    mixed = np.sqrt(mixing_efficiency * (local_oscillator_power * echo_power_scale))
-    return 2 * apd_gain * responsivity * mixed
 
 
 def shot_noise(
@@ -84,13 +42,6 @@ class ReceiverNoise(NamedTuple):
     """Of the receiver's own, by source."""
 
 
-NOISY = (
-    "local_oscillator_power", "apd_gain", "excess_noise_factor", "responsivity",
-    "noise_equivalent_power", "amplifier_noise_current", "load_resistance", "temperature",
-    "detector_bandwidth", "amplifier_bandwidth", "noise_figure", "transimpedance",
-)  # fmt: skip
-"""Parameters of the receiver that its noise follows from."""
-
 ANTIALIAS = {"antialias_bandwidth": 0.0, "antialias_order": 6.0}
 """Parameters of the filter before the ADC, none by default, which points need not have."""
 
@@ -103,41 +54,28 @@ _STOPPED = 345.0
 
 
 def receiver_noise(
-    architecture: str, values: Mapping[str, np.ndarray], in_quadrature: bool = False
+    architecture: str, v: Mapping[str, np.ndarray], in_quadrature: bool = False
 ) -> ReceiverNoise:
-    """Noise of receivers of an architecture, from :data:`NOISY`, (n,) or scalars.
+    """Noise of receivers of an architecture, from :func:`receiver_values`, (n,) or scalars.
 
     The local oscillator's shot noise, the detector's own (M Re NEP)^2 B_e, the amplifier's rms
-    current squared. Direct detection has no local oscillator and adds its load's thermal noise
-    4 k T B_e / R_L [T 2.22]. Noise of light from outside is added by effects.
-
-    A heterodyne receiver mixes an IF down: noise from both sides of the IF lands in the record,
-    which makes the shot-limited SNR Re P / (2 q B_e) [T 2.23], half the homodyne's. Its RF noise
-    figure multiplies all of it.
+    current squared. Direct detection has no local oscillator and adds its load's thermal noise,
+    4 k T B_e / R_L [T 2.22]. A heterodyne receiver mixes an IF down: noise from both sides of the
+    IF lands in the record, which makes the shot-limited SNR Re P / (2 q B_e) [T 2.23], half the
+    homodyne's. Its RF noise figure multiplies all of it.
 
     ``in_quadrature``: of two receivers that sample I and Q, as the noise of a bin of a real record.
-    A 90 degree hybrid gives each of them half of echo and local oscillator. The bins of I + iQ then
-    show a line as those of a real record do. Shot noise of half the light each is the same
-    altogether, each one's own noise twice as much. Noise of currents which go with the light, a
-    quarter of the variance each, is half as much.
+    A 90 degree hybrid gives each of them half of echo and local oscillator, and the bins of I + iQ
+    show a line as those of a real record do. Shot noise is the same altogether, each one's own
+    noise twice as much; that of currents which go with the light, a quarter of the variance each,
+    is half.
     """
-    noise = _noise(architecture, values)
-    if not in_quadrature:
-        return noise
-    sources = {
-        name: value if name == "local_oscillator_shot" else 2 * value
-        for name, value in noise.sources.items()
-    }
-    return ReceiverNoise(noise.per_ampere / 2, noise.per_watt, sources)
-
-
-def _noise(architecture: str, v: Mapping[str, np.ndarray]) -> ReceiverNoise:
     bandwidth = electrical_bandwidth(v)
     light = {name: v[name] for name in ("apd_gain", "excess_noise_factor", "responsivity")}
     detector = (v["apd_gain"] * v["responsivity"] * v["noise_equivalent_power"]) ** 2 * bandwidth
-    passed = bandwidth / _receiver_bandwidth(v)  # what the anti-alias filter leaves of the rms
-    amplifier = np.asarray(v["amplifier_noise_current"]) ** 2 * passed
-    own = {"detector": detector, "amplifier": amplifier}
+    # what the anti-alias filter leaves of the rms
+    passed = bandwidth / np.minimum(v["detector_bandwidth"], v["amplifier_bandwidth"])
+    own = {"detector": detector, "amplifier": v["amplifier_noise_current"] ** 2 * passed}
     if architecture == "direct":
         thermal = 4 * BOLTZMANN * v["temperature"] * bandwidth / v["load_resistance"]
         own = own | {"thermal": thermal}
@@ -149,7 +87,11 @@ def _noise(architecture: str, v: Mapping[str, np.ndarray]) -> ReceiverNoise:
     scale = np.asarray(both_sides * v["transimpedance"] ** 2)
     per_watt = shot_noise(power=1.0, electrical_bandwidth=bandwidth, **light)
     sources = {source: np.asarray(value * scale) for source, value in own.items()}
-    return ReceiverNoise(scale, np.asarray(per_watt * scale), sources)
+    if in_quadrature:
+        for name in sources.keys() - {"local_oscillator_shot"}:
+            sources[name] = 2 * sources[name]
+    per_ampere = scale / 2 if in_quadrature else scale
+    return ReceiverNoise(per_ampere, np.asarray(per_watt * scale), sources)
 
 
 def rounding_variance(
@@ -178,39 +120,37 @@ def transfer(
     *,
     detector_bandwidth: np.ndarray,
     amplifier_bandwidth: np.ndarray,
-    transimpedance: np.ndarray,
 ) -> np.ndarray:
-    """Complex transfer from photocurrent to ADC voltage [ohm] at a signed frequency [Hz].
+    """Complex transfer of the receiver at a signed frequency [Hz], over that at DC.
 
-    Two single-pole low-passes, each 3 dB down at its stated bandwidth, and the transimpedance.
-    Lines are taken at the frequency they have before the ADC folds them.
+    Two single-pole low-passes, each 3 dB down at its stated bandwidth. Lines are taken at the
+    frequency they have before the ADC folds them.
     """
     poles = (1 + 1j * frequency / detector_bandwidth) * (1 + 1j * frequency / amplifier_bandwidth)
-    return transimpedance / poles
+    return 1 / poles
 
 
-def electrical_bandwidth(values: Mapping[str, np.ndarray], prefix: str = "") -> np.ndarray:
+def electrical_bandwidth(values: Mapping[str, np.ndarray]) -> np.ndarray:
     """Bandwidth B_e [Hz] over which noise is counted: the narrowest of all stages.
 
     [T] states one figure for detector and amplifier and uses it as the noise bandwidth; so does
     this. An anti-alias filter counts as a further stage.
     """
-    narrower, antialias = _receiver_bandwidth(values, prefix), antialias_of(values, prefix)
+    narrower = np.minimum(values["detector_bandwidth"], values["amplifier_bandwidth"])
+    antialias = antialias_of(values)
     return np.minimum(narrower, antialias["antialias_bandwidth"]) if antialias else narrower
 
 
-def receiver_values(p: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
-    """Parameters by name that the receiver's noise follows from."""
-    return {name: p[prefix + name] for name in NOISY} | antialias_of(p, prefix)
+def receiver_values(p: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Parameters of the receiver, by their names alone."""
+    return {
+        path.removeprefix(RECEIVER): value for path, value in p.items() if path.startswith(RECEIVER)
+    }
 
 
-def _receiver_bandwidth(values: Mapping[str, np.ndarray], prefix: str = "") -> np.ndarray:
-    return np.minimum(values[f"{prefix}detector_bandwidth"], values[f"{prefix}amplifier_bandwidth"])
-
-
-def antialias_of(values: Mapping[str, np.ndarray], prefix: str = "") -> dict[str, np.ndarray]:
-    """Parameters of the filter before the ADC by name; empty without one."""
-    found = {name: np.asarray(values.get(prefix + name, v)) for name, v in ANTIALIAS.items()}
+def antialias_of(values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Parameters of the filter before the ADC, of the receiver's; empty without one."""
+    found = {name: np.asarray(values.get(name, v)) for name, v in ANTIALIAS.items()}
     return found if np.any(found["antialias_bandwidth"]) else {}
 
 
@@ -231,13 +171,7 @@ def antialias_power(
 
 
 def noise_density(
-    frequency: np.ndarray,
-    *,
-    detector_bandwidth: np.ndarray,
-    amplifier_bandwidth: np.ndarray,
-    sample_rate: np.ndarray,
-    antialias_bandwidth: np.ndarray | float = 0.0,
-    antialias_order: np.ndarray | float = ANTIALIAS["antialias_order"],
+    frequency: np.ndarray, *, sample_rate: np.ndarray, **filters: np.ndarray
 ) -> np.ndarray:
     """Density of the noise in a record, over that of white noise of the same sources.
 
@@ -249,22 +183,19 @@ def noise_density(
     and that of two poles follows by partial fractions, or by the derivative where they are equal.
     Behind an anti-alias filter |H|^2 has its power too, and aliases are summed one by one.
     """
-    if np.any(antialias_bandwidth):
+    poles = {
+        name: np.asarray(filters[name], float)
+        for name in ("detector_bandwidth", "amplifier_bandwidth")
+    }
+    if antialias := antialias_of(filters):
         folded = frequency - sample_rate * np.rint(frequency / sample_rate)
         total = np.zeros(())
-        antialias = {
-            "antialias_bandwidth": np.asarray(antialias_bandwidth),
-            "antialias_order": np.asarray(antialias_order),
-        }
-        poles = {
-            "detector_bandwidth": detector_bandwidth, "amplifier_bandwidth": amplifier_bandwidth
-        }  # fmt: skip
         for fold in range(-_FOLDS, _FOLDS + 1):
             alias = folded + fold * sample_rate
-            passed = transfer(alias, transimpedance=np.asarray(1.0), **poles)
+            passed = transfer(alias, **poles)
             total = total + np.abs(passed) ** 2 * antialias_power(alias, **antialias)
-        return total * sample_rate / (2 * electrical_bandwidth(poles | antialias))
-    one, other = np.asarray(detector_bandwidth, float), np.asarray(amplifier_bandwidth, float)
+        return total * sample_rate / (2 * electrical_bandwidth(filters))
+    one, other = poles.values()
     cosine = np.cos(2 * np.pi * (np.asarray(frequency) / sample_rate))
     alike = np.abs(one - other) <= 1e-4 * np.minimum(one, other)
     first, slope = _pole(2 * np.pi * np.where(alike, (one + other) / 2, one) / sample_rate, cosine)

@@ -110,12 +110,8 @@ class Looks(NamedTuple):
     ) -> tuple[np.ndarray, np.ndarray]:
         """Probabilities that a bin of a steady signal is detected, and that it is not.
 
-        Parameters
-        ----------
-        signal, level : ndarray
-            |X| and threshold over the noise per quadrature of one record, >= 0.
-        real : ndarray
-            True where the noise is real, with the power of both quadratures in one.
+        |X| and threshold are over the noise per quadrature of one record. If the noise is ``real``
+        it has the power of both quadratures in one.
         """
         from scipy import stats
 
@@ -175,21 +171,12 @@ class Looks(NamedTuple):
     ) -> np.ndarray:
         """Probability that two segments in developed speckle are both detected.
 
-        Parameters
-        ----------
-        one, other : ndarray
-            |X| of their bins over the noise per quadrature; nan for a segment that is not there.
-        level : ndarray
-            Threshold over the same.
-        alike : ndarray
-            Size of the correlation of the signals' amplitudes, 0..1.
-
-        Notes
-        -----
-        Looks of their own speckle are summed over that of the first segment: given it, the second's
-        are a noncentral chi square. In one speckle of all, both segments see it: the mean over it
-        of the product. If they share but a part of it, what they have in common is that share
-        of it which two Rayleigh magnitudes of the same probabilities have.
+        By |X| of their bins and threshold over the noise per quadrature, and the size of the
+        correlation of their signals' amplitudes (``alike``). Looks of their own speckle are summed
+        over that of the first segment: given it, the second's are a noncentral chi square. In one
+        speckle of all, both segments see it: the mean over it of the product. If they share but a
+        part of it, what they have in common is that share of it which two Rayleigh magnitudes of
+        the same probabilities have.
         """
         from scipy import stats
 
@@ -236,11 +223,8 @@ class Looks(NamedTuple):
     def log_alarm(self, level: np.ndarray) -> np.ndarray:
         """Natural logarithm of the probability that a bin of noise alone is detected.
 
-        ``level`` is the threshold over the noise per quadrature of one record. It keeps its digits
-        where the probability itself leaves float64's range.
+        It keeps its digits where the probability itself leaves float64's range.
 
-        Examples
-        --------
         >>> round(float(Looks(4).log_alarm(np.array(2.0))), 4)  # ln Q(4, 8)
         -3.1611
         """
@@ -259,13 +243,7 @@ class Looks(NamedTuple):
             return np.minimum(special.logsumexp(ways + each, axis=-1), 0.0)
 
     def level(self, log_alarm: np.ndarray) -> np.ndarray:
-        """Threshold over sigma at which :meth:`log_alarm` is so much.
-
-        Examples
-        --------
-        >>> round(float(Looks(4).level(np.array(-3.1611))), 3)
-        2.0
-        """
+        """Threshold over sigma at which :meth:`log_alarm` is so much."""
         if self.several:
             return level_of(np.asarray(log_alarm, float), self.log_alarm)
         return np.asarray(np.sqrt(-2 * np.asarray(log_alarm)))
@@ -386,19 +364,6 @@ def coherent_gain(
     |mean exp(2 pi i f a t^2 / c)|, t the looks' times about their middle: what a velocity that is
     put right leaves. A laser's walking phase leaves the root of
     :func:`sweep.model.effects.line_width.coherent_share` besides.
-
-    Parameters
-    ----------
-    acceleration, carrier, period : ndarray
-        Rate at which the radial velocity grows a [m/s^2]; optical frequency f [Hz]; time from
-        look to look [s].
-
-    Examples
-    --------
-    >>> given = {"carrier": np.array(193.4e12), "period": np.array(1e-4)}
-    >>> gain = coherent_gain(Looks(16, "coherent"), acceleration=np.array(1.0), **given)
-    >>> round(float(gain), 4)
-    0.7356
     """
     place = np.arange(looks.added) - (looks.added - 1) / 2
     turn = np.asarray(carrier * acceleration * np.square(period) / SPEED_OF_LIGHT, float)
@@ -406,15 +371,7 @@ def coherent_gain(
 
 
 def level_of(log_pfa: np.ndarray, law: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """Threshold over sigma at which a segment alarms with a given probability, (n,).
-
-    Parameters
-    ----------
-    log_pfa : (n,) ndarray
-        Natural logarithm of the probability, < 0.
-    law : callable
-        Logarithm of a segment's false-alarm probability, falling, at levels (n,) from 0 up.
-    """
+    """Threshold over sigma, (n,), at which ``law``, falling from 0 on, is a logarithm of pfa."""
     # A bin alone alarms less often than n of them, and these no oftener than n each for itself.
     low, high = np.zeros_like(log_pfa), np.sqrt(2 * (100.0 - log_pfa))
     for _ in range(_HALVINGS):
@@ -435,25 +392,16 @@ def fading_any_two(
         P_i(u) = Q_1(l_i sqrt(2 u / (1 - l_i^2)), sqrt(2 A_i / (1 - l_i^2)))
 
     and given u the segments are independent. The correlations, those of
-    :func:`sweep.model.detection.fading_together`, give l_i = sqrt(rho_ij rho_ik / rho_jk): exact
-    for segments that share their speckle, or each have their own. If speckle moves on between
-    them one l_k may come out above 1. It is then 1, z is that segment's own amplitude, and of the
-    others a covariance
-    kappa = rho_ij - rho_ik rho_jk is left, which adds to the probability of both
+    :func:`sweep.model.detection.fading_together` by :class:`sweep.model.detection.Fading`, give l_i
+    = sqrt(rho_ij rho_ik / rho_jk): exact for segments that share their speckle, or each have their
+    own. If speckle moves on between them one l_k may come out above 1. It is then 1, z is that
+    segment's own amplitude, and of the others a covariance kappa = rho_ij - rho_ik rho_jk is left,
+    which adds to the probability of both
 
         kappa P_i' P_j' / 2 + kappa^2 (A_i A_j + B_i B_j) / 16,    A, B = P'' +- P' / r
 
     with derivatives by r, the mean given z: Mehler's series to its second term, within 0.002 of
     drawn amplitudes.
-
-    Parameters
-    ----------
-    pd, miss : (3, n) ndarray
-        Probabilities of up, Doppler and down segment.
-    level : (n,) ndarray
-        Threshold over the noise per quadrature.
-    alike : (3, n) ndarray
-        Sizes of the correlations of :class:`sweep.model.detection.Fading`.
     """
     from sweep.model.detection import any_two
     from sweep.model.marcum import marcum_q1

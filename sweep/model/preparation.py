@@ -64,16 +64,12 @@ class PhaseError(NamedTuple):
     values: dict[str, Any]
     """Arguments by name, (n,) or scalars; a tuple holds one for each segment."""
 
-    def chosen(
-        self, segment: int, index: np.ndarray, *, once: bool = False
-    ) -> dict[str, np.ndarray]:
-        """Arguments of some points in a segment, as many each; or one where all have it."""
-        found, size = {}, 1 if once else index.size
+    def chosen(self, segment: int, index: np.ndarray) -> dict[str, np.ndarray]:
+        """Arguments of some points in a segment, as many each."""
+        found = {}
         for name, value in self.values.items():
             value = value[segment] if isinstance(value, tuple) else value
-            found[name] = value[index] if np.ndim(value) else np.full(size, float(value))
-            if once and (found[name] == found[name][:1]).all():
-                found[name] = found[name][:1]
+            found[name] = value[index] if np.ndim(value) else np.full(index.size, float(value))
         return found
 
 
@@ -456,15 +452,7 @@ class Shots:
     def searched_bins(
         self, exempted: np.ndarray, points: np.ndarray | slice = slice(None)
     ) -> np.ndarray:
-        """Bins that can raise a false alarm.
-
-        Parameters
-        ----------
-        exempted : (3, m) ndarray
-            Bins searched that the detection of some points occupies, by segment.
-        points
-            Which points these are.
-        """
+        """Bins that can raise a false alarm, less the ``exempted``, (3, m), by segment."""
         searched: Any = self.fft_size if self.complex_record else self.fft_size // 2
         if self.real_ends:
             searched += 1 - 2 * self.searched_from
@@ -480,10 +468,7 @@ class Shots:
     def counted_bins(
         self, exempted: np.ndarray, points: np.ndarray | slice = slice(None)
     ) -> np.ndarray:
-        """Independent bins that would raise a false alarm as often as those that can.
-
-        Parameters are those of :meth:`searched_bins`.
-        """
+        """Independent bins that would raise a false alarm as often as those that can."""
         bins = self.searched_bins(exempted, points)
         if self.noise_bins == "independent":
             return bins
@@ -533,26 +518,15 @@ def in_rows(values: Sequence[np.ndarray | float], shape: tuple[int, ...]) -> np.
 def as_arrays(parameters: Parameters) -> dict[str, np.ndarray]:
     """Parameters as arrays, with the length of the record among them."""
     arrays = {path: np.asarray(value) for path, value in parameters.items()}
-    arrays["record"] = waveform.record_length(
-        fft_size=arrays[PROCESSING + "fft_size"],
-        duration=arrays[CHIRP + "duration"],
-        acquisition_delay=arrays[PROCESSING + "acquisition_delay"],
-        sample_rate=arrays[PROCESSING + "sample_rate"],
-    )
+    arrays["record"] = waveform.record_length(arrays)
     return arrays
 
 
 def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
-    """Points of one category with nothing but the echo on the beam's axis and receiver noise.
-
-    Parameters
-    ----------
-    p, size, ground : mapping, int, Ground
-        Of :func:`categories`; points n; what their beams meet.
-    """
+    """Points of one category with nothing but the echo on the beam's axis and receiver noise."""
     architecture, in_quadrature = str(p[RECEIVER + "architecture"]), str(p[RECORD]) == "complex"
     echo_scale, current_scale = link_scales(architecture, p)
-    noise = link.receiver_noise(architecture, link.receiver_values(p, RECEIVER), in_quadrature)
+    noise = link.receiver_noise(architecture, link.receiver_values(p), in_quadrature)
     row, offset, doppler, echo = ground.axis(size)
     everywhere, accuracy, looks = np.zeros(size), Accuracy.of(p), Looks.of(p)
     return Shots(
@@ -596,7 +570,7 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
         doppler=doppler,
         amplitude=relative_amplitude(architecture, echo),
         incoherent=architecture != "direct",
-        antialias=link.antialias_of(p, RECEIVER),
+        antialias=link.antialias_of(link.receiver_values(p)),
         complex_record=in_quadrature,
         looks=looks,
     )
@@ -628,22 +602,27 @@ def doppler_ratio(radial_velocity: np.ndarray) -> np.ndarray:
 
 
 def link_scales(architecture: str, p: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Echo power [W] per backscatter of 1/sr, and the beat photocurrent [A] of that."""
-    power_scale = link.echo_power_scale(
-        power=p[LASER + "power"],
-        area=beam.collecting_area(p),
-        optical_efficiency=p[TELESCOPE + "optical_efficiency"],
-        reflectance=p["target.reflectance"],
-        range=p["target.range"],
-    )
-    names = (
-        "local_oscillator_power", "mixing_efficiency", "apd_gain", "responsivity",
-        "modulation_index",
-    )  # fmt: skip
-    return power_scale, link.beat_scale(
-        architecture, echo_power_scale=power_scale, **_receiver(p, *names)
-    )
+    """Echo power [W] for a backscatter of 1/sr with the whole beam at one range; its beat [A].
+
+    [T 4.4] without its 1/(2 pi): that belongs to the reflectance law. A beamlet's echo is this
+    times its power fraction, its backscatter [1/sr] and what :func:`sweep.model.beam.dimming` says
+    of its range.
+    """
+    light = p[LASER + "power"] * beam.collecting_area(p) * p[TELESCOPE + "optical_efficiency"]
+    power = light * p["target.reflectance"] / p["target.range"] ** 2
+    return power, beat_current(architecture, p, power)
 
 
-def _receiver(p: Mapping[str, np.ndarray], *names: str) -> dict[str, np.ndarray]:
-    return {name: p[RECEIVER + name] for name in names}
+def beat_current(architecture: str, p: Mapping[str, np.ndarray], power: np.ndarray) -> np.ndarray:
+    """Amplitude of the beat photocurrent [A] that light of a power P [W] makes.
+
+    Coherent architectures: 2 M Re sqrt(eta P_lo P), eta the heterodyne efficiency, a share of
+    power. Direct detection: m M Re P, hence 2 dB of SNR for each dB of light. [T 2.22] takes
+    2 Re^2 P^2 as the mean square current, which is the peak of a fully modulated echo. With P the
+    mean echo power the mean square is m^2 Re^2 P^2 / 2, a quarter of it.
+    """
+    gain, responsivity = p[RECEIVER + "apd_gain"], p[RECEIVER + "responsivity"]
+    if architecture == "direct":
+        return p[RECEIVER + "modulation_index"] * gain * responsivity * power
+    light = p[RECEIVER + "local_oscillator_power"] * power
+    return 2 * gain * responsivity * np.sqrt(p[RECEIVER + "mixing_efficiency"] * light)

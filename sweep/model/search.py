@@ -19,12 +19,14 @@ def cut(shots: Any, runs: Any) -> Any:
     """
     if shots.band is None:
         return runs
-    part, inside = runs.part, np.ones(runs.low.shape, np.bool_)
+    part = runs.part
     numbers = np.array([runs.low, runs.bins, runs.peak, runs.exempted, runs.start])
     chances = np.array([runs.pd, runs.miss, runs.leakage])
     period = shots.fft_size if shots.complex_record else 0
     band = np.ascontiguousarray(shots.band[:, :, part])
-    _find_outside(numbers, band, period, inside)
+    apart = runs.low + runs.peak - band[:, 0]
+    apart = apart % period if period else apart
+    inside = (runs.bins == 0) | ((apart >= 0) & (apart < band[:, 1]))
     lines = np.empty((part.size, 3, 0)) if inside.all() else beamlet_lines(shots)[part]
     each = shots.line_deviation, shots.threshold, shots.bin_deviation, shots.floor
     levels = np.array([np.broadcast_to(column, shots.size)[part] for column in each])
@@ -71,35 +73,15 @@ def _is_in(bin_, band, period):
     return 0 <= apart < band[1]
 
 
-@njit(cache=True, error_model="numpy")
-def _find_outside(numbers, band, period, inside):
-    """Unmark the runs whose largest bin is not searched."""
-    low, count, peak, _, _ = numbers
-    for s in range(low.shape[0]):
-        for j in range(low.shape[1]):
-            if count[s, j] > 0:
-                inside[s, j] = _is_in(low[s, j] + peak[s, j], band[s, :, j], period)
-
-
 @njit(cache=True, nogil=True, error_model="numpy")
 def _cut(numbers, where, levels, how, magnitudes, exempts, chances):
     """Cut runs to the band, in place.
 
-    Parameters
-    ----------
-    numbers : (5, segments, m) int64
-        Low, count, peak, exempted and start of each run.
-    where : tuple
-        Band (3, 2, m), N of complex records or 0, places of lines (m, 3, beamlets), and runs whose
-        largest bin is searched (3, m).
-    levels : (4, m) float64
-        Noise under lines, threshold, noise of other bins, floor of leakage over that.
-    how : tuple
-        :attr:`sweep.model.preparation.Shots.echo_rule`; segments (3,) whose leakage is looked at.
-    magnitudes, exempts : ndarray
-        Of all runs.
-    probabilities : (3, segments, m) float64
-        pd, miss and leakage.
+    ``numbers`` (5, segments, m) are low, count, peak, exempted and start of runs; ``where`` the
+    band (3, 2, m), N of complex records or 0, places of lines (m, 3, beamlets), and whether a run's
+    largest bin is searched; ``levels`` (4, m) noise under lines, threshold, noise of other bins,
+    and floor of leakage over that; ``how`` the rule of detection and segments whose leakage is
+    looked at; ``chances`` (3, segments, m) pd, miss and leakage.
     """
     (band, period, lines, inside), (rule, leaks) = where, how
     low, count, peak, exempted, start = numbers

@@ -43,15 +43,12 @@ from sweep.model.spectrum import (
     A_IM,
     A_RE,
     COMPLEX,
-    F_IM,
-    F_RE,
     FOLDED,
     IMAGED,
     MOST_CELLS,
     OUT,
     ROOM,
     detect,
-    field,
 )
 from sweep.model.window import Window
 
@@ -150,25 +147,11 @@ def runs_of(
     keep: bool = True,
     whole: bool = False,
 ) -> Iterator[Runs]:
-    """Yield runs of all points, some points at a time, in any order.
+    """Yield runs of all points, or of those in ``points``, some points at a time, in any order.
 
-    Parameters
-    ----------
-    shots : Shots
-        Prepared points.
-    points : (m,) ndarray, optional
-        Numbers of the points to look at, by default all.
-    least : (n,) ndarray, optional
-        Level [V, summed over the record] below which bins may be left out, by default the
-        threshold; 0 gives all.
-    leakage : bool
-        Look at leakage where shots have it.
-    every_bin : bool
-        Look at each bin by itself where leakage could be summed as an integral.
-    keep : bool
-        Hand the bins' magnitudes on.
-    whole : bool
-        Look at bins that are not searched as well.
+    Bins below ``least`` (n,) [V, summed over the record], by default the threshold, may be left
+    out. With ``every_bin`` each bin is looked at by itself where leakage could be summed as an
+    integral; ``keep`` hands magnitudes on; ``whole`` has bins that are not searched as well.
     """
     table = shots.point_table()
     levels = table[11] if least is None else np.broadcast_to(least, shots.size)
@@ -209,19 +192,7 @@ def _of_looks(shots: Shots, runs: Runs, leakage: bool) -> Runs:
 def spectrum(shots: Shots, i: int, segment: int, *, level: float = 0.0) -> tuple:
     """Bins of a segment in which the echo stands above a level, and |X| there, without noise.
 
-    Parameters
-    ----------
-    shots : Shots
-        Prepared points.
-    i, segment : int
-        Point; 0 up, 1 Doppler, 2 down.
-    level : float
-        Magnitude [V, summed over the record] below which bins may be left out; 0 gives all.
-
-    Returns
-    -------
-    bins : (m,) int ndarray
-    magnitude : (m,) ndarray
+    Bins below the level [V, summed over the record] may be left out; 0 gives all.
     """
     shots = replace(shots, leak_amplitude=None)
     (runs,) = runs_of(
@@ -230,33 +201,6 @@ def spectrum(shots: Shots, i: int, segment: int, *, level: float = 0.0) -> tuple
     low = int(runs.low[segment, 0])
     magnitude = runs.run(segment, 0).copy()
     return np.arange(low, low + magnitude.size), magnitude
-
-
-def tones(window: Window, fft_size: int, place: np.ndarray, first: int, count: int) -> np.ndarray:
-    """|W| that lone tones at places of bin 0 show in bins ``first`` .., (count, m)."""
-    shapes = (
-        line_shape.shapes(window, fft_size, False, 0)
-        if line_shape.has_modes(window, fft_size)
-        else _plain(window, fft_size, False, 1)
-    )
-    room, found = (
-        np.empty((ROOM, max(count, LEAST_WIDTH, MOST_CELLS) + 16)),
-        np.empty((count, place.size)),
-    )
-    table = np.empty((2, line_shape.places_of(shapes.sizes)))
-    form = np.zeros((7, shapes.reach.shape[1]))
-    modes = np.zeros((1, 1, 2, 1))
-    modes[..., 0, :] = 1.0
-    parts = np.zeros((1, 1)), modes, np.ones((1, 1), np.int64), np.empty((1, 2, 0))
-    line_shape.build(0, (0, -1), parts, shapes, table, form)
-    room[RE, 0], room[IM, 0] = 1.0, 0.0
-    for i, at in enumerate(place):
-        room[PLACE, 0] = at
-        field(
-            first, count, (1, at, at, 0, 0.0), table, form, shapes.sizes, tangents(fft_size), room
-        )
-        found[:, i] = np.hypot(room[F_RE, :count], room[F_IM, :count])
-    return found
 
 
 def _bin(shots: Shots, number: np.ndarray) -> np.ndarray:
@@ -496,15 +440,6 @@ def _take_lines(p, where, footprint, centre, shift, window_sum, limits, sizes, r
 
 
 @njit(cache=True, error_model="numpy")
-def _used(shift):
-    """Shifts of a point that have any weight."""
-    number = 0
-    while number < shift.shape[1] and shift[1, number] > 0.0:
-        number += 1
-    return shift[:, :number]
-
-
-@njit(cache=True, error_model="numpy")
 def _keep(at, count, room, exempt, magnitudes, exempts):
     """Hands a run on, from ``at`` on; where the next one begins."""
     for k in range(count):
@@ -516,26 +451,14 @@ def _keep(at, count, room, exempt, magnitudes, exempts):
 def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, work, out):
     """Compute runs of points; return the number of points that there was room for.
 
-    Parameters
-    ----------
-    points : (m, COMMON + OWN segments) float64
-        :meth:`sweep.model.preparation.Shots.point_table`.
-    where : (2, m) int64
-        Rows in the footprints; shapes.
-    footprint : (3 or 3 + segments, rows, beamlets) float64
-    modes, shapes
-        Of :class:`Together`, with shifts (m, segments, 2, k); sizes with the view and half of the
-        echo's main lobe at their end.
-    tables : tuple
-        Limits of nodes; tangents.
-    how : tuple
-        Segments that there are; levels below which bins may be left out; each segment's way to look
-        at leakage; the window's sum; rule of detection.
-    made, work : tuple
-        Room for shapes; for spectra.
-    out : tuple
-        Results: low, count, peak, exempted and start (5, segments, m); pd, miss, magnitude and
-        leakage (4, segments, m); magnitudes and exempt bins of runs, which may have no room at all.
+    ``points`` are rows of :meth:`sweep.model.preparation.Shots.point_table`; ``where`` (2, m) rows
+    in the footprints, and shapes; ``modes`` and ``shapes`` those of :class:`Together`, with shifts
+    (m, segments, 2, k) and with sizes that end in the view and half of the echo's main lobe;
+    ``tables`` limits of nodes, and tangents; ``how`` segments that there are, levels below which
+    bins may be left out, each segment's way to look at leakage, the window's sum, and the rule of
+    detection. ``made`` and ``work`` are room for shapes and for spectra. Results (``out``): low,
+    count, peak, exempted and start (5, segments, m); pd, miss, magnitude and leakage (4, segments,
+    m); magnitudes and exempt bins of runs, which may have no room at all.
     """
     centre, shifts = modes[0], modes[3]
     sizes, limits, tangent = shapes[0], tables[0], tables[1]
@@ -558,7 +481,7 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
         for s in range(segments.size):
             if not segments[s]:
                 continue
-            shift = _used(shifts[i, s])
+            shift = shifts[i, s][:, : np.count_nonzero(shifts[i, s, 1])]  # zeros are last
             origin, n, total, lowest, highest = _take_lines(
                 p, (s, row), footprint, centre[s, which], shift, window_sum, limits, sizes, room
             )

@@ -36,13 +36,8 @@ def prepare(
 ) -> Iterator[tuple[np.ndarray, Shots]]:
     """Shots on a flat plane, split by category: (indices, :class:`Shots`) for each.
 
-    Parameters
-    ----------
-    parameters : mapping
-        Dotted path to SI scalar, string or (n,) array, for every parameter of instrument, target,
-        footprint and accuracy, and for those of effects that are not at their defaults.
-    effects : collection of str
-        Names of the effects that are simulated.
+    Parameters by dotted path are SI scalars, strings or (n,) arrays: all of instrument, target,
+    footprint and accuracy, and those of effects that are not at their defaults.
     """
     for index, p in resolved_categories(DEFAULTS | dict(parameters), effects, SHARED):
         plane = Plane(p, index.size, moving="doppler_spread" in effects)
@@ -193,14 +188,8 @@ def fit(
 ) -> waveform.Resolution:
     """Range and radial velocity at the shot's start, by :func:`sweep.model.waveform.fit`.
 
-    Parameters
-    ----------
-    shots : Shots
-        Prepared points.
-    peaks, weights : (3, n) ndarray
-        Frequencies [Hz] by segment, and their weights, 0 where a segment is not detected.
-    point : ndarray of int, optional
-        Point that each peak is of; by default one after the other.
+    Frequencies of peaks [Hz] by segment, (3, n), and weights, 0 where a segment is not detected;
+    ``point`` says which point each is of.
     """
     size = (shots.size,)
     walk, rate = np.broadcast_to(shots.walk, size), np.broadcast_to(shots.sample_rate, size)

@@ -46,15 +46,7 @@ _SLOPE = np.array(
 
 
 def outcomes(shots: Any, pd: np.ndarray, miss: np.ndarray) -> dict[str, np.ndarray]:
-    """Probabilities of segments and shot, (n,) by name: ``pd_``, ``miss_``, ``p_wrong_range_``.
-
-    Parameters
-    ----------
-    shots : Shots
-        Prepared points, one record of each segment.
-    pd, miss : (3, n) ndarray
-        Probabilities that each segment's echo crosses the threshold, and that it does not.
-    """
+    """Probabilities of segments and shot, (n,) by name: ``pd_``, ``miss_``, ``p_wrong_range_``."""
     lost, alarm, shared = np.zeros((3, shots.size)), np.zeros((3, shots.size)), np.zeros(shots.size)
     for runs in runs_of(shots, every_bin=True):
         lost[:, runs.part], alarm[:, runs.part], shared[runs.part] = _of_runs(shots, runs, pd)
@@ -153,24 +145,11 @@ def _excess_pair(a, b, alike):
 def _at_levels(numbers, inside, bins, levels, noise, how, lost, silence):
     """Evaluate runs at all levels: what the echo loses there, and what leaked signal adds.
 
-    Parameters
-    ----------
-    numbers : (4, segments, m) int64
-        Low, count, peak and start of each run.
-    inside : (segments, m) bool
-        True where the echo's largest bin is searched.
-    bins : tuple
-        |X| [V] of all runs, and whether bins are of the echo.
-    levels : (segments, m, k) float64
-        Levels [V], the threshold first.
-    noise : tuple
-        Noise per quadrature of bins with lines, and of others [V]; floor of leakage over that.
-    how : tuple
-        :attr:`sweep.model.preparation.Shots.echo_rule`; whether leakage is looked at.
-    lost : (segments, m, k) float64
-        Result: P_b - P_z.
-    silence : (segments, m, k) float64
-        -ln P(Z < z), to which that of leaked signal is added.
+    ``numbers`` (4, segments, m) are low, count, peak and start of runs; ``bins`` |X| [V] of all
+    runs, and whether they are of the echo; ``levels`` (segments, m, k) [V], the threshold first;
+    ``noise`` that of bins with lines, and of others [V], and the floor of leakage over that;
+    ``how`` the rule of detection, and whether leakage is looked at. Results, of the levels' shape:
+    ``lost`` P_b - P_z; ``silence`` -ln P(Z < z), to which that of leaked signal is added.
     """
     low, count, peak, start = numbers
     deviation, sigma, floor = noise
@@ -200,15 +179,10 @@ def _at_levels(numbers, inside, bins, levels, noise, how, lost, silence):
 def _share(weights, rare, share, alike, shared):
     """Excess probability that both peaks are right if noise crosses in either, (m,) in place.
 
-    Parameters
-    ----------
-    weights, rare, share : tuple
-        Of up and down segment, (m, 1 + k) each, the threshold first: probabilities of levels that
-        the echo has to cross; -ln P_z; share of signal in the power of the bin detected as often.
-    alike : (m,) float64
-        Square of the correlation of the signals' amplitudes.
-    shared : (m,) float64
-        Result.
+    ``weights``, ``rare`` and ``share`` are of up and down segment, (m, 1 + k) each, the threshold
+    first: probabilities of levels that the echo has to cross; -ln P_z; share of signal in the power
+    of the bin detected as often. ``alike`` is the square of the correlation of the signals'
+    amplitudes.
     """
     for j in range(shared.size):
         up, down, total = weights[0][j], weights[1][j], 0.0

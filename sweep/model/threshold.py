@@ -43,19 +43,8 @@ RAYLEIGH_MEAN = math.sqrt(math.pi / 2)
 def tnr_of(p: Mapping[str, Any]) -> np.ndarray:
     """Threshold-to-noise ratio of points that share their words and sizes, however it is written.
 
-    Parameters
-    ----------
-    p : mapping
-        Dotted path to SI scalar or array, as for :func:`sweep.model.shot.prepare`; of the
-        parameters :data:`WAYS` exactly one.
+    A ValueError where none of the parameters :data:`WAYS` is there, or several.
 
-    Raises
-    ------
-    ValueError
-        None of them is there, or several.
-
-    Examples
-    --------
     >>> four_times_the_mean = tnr_of({"instrument.processing.threshold_to_mean": 4.0})
     >>> round(float(four_times_the_mean), 2)
     7.65
@@ -102,15 +91,6 @@ def segment_bins(p: Mapping[str, Any], level: np.ndarray, segment: str = "up") -
     """Independent bins that alarm as often as those of a segment that a detection takes none of.
 
     As :meth:`sweep.model.preparation.Shots.counted_bins`. Segments differ where a band is searched.
-
-    Parameters
-    ----------
-    p : mapping
-        As of :func:`tnr_of`.
-    level : (n,) ndarray
-        Threshold over sigma, >= 0.
-    segment : str
-        Of :data:`sweep.model.waveform.SEGMENTS`.
     """
     size = int(np.max(p[PROCESSING + "fft_size"]))
     is_all = str(p[PROCESSING + "bins_counted"]) == "all"
@@ -122,13 +102,7 @@ def segment_bins(p: Mapping[str, Any], level: np.ndarray, segment: str = "up") -
             number = number_of(band, size, 1, is_signed=in_quadrature)[row]
             return number + np.zeros(np.shape(level))
         return np.full(np.shape(level), float(size if is_all else size // 2))
-    record = record_length(
-        fft_size=np.asarray(size),
-        duration=p["instrument.chirp.duration"],
-        acquisition_delay=p[PROCESSING + "acquisition_delay"],
-        sample_rate=p[PROCESSING + "sample_rate"],
-    )
-    taper = window(canonical_name(str(p[PROCESSING + "window"])), int(np.max(record)))
+    taper = window(canonical_name(str(p[PROCESSING + "window"])), int(np.max(record_length(p))))
     first = 1 if in_quadrature else alarms.first_circular(taper, size)
     bins = size if is_all else max(size // 2 + 1 - 2 * first, 0)
     if band is not None:

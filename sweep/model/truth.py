@@ -29,17 +29,9 @@ def spectrum(
     """|X[k]| of point i's segment, without noise, for k = 0..N/2, (N // 2 + 1,).
 
     Of a complex record for k = -N/2..N/2 - 1, (N,). With incoherent phases: the root of the mean of
-    |X|^2 over independent uniform phases.
-
-    Parameters
-    ----------
-    segment : int
-        0 up, 1 Doppler, 2 down.
-    range_walk, acceleration : bool
-        Whether the terms of the phase in t^2 are kept, the frequency drift while the target moves,
-        which the fast path leaves out; whether the velocity drifts within the record.
-    laser_phase : (L,) ndarray or float
-        Phase theta(t) - theta(t - tau) of the laser in each sample [rad].
+    |X|^2 over independent uniform phases. ``range_walk`` keeps the terms of the phase in t^2, the
+    frequency drift while the target moves; ``acceleration`` that of its velocity; ``laser_phase``
+    (L,) is theta(t) - theta(t - tau) in each sample [rad].
     """
     w = window.samples(shots.window.name, shots.window.length)
     half, signed = shots.fft_size // 2 + 1, shots.complex_record
@@ -133,7 +125,6 @@ def analytic_record(
         np.array(beat),
         detector_bandwidth=_at(shots.detector_bandwidth, i),
         amplifier_bandwidth=_at(shots.amplifier_bandwidth, i),
-        transimpedance=np.array(1.0),
     )
     amplitude = _at(shots.beat_scale, i) * shots.amplitude[shots.row[i], beamlet]
     amplitude = amplitude * shots.whitening[segment][i]

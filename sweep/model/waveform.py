@@ -16,11 +16,8 @@ Table 4.1 by 0.2 bins at 150 m/s. The terms in t^2 are range walk, an effect of 
 segment starts with the target at range R; that it moves on in between is an effect too.
 
 A shot has an up- and a down-chirp, in any order, and may have a Doppler segment before, between or
-behind them: the lander's ``up doppler down``, the triangle ``up down`` of automotive lidars. All
-last as long, with equal gaps. Without a Doppler segment two beats tell of two unknowns, and
-half sum and half difference could be exchanged. The target is taken to be further away than
-|v_r| c / (lambda S), so that |f_d| < f_r, and no beat to be folded. Complex records (I and Q) keep
-the sign of each beat, and two tell both unknowns.
+behind them. All last as long, with equal gaps. Two beats of real records tell both unknowns by an
+assumption (docs/physics.md, *A segment that is missed*); complex records keep the sign of each.
 """
 
 from collections.abc import Mapping, Sequence
@@ -106,13 +103,7 @@ def carrier_frequencies(
 
 
 def slopes_of(p: Mapping[str, Any]) -> tuple[float, ...]:
-    """Chirp rate of each segment over the up-chirp's, of points that share them.
-
-    Examples
-    --------
-    >>> slopes_of({DOWN_SLOPE: 0.5})
-    (1.0, 0.0, 0.5)
-    """
+    """Chirp rate of each segment over the up-chirp's, of points that share them."""
     doppler, down = (float(np.ravel(p.get(x, DEFAULTS[x]))[0]) for x in (DOPPLER_SLOPE, DOWN_SLOPE))
     return 1.0, doppler, down
 
@@ -140,20 +131,7 @@ def order_of(architecture: str, segments: str) -> tuple[str, ...]:
 def segment_starts(
     order: tuple[str, ...], *, duration: np.ndarray, gap: np.ndarray | float = 0.0
 ) -> tuple[np.ndarray, ...]:
-    """Return times [s] from the shot's start to that of up, Doppler and down segment; 0 for none.
-
-    Parameters
-    ----------
-    order : tuple of str
-        Of :func:`order_of`.
-    duration, gap : (n,) ndarray or float
-        Length of a segment, and time from its end to the next one's start [s], >= 0.
-
-    Examples
-    --------
-    >>> [float(start) for start in segment_starts(("up", "down"), duration=32e-6, gap=1e-6)]
-    [0.0, 0.0, 3.3e-05]
-    """
+    """Return times [s] from the shot's start to each segment's: up, Doppler, down; 0 for none."""
     step = np.asarray(duration, float) + gap
     return tuple(step * (order.index(name) if name in order else 0) for name in SEGMENTS)
 
@@ -171,16 +149,11 @@ def beat_frequency(
     return carrier * beta - slope * chirp_rate * (2 * range / SPEED_OF_LIGHT) * (1 + beta)
 
 
-def record_length(
-    *,
-    fft_size: np.ndarray,
-    duration: np.ndarray,
-    acquisition_delay: np.ndarray,
-    sample_rate: np.ndarray,
-) -> np.ndarray:
+def record_length(p: Mapping[str, Any]) -> np.ndarray:
     """Return the record's length [samples]: the FFT's, or what the chirp leaves after the delay."""
-    available = np.floor((duration - acquisition_delay) * sample_rate + 1e-6)
-    return np.minimum(fft_size, available).astype(np.int64)
+    left = p["instrument.chirp.duration"] - p["instrument.processing.acquisition_delay"]
+    available = np.floor(left * p["instrument.processing.sample_rate"] + 1e-6)
+    return np.minimum(p["instrument.processing.fft_size"], available).astype(np.int64)
 
 
 def fold(frequency: np.ndarray, sample_rate: np.ndarray) -> np.ndarray:
@@ -297,8 +270,8 @@ def fit(
         f_i = carrier_i beta - rate_i x,
 
     and every assignment of signs (and folds at Nyquist) to the peaks gives a fit. Of three peaks or
-    more that of the least misfit is taken, of those whose range is not negative, a fold counting
-    as :data:`FOLD_PENALTY` bins. Two peaks fit whatever their signs, and an assumption decides:
+    more that of the least misfit is taken, of those whose range is not negative, a fold counting as
+    :data:`FOLD_PENALTY` bins. Two peaks fit whatever their signs, and an assumption decides:
 
     - ``far``: the range beat exceeds the Doppler shift in every chirp, so that a beat has the
       sign opposite to its chirp rate; that of a segment without a chirp is positive (closing);
@@ -309,38 +282,10 @@ def fit(
     segments of rates furthest apart give the least range that is not negative, and a Doppler shift
     within half the sample rate.
 
-    Parameters
-    ----------
-    peaks : (k, n) ndarray
-        Frequencies of the peaks [Hz]: 0..fs/2, or with signs.
-    weights : (k, n) ndarray
-        Inverse variances of the peaks, in any unit; 0 for a segment that is not detected.
-    carriers, rates : (k, n) ndarray
-        Carrier [Hz], and signed chirp rate [Hz/s] of each segment. To refer results to the start
-        of the shot, add to the carrier of a segment rate times the time of its record.
-    sample_rate, bin_width : (n,) ndarray or float
-        [Hz]
-    signed : bool
-        True for peaks of complex records.
-    assumed : str
-        ``far`` or ``fast``.
-
-    Returns
-    -------
-    Resolution
-        nan where segments of less than two different chirp rates are detected.
-
-    Examples
-    --------
-    Two up-chirps, the second of half the slope, 300 m away and closing at 10 m/s:
-
-    >>> carriers, rates = np.full((2, 1), 1.93e14), np.array([[1e14], [5e13]])
-    >>> beats = [beat_frequency(1.0, carrier=1.93e14, chirp_rate=rate, range=np.array([300.0]),
-    ...                         radial_velocity=np.array([10.0])) for rate in rates]
-    >>> found = fit(np.abs(beats), weights=np.ones((2, 1)), carriers=carriers, rates=rates,
-    ...             sample_rate=1e9, bin_width=1e5)
-    >>> round(float(found.range[0]), 6), round(float(found.radial_velocity[0]), 6)
-    (300.0, 10.0)
+    Peaks [Hz], inverse variances in any unit (``weights``, 0 for a segment that is not detected),
+    carriers [Hz] and signed chirp rates [Hz/s] are (k, n). To refer results to the start of the
+    shot, add to a carrier its rate times the time of its record. nan where segments of less than
+    two different chirp rates are detected.
     """
     shape = np.shape(peaks)
     carriers, rates, weights = (np.broadcast_to(v, shape) for v in (carriers, rates, weights))

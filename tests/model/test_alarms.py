@@ -8,15 +8,20 @@ from sweep.model import philox, shot, truth
 from sweep.model.alarms import (
     first_circular,
     independent_bins,
-    log_segment_pfa,
     neighbour_correlation,
 )
 from sweep.model.detection import RAYLEIGH_DEVIATION, crossing_pair
-from sweep.model.marcum import marcum_q1
+from sweep.model.marcum import log_at_least_one, marcum_q1
 from sweep.model.sampling import simulate
 from sweep.model.window import samples, window
 
 NOISE_BINS = "instrument.processing.noise_bins"
+
+
+def log_segment_pfa(bins, level, correlation):
+    """Natural logarithm of the probability that noise alone crosses in any of n adjacent bins."""
+    number = independent_bins(bins, level=level, correlation=correlation)
+    return log_at_least_one(-0.5 * np.square(level), number)
 
 
 def noise(name, length, fft_size, draws, seed):

@@ -49,7 +49,7 @@ class Instrument(NamedTuple):
         # enough samples that what a transform's circle brings back is far from the record
         whole = OVER * (length + 64)
         high = np.fft.rfftfreq(whole, 1 / (OVER * rate))
-        gain = link.transfer(high, transimpedance=1.0, **poles)
+        gain = link.transfer(high, **poles)
         within = link.electrical_bandwidth(poles) / (OVER * rate / 2)
         white = rng.normal(size=(draws, whole)) * np.sqrt(shots.noise_variance[0] / within)
         return np.fft.irfft(gain * np.fft.rfft(white, axis=1), axis=1)[:, : OVER * length : OVER]

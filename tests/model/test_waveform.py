@@ -76,9 +76,9 @@ def test_the_delay_turns_the_optical_frequency_into_phase_or_the_radio_frequency
 
 def test_the_record_ends_with_the_chirp():
     def length(fft_size, delay, rate=600e6, duration=500e-6):
-        return record_length(
-            fft_size=fft_size, duration=duration, acquisition_delay=delay, sample_rate=rate
-        )
+        given = {"fft_size": fft_size, "acquisition_delay": delay, "sample_rate": rate}
+        given = {f"instrument.processing.{name}": value for name, value in given.items()}
+        return record_length(given | {"instrument.chirp.duration": duration})
 
     assert length(2**17, 0.0) == 2**17
     assert length(2**18, 0.0) == 2**18

@@ -8,14 +8,16 @@ from typing import Any
 import mpmath as mp
 import numpy as np
 from cases import EPS, Family
-from engine import run_of_bins
+from engine import run_of_bins, shape_of
 from exact_spectrum import magnitudes, transform
 from hard_marcum import mixture
 from table_shots import shots
 
 from sweep.model.line_shape import SHARED
-from sweep.model.segments import tones
+from sweep.model.lines import IM, LEAST_WIDTH, PLACE, RE
+from sweep.model.segments import tangents
 from sweep.model.shot import find
+from sweep.model.spectrum import F_IM, F_RE, MOST_CELLS, ROOM, field
 from sweep.model.window import COSINE_SUMS, samples, window
 
 FAMILY = Family(
@@ -33,8 +35,12 @@ PEAK = {"measure": "abs(X), of the peak", "reference": "sum over all samples, ex
 
 def kernel(name: str, size: int, delta: float, bins: Iterable[int]) -> Iterator[float]:
     """|W| of single bins, unpadded, for a line `delta` bins off bin 0."""
+    table, form, sizes, _, _ = shape_of(window(name, size), size)
+    room = np.empty((ROOM, max(LEAST_WIDTH, MOST_CELLS) + 16))
+    room[PLACE, 0], room[RE, 0], room[IM, 0] = delta, 1.0, 0.0
     for k in bins:
-        yield float(tones(window(name, size), size, np.array([delta]), k, 1)[0, 0])
+        field(k, 1, (1, delta, delta, 0, 0.0), table, form, sizes, tangents(size), room)
+        yield float(np.hypot(room[F_RE, 0], room[F_IM, 0]))
 
 
 def far(size: int) -> list[int]:

@@ -122,10 +122,9 @@ def _bounds(snr: tuple[np.ndarray, ...], p: dict[str, np.ndarray]) -> estimators
 def _alike(snr: list[np.ndarray], p: dict[str, np.ndarray]) -> estimators.Deviation:
     """Bounds of points of one architecture, waveform, window and record."""
     size, rate = int(p["fft_size"][0]), float(p["sample_rate"][0])
-    length = int(waveform.record_length(
-        fft_size=p["fft_size"][:1], duration=p["duration"][:1], acquisition_delay=p["delay"][:1],
-        sample_rate=p["sample_rate"][:1],
-    )[0])  # fmt: skip
+    record = {"fft_size": size, "sample_rate": rate, "acquisition_delay": p["delay"][0]}
+    record = {f"instrument.processing.{name}": value for name, value in record.items()}
+    length = int(waveform.record_length(record | {"instrument.chirp.duration": p["duration"][0]}))
     shape = window(str(p["window"][0]), length)
     slopes = np.ones_like(p["down_slope"]), p["doppler_slope"], p["down_slope"]
     carriers = waveform.carrier_frequencies(

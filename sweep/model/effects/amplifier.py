@@ -29,7 +29,6 @@ B_e / P_lo. Direct detection has no local oscillator.
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from sweep.model import link
 from sweep.model.constants import PLANCK, SPEED_OF_LIGHT
@@ -42,69 +41,35 @@ _AMPLIFIED, _ISOLATION = LASER + "amplified_light", TELESCOPE + "isolation"
 SENT, BOTH = "sent", "sent and local oscillator"
 
 
-def emission(*, wavelength: ArrayLike, inversion: ArrayLike, gain: ArrayLike) -> np.ndarray:
+def emission(p: Mapping[str, np.ndarray]) -> np.ndarray:
     """Density n_sp (G - 1) h nu [W/Hz] of spontaneous emission, in one polarisation.
 
-    Parameters
-    ----------
-    wavelength, inversion, gain : array_like
-        [m]; n_sp, 1 for full inversion; G >= 1.
-
-    Examples
-    --------
-    A gain of 30 dB at 1550 nm: 0.13 fW/Hz.
-
-    >>> f"{emission(wavelength=1550e-9, inversion=1.0, gain=1001.0):.3g}"
+    >>> given = {_INVERSION: 1.0, _GAIN: 1001.0, LASER + "wavelength": 1550e-9}
+    >>> f"{emission(given):.3g}"
     '1.28e-16'
     """
-    energy = PLANCK * SPEED_OF_LIGHT / np.asarray(wavelength, float)
-    return np.asarray(energy * np.asarray(inversion, float) * (np.asarray(gain, float) - 1))
+    energy = PLANCK * SPEED_OF_LIGHT / p[LASER + "wavelength"]
+    return np.asarray(energy * p[_INVERSION] * (p[_GAIN] - 1))
 
 
-def beat_variance(
-    *,
-    density: ArrayLike,
-    power: ArrayLike,
-    apd_gain: ArrayLike,
-    responsivity: ArrayLike,
-    electrical_bandwidth: ArrayLike,
-) -> np.ndarray:
-    """Return the current variance 4 (M Re)^2 P N B_e [A^2] of light that beats with emission.
-
-    Parameters
-    ----------
-    density, power : array_like
-        N on the detector [W/Hz], P [W].
-    apd_gain, responsivity, electrical_bandwidth : array_like
-        As of :func:`sweep.model.link.shot_noise`.
-    """
-    scale = (np.asarray(apd_gain, float) * np.asarray(responsivity, float)) ** 2
-    light = np.asarray(power, float) * np.asarray(density, float)
-    return np.asarray(4 * scale * light * np.asarray(electrical_bandwidth, float))
-
-
-def _current(p: Mapping[str, np.ndarray], amplified: str) -> np.ndarray:
-    """Return the current variance of points by their parameters [A^2]."""
-    density = emission(wavelength=p[LASER + "wavelength"], inversion=p[_INVERSION], gain=p[_GAIN])
+def current_variance(p: Mapping[str, np.ndarray], amplified: str) -> np.ndarray:
+    """Return the current variance 4 (M Re)^2 P N B_e [A^2] of light that beats with emission."""
     oscillator = p[RECEIVER + "local_oscillator_power"]
     mixed = p[RECEIVER + "mixing_efficiency"] / p[_ISOLATION]
     if amplified == BOTH:
         rejected = p[RECEIVER + "common_mode_rejection"] * p[LASER + "power"]
         mixed = mixed + oscillator / rejected
-    return beat_variance(
-        density=density * mixed,
-        power=oscillator,
-        apd_gain=p[RECEIVER + "apd_gain"],
-        responsivity=p[RECEIVER + "responsivity"],
-        electrical_bandwidth=link.electrical_bandwidth(p, RECEIVER),
-    )
+    scale = (p[RECEIVER + "apd_gain"] * p[RECEIVER + "responsivity"]) ** 2
+    light = oscillator * (emission(p) * mixed)
+    bandwidth = link.electrical_bandwidth(link.receiver_values(p))
+    return np.asarray(4 * scale * light * bandwidth)
 
 
 def emission_size(points: Points) -> Size | None:
     """Return the beat noise, exactly; the threshold is set on it."""
     if points.architecture == "direct" or not points.has(_INVERSION):
         return None
-    current = _current(points.parameters, points.word(_AMPLIFIED))
+    current = current_variance(points.parameters, points.word(_AMPLIFIED))
     return Size(noise=current * points.receiver.per_ampere / points.noise_variance)
 
 
@@ -112,7 +77,7 @@ def add_emission(shots: Shots, scene: Scene) -> Shots:
     """Beat noise of spontaneous emission; direct detection has none."""
     if shots.architecture == "direct":
         return shots
-    current = _current(scene.parameters, str(scene.parameters[_AMPLIFIED]))
+    current = current_variance(scene.parameters, str(scene.parameters[_AMPLIFIED]))
     return noisier(shots, spontaneous_emission=current * shots.noise_scale)
 
 

@@ -125,14 +125,6 @@ def _mean_extinction(
     return np.asarray(a0 + (a1 - a0) * ((start + end) / 2 - z0) / (z1 - z0))
 
 
-def transmission(
-    profile: Profile, *, start_height: ArrayLike, end_height: ArrayLike, range: ArrayLike
-) -> np.ndarray:
-    """Transmission T = exp(-tau) of a path, one way, 0..1; parameters of :func:`optical_depth`."""
-    depth = optical_depth(profile, start_height=start_height, end_height=end_height, range=range)
-    return np.exp(-depth)
-
-
 PATH_ELEVATION = "path.elevation"
 """Angle of the beam below the horizon [rad] by shot; only of scenes."""
 
@@ -167,7 +159,7 @@ def dim(shots: Shots, scene: Scene) -> Shots:
     air = profile_of(scene.parameters)
     if air is None:
         return shots
-    t = transmission(air, **_path(scene.parameters, shots.range))
+    t = np.exp(-optical_depth(air, **_path(scene.parameters, shots.range)))
     return replace(
         shots,
         echo_scale=shots.echo_scale * t**2,
@@ -181,7 +173,7 @@ def dimming_size(points: Points) -> Size | None:
     air = profile_of(points.parameters)
     if air is None:
         return None
-    t = transmission(air, **_path(points.parameters, points.range))
+    t = np.exp(-optical_depth(air, **_path(points.parameters, points.range)))
     light = points.echo_noise
     if (sun := noise_sources.sun_size(points)) is not None:
         light = light + sun.noise

@@ -37,14 +37,13 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from sweep.model import link
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.effect import Effect, Parameter, Scene, Size, noisier
 from sweep.model.effects.points import Points
 from sweep.model.looks import Looks
-from sweep.model.preparation import LASER, RECEIVER, TELESCOPE, Shots
+from sweep.model.preparation import LASER, RECEIVER, TELESCOPE, Shots, beat_current
 from sweep.model.window import Window, samples
 
 MASKED_FROM = 0.5
@@ -55,83 +54,27 @@ _PHASES = 16
 PATH, ISOLATION = TELESCOPE + "leak_path", TELESCOPE + "isolation"
 
 
-def excess_density(
-    *,
-    leaked: ArrayLike,
-    beat: ArrayLike,
-    delay: ArrayLike,
-    electrical_bandwidth: ArrayLike,
-    relative_intensity_noise: ArrayLike,
-    common_mode_rejection: ArrayLike,
-    local_oscillator_power: ArrayLike,
-    line_width: ArrayLike,
-) -> np.ndarray:
-    """Relative variance of the leaked beat's noise within a bandwidth, of a gain M Re of 1.
-
-    Parameters
-    ----------
-    leaked, local_oscillator_power : array_like
-        Powers P_l and P_lo [W].
-    beat : array_like
-        Amplitude i of the beat over M Re [W].
-    delay, line_width : array_like
-        Delay tau [s]; width v of the Lorentzian line [Hz], 0 for none.
-    electrical_bandwidth : array_like
-        B_e [Hz].
-    relative_intensity_noise, common_mode_rejection : array_like
-        One-sided density [1/Hz]; ratio of powers.
-
-    Returns
-    -------
-    ndarray
-        Variance [W^2], to be multiplied by (M Re)^2.
-
-    Examples
-    --------
-    10 uW that leak over 1 m, of a laser of 100 kHz: as much as the shot noise of 0.9 W.
-
-    >>> laser = {"line_width": 1e5, "relative_intensity_noise": 0.0, "common_mode_rejection": 1.0}
-    >>> light = {"leaked": 1e-5, "local_oscillator_power": 1e-3, "beat": 2e-4}
-    >>> f"{excess_density(**light, **laser, delay=3.34e-9, electrical_bandwidth=1e8):.3g}"
-    '2.8e-11'
-    """
-    half, width = np.square(beat) / 2, np.asarray(line_width, float)
-    band, time = np.asarray(electrical_bandwidth, float), np.asarray(delay, float)
-    light, oscillator = np.asarray(leaked, float), np.asarray(local_oscillator_power, float)
-    common = (2 * oscillator + light) * light / np.asarray(common_mode_rejection, float)
-    intensity = np.asarray(relative_intensity_noise, float) * band * (common + half)
-    phase = 2 * np.pi * width * time * np.minimum(2 * time * band, 1.0)
-    return np.asarray(intensity + half * phase)
-
-
 def _leaked(p: Mapping[str, np.ndarray], architecture: str) -> tuple[np.ndarray, np.ndarray]:
     """Leaked light [W], and amplitude of its beat's photocurrent [A]."""
     power = np.asarray(p[LASER + "power"] / p[ISOLATION])
-    names = (
-        "local_oscillator_power", "mixing_efficiency", "apd_gain", "responsivity",
-        "modulation_index",
-    )  # fmt: skip
-    own = {name: p[RECEIVER + name] for name in names}
-    return power, np.asarray(link.beat_scale(architecture, echo_power_scale=power, **own))
+    return power, beat_current(architecture, p, power)
 
 
-def _variance(p: Mapping[str, np.ndarray], architecture: str, shape: str) -> np.ndarray:
+def excess(p: Mapping[str, np.ndarray], architecture: str, shape: str) -> np.ndarray:
     """Compute the current variance [A^2] of the beat's noise; direct detection has no beat."""
     if architecture == "direct":
         return np.zeros(())
-    power, current = _leaked(p, architecture)
+    light, current = _leaked(p, architecture)
     scale = p[RECEIVER + "apd_gain"] * p[RECEIVER + "responsivity"]
-    width = p[LASER + "line_width"] if shape == "lorentzian" else 0.0
-    return scale**2 * excess_density(
-        leaked=power,
-        beat=current / scale,
-        delay=p[PATH] / SPEED_OF_LIGHT,
-        electrical_bandwidth=link.electrical_bandwidth(p, RECEIVER),
-        relative_intensity_noise=p[LASER + "relative_intensity_noise"],
-        common_mode_rejection=p[RECEIVER + "common_mode_rejection"],
-        local_oscillator_power=p[RECEIVER + "local_oscillator_power"],
-        line_width=width,
-    )
+    band, delay = link.electrical_bandwidth(link.receiver_values(p)), p[PATH] / SPEED_OF_LIGHT
+    half = np.square(current / scale) / 2
+    common = (2 * p[RECEIVER + "local_oscillator_power"] + light) * light
+    common = common / p[RECEIVER + "common_mode_rejection"]
+    variance = p[LASER + "relative_intensity_noise"] * band * (common + half)
+    if shape == "lorentzian":
+        phase = 2 * np.pi * p[LASER + "line_width"] * delay * np.minimum(2 * delay * band, 1.0)
+        variance = variance + half * phase
+    return np.asarray(scale**2 * variance)
 
 
 def leak_size(points: Points) -> Size | None:
@@ -141,7 +84,7 @@ def leak_size(points: Points) -> Size | None:
     p, own = points.parameters, points.receiver
     noise = _leaked(p, points.architecture)[0] * own.per_watt
     shape = points.word(LASER + "line_shape")
-    noise = noise + _variance(p, points.architecture, shape) * own.per_ampere
+    noise = noise + excess(p, points.architecture, shape) * own.per_ampere
     return Size(noise=noise / points.noise_variance, chance=1.0)
 
 
@@ -149,8 +92,8 @@ def add_leak(shots: Shots, scene: Scene) -> Shots:
     """Add the leaked light's noise and its line."""
     p = scene.parameters
     power, current = _leaked(p, shots.architecture)
-    excess = _variance(p, shots.architecture, str(p[LASER + "line_shape"])) * shots.noise_scale
-    shots = noisier(shots, leak_shot=shots.shot_noise_scale * power, leak_excess=excess)
+    beat = excess(p, shots.architecture, str(p[LASER + "line_shape"])) * shots.noise_scale
+    shots = noisier(shots, leak_shot=shots.shot_noise_scale * power, leak_excess=beat)
     return replace(
         shots,
         leak_amplitude=current * p[RECEIVER + "transimpedance"],
@@ -195,9 +138,10 @@ def line_of(shots: Shots, i: int, segment: int, at: float | None = None) -> tupl
     )
     beat = -shots.waveform[segment].slope * rate * delay
     gain = link.transfer(
-        np.array(beat), detector_bandwidth=np.array(detector),
-        amplifier_bandwidth=np.array(amplifier), transimpedance=np.array(1.0),
-    )  # fmt: skip
+        np.array(beat),
+        detector_bandwidth=np.array(detector),
+        amplifier_bandwidth=np.array(amplifier),
+    )
     whitened = shots.whitened(np.array(beat), None if at is None else np.array(at))
     own = float(np.broadcast_to(whitened, shots.size)[i])
     scale = 0.5 * amplitude * abs(complex(gain)) * own
@@ -206,16 +150,9 @@ def line_of(shots: Shots, i: int, segment: int, at: float | None = None) -> tupl
 
 
 def alarm(looks: Looks, line: Line, bins: np.ndarray, *, scale: float, level: float) -> float:
-    """Probability that a line raises an alarm in some bins where noise alone does not.
+    """Probability that a line raises an alarm in some of its bins where noise alone does not.
 
-    Parameters
-    ----------
-    looks : Looks
-        How records are combined.
-    bins : (m,) int ndarray
-        Bins of the line that are looked at.
-    scale, level : float
-        Half of the line's amplitude, and the threshold, over the noise per quadrature.
+    ``scale`` and ``level`` are half of the line's amplitude and the threshold, over the noise.
     """
     one, other = scale * line.terms[:, bins]
     phases = np.pi * (np.arange(_PHASES) + 0.5) / _PHASES  # its magnitude has this period
@@ -231,21 +168,8 @@ def raised(
 ) -> np.ndarray:
     """|X| of an echo's bins that cross as often as those with the line in them do, (m,).
 
-    Parameters
-    ----------
-    own, line : (m,) ndarray
-        |X| of the echo and root mean square |L| of the line [V].
-    deviation, level : float
-        Noise per quadrature and threshold [V].
-    fades : bool
-        Whether ``own`` is the root mean square of an echo that fades; the line never does.
-
-    Examples
-    --------
-    Without noise to speak of a steady echo and a line of 3 and 4 V come to 5 V.
-
-    >>> float(raised(np.array([3.0]), np.array([4.0]), deviation=1.0, level=9.0, fades=False)[0])
-    5.0
+    ``own`` is |X| of the echo, the root mean square of one that ``fades``; ``line`` the root mean
+    square of the line's [V]; ``deviation`` and ``level`` noise per quadrature and threshold [V].
     """
     from sweep.model.marcum import marcum_q1  # needs the compiler, too
 

@@ -18,12 +18,6 @@ from sweep.model.preparation import Parameters, Shots
 if TYPE_CHECKING:
     from sweep.model.effects.points import Points, Smear
 
-STAGES = ("lines", "light", "noise", "record", "spectrum", "detection", "draws")
-"""Stages at which effects act, in this order: on the lines of a footprint; on the light that comes
-back; on the noise; on the record and its phases; on the spectrum; on what is detected in it; and,
-draw by draw, on all of these at random.
-"""
-
 MODES = ("auto", "on", "off")
 
 
@@ -126,7 +120,9 @@ class Effect:
     about: str
     """Description in a few words, for tables and help."""
     stage: str
-    """One of :data:`STAGES`."""
+    """Stage at which it acts, in this order: on the ``lines`` of a footprint; on the ``light`` that
+    comes back; on the ``noise``; on the ``record`` and its phases; on the ``spectrum``; on the
+    ``detection``; and, in ``draws``, on all of these at random."""
     size: "Callable[[Points], Size | None]"
     """Change at each point by leaving it out. None: the scene has nothing of it."""
     smear: "Callable[[Points], Smear | None] | None" = None

@@ -23,15 +23,8 @@ GAIN, PHASE = RECEIVER + "iq_gain_imbalance", RECEIVER + "iq_phase_imbalance"
 def image_gain(*, gain: ArrayLike, phase: ArrayLike) -> np.ndarray:
     """Amplitude of the image over the line's, 0..1.
 
-    Parameters
-    ----------
-    gain : array_like
-        Power of Q over that of I, > 0.
-    phase : array_like
-        Departure from 90 degrees between them [rad].
+    By the power of Q over that of I, and their phase's departure from 90 degrees [rad].
 
-    Examples
-    --------
     >>> leak = image_gain(gain=10**0.05, phase=0.0523598776)  # 0.5 dB and 3 deg
     >>> round(float(20 * np.log10(leak)), 1)
     -28.2

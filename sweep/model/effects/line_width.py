@@ -204,19 +204,11 @@ def seen_line(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Line and pedestal in the line's bin as |X| sees them, but for the phase of all the record.
 
-    Of looks that are added in amplitude the phase of a record counts too: each has its own. Other
-    arguments as of :func:`power_under_line`.
+    Returns, (n,) each: the share of the power |C W(0)|^2 in the line, more than
+    :func:`coherent_share`; and the mean square of what is in phase with it, over |C|^2 of the line:
+    as noise, half of this is the pedestal's share. If looks are added in amplitude the phase of a
+    record counts too: each has its own.
 
-    Returns
-    -------
-    share : (n,) ndarray
-        Of the power |C W(0)|^2 in the line, 0..1: more than :func:`coherent_share`.
-    in_phase : (n,) ndarray
-        Mean square of what is in phase with it, over |C|^2 of the line, >= 0: as noise, half of
-        this is the pedestal's share.
-
-    Notes
-    -----
     With C(t, s) the covariance of phi and E_t = exp(-C(t, t) / 2), both less the mean under the
     window w, the line is m = sum w E, and its fellow sum w E w E cosh C - m^2. As
     C(t, s) = c(t - s) - q(t) - q(s), c the triangle Gamma (tau - |t|), each exponential is one of a

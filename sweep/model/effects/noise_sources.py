@@ -52,11 +52,6 @@ def sunlight(*, wavelength: ArrayLike, distance: ArrayLike, elevation: ArrayLike
     """Spectral irradiance [W/m^3] of a level surface by a black sun; 0 for a distance of 0.
 
     Planck's radiance pi B(wavelength, T) (R / d)^2 sin(elevation).
-
-    Parameters
-    ----------
-    wavelength, distance, elevation : array_like
-        [m]; from the sun [m]; of the sun above the surface [rad].
     """
     x, d = np.asarray(wavelength, float), np.asarray(distance, float)
     exponent = PLANCK * SPEED_OF_LIGHT / (x * BOLTZMANN * SUN_TEMPERATURE)
@@ -67,41 +62,22 @@ def sunlight(*, wavelength: ArrayLike, distance: ArrayLike, elevation: ArrayLike
     return np.asarray(exitance * dilution * np.maximum(np.sin(elevation), 0.0))
 
 
-def solar_power(
-    *,
-    solar_irradiance: np.ndarray,
-    reflectance: np.ndarray,
-    aperture: np.ndarray,
-    beam_divergence: np.ndarray,
-    optical_passband: np.ndarray,
-    optical_efficiency: np.ndarray,
-) -> np.ndarray:
-    """Sunlight [W] scattered into the receiver by a diffuse surface that fills its field of view.
-
-    Radiance E rho / pi, seen through the aperture, over the solid angle of the beam's full
-    divergence and the optical passband. E is the spectral irradiance on the surface [W/m^3].
-    """
-    solid_angle = np.pi * (np.asarray(beam_divergence) / 2) ** 2
-    radiance = solar_irradiance * reflectance / np.pi
-    area = link.aperture_area(aperture)
-    return radiance * area * solid_angle * optical_passband * optical_efficiency
-
-
 def received(p: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Sunlight on the detector [W] without extinction, (n,) or scalar."""
+    """Sunlight [W] that a diffuse surface sends onto the detector, without extinction.
+
+    Radiance E rho / pi of a surface that fills the field of view, through the aperture, over the
+    field's solid angle and the optical passband; E is the spectral irradiance on it [W/m^3].
+    """
     lit = p[_IRRADIANCE] + sunlight(
         wavelength=p[LASER + "wavelength"], distance=p[_DISTANCE], elevation=p[_ELEVATION]
     )
     field = np.asarray(p[_FIELD], float)
     diameter, angle = beam.receiving_field(p)
-    return solar_power(
-        solar_irradiance=lit,
-        reflectance=p["target.reflectance"],
-        aperture=np.where(field > 0, p[TELESCOPE + "aperture"], diameter),
-        beam_divergence=np.where(field > 0, field, angle),
-        optical_passband=p[RECEIVER + "optical_passband"],
-        optical_efficiency=p[TELESCOPE + "optical_efficiency"],
-    )
+    area = link.aperture_area(np.where(field > 0, p[TELESCOPE + "aperture"], diameter))
+    solid_angle = np.pi * (np.where(field > 0, field, angle) / 2) ** 2
+    radiance = lit * p["target.reflectance"] / np.pi
+    light = radiance * area * solid_angle * p[RECEIVER + "optical_passband"]
+    return np.asarray(light * p[TELESCOPE + "optical_efficiency"])
 
 
 def sun_size(points: Points) -> Size | None:
@@ -155,58 +131,26 @@ SOLAR_BACKGROUND = Effect(
 _RIN, _REJECTION = LASER + "relative_intensity_noise", RECEIVER + "common_mode_rejection"
 
 
-def current_variance(
-    *,
-    relative_intensity_noise: ArrayLike,
-    common_mode_rejection: ArrayLike,
-    local_oscillator_power: ArrayLike,
-    apd_gain: ArrayLike,
-    responsivity: ArrayLike,
-    electrical_bandwidth: ArrayLike,
-) -> np.ndarray:
+def current_variance(p: Mapping[str, np.ndarray]) -> np.ndarray:
     """Compute the current variance [A^2] from intensity noise of the local oscillator.
 
     One diode sees (M Re P_lo)^2 RIN B_e. The two diodes of a balanced receiver see the same
-    fluctuation and subtract it, all but their mismatch. The common-mode rejection (in dB 20 log10
+    fluctuation and subtract it, all but their mismatch: the common-mode rejection (in dB 20 log10
     of the ratio of their currents) divides the variance. Both are taken to be flat over the
     electrical bandwidth. The echo's own is left out: it is below that by P / P_lo.
-
-    Parameters
-    ----------
-    relative_intensity_noise : array_like
-        One-sided density of dP/P [1/Hz], >= 0; -150 dB/Hz is 1e-15/Hz. (n,) or scalar, as all.
-    common_mode_rejection : array_like
-        Ratio of powers, >= 1; 1 for a single diode, 25 dB is 316.
-    local_oscillator_power : array_like
-        Power [W] on the detector; 0 for direct detection.
-    apd_gain, responsivity, electrical_bandwidth : array_like
-        As for :func:`sweep.model.link.shot_noise`.
     """
-    current = (
-        np.asarray(apd_gain, float)
-        * np.asarray(responsivity, float)
-        * np.asarray(local_oscillator_power, float)
-    )
-    seen = np.asarray(relative_intensity_noise, float) / np.asarray(common_mode_rejection, float)
-    return current**2 * seen * np.asarray(electrical_bandwidth, float)
-
-
-def _current(p: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Compute the current variance [A^2] of points from their parameters."""
-    own = ("local_oscillator_power", "apd_gain", "responsivity")
-    return current_variance(
-        relative_intensity_noise=p[_RIN],
-        common_mode_rejection=p[_REJECTION],
-        electrical_bandwidth=link.electrical_bandwidth(p, RECEIVER),
-        **{name: p[RECEIVER + name] for name in own},
-    )
+    current = p[RECEIVER + "apd_gain"] * p[RECEIVER + "responsivity"]
+    current = current * p[RECEIVER + "local_oscillator_power"]
+    seen = p[_RIN] / p[_REJECTION]
+    bandwidth = link.electrical_bandwidth(link.receiver_values(p))
+    return np.asarray(current**2 * seen * bandwidth)
 
 
 def intensity_size(points: Points) -> Size | None:
     """Intensity noise, exactly; the threshold is set on it."""
     if points.architecture == "direct" or not points.has(_RIN):
         return None
-    current = _current(points.parameters)
+    current = current_variance(points.parameters)
     return Size(noise=current * points.receiver.per_ampere / points.noise_variance)
 
 
@@ -214,7 +158,8 @@ def add_intensity(shots: Shots, scene: Scene) -> Shots:
     """Intensity noise of the local oscillator; direct detection has none."""
     if shots.architecture == "direct":
         return shots
-    return noisier(shots, relative_intensity=_current(scene.parameters) * shots.noise_scale)
+    current = current_variance(scene.parameters)
+    return noisier(shots, relative_intensity=current * shots.noise_scale)
 
 
 RELATIVE_INTENSITY_NOISE = Effect(

@@ -112,15 +112,7 @@ def means(window: Window) -> Means:
 
 
 def over_record(points: Points, terms: Mapping[int, np.ndarray]) -> Smear:
-    """Express a polynomial in time by powers of the place in the record, -1..1.
-
-    Parameters
-    ----------
-    points : Points
-        Points that are planned.
-    terms : mapping
-        Coefficients [cycles/s^j] by power j, 2..4, of the time since the segment's start.
-    """
+    """Polynomial in the place in the record of a phase sum_j c_j t^j, c_j [cycles/s^j] by j."""
     half = 0.5 * points.record_duration
     middle = points.start + half
     found: list[np.ndarray | float] = [0.0] * 5
@@ -215,20 +207,10 @@ def walk_phase(
     duration: np.ndarray,
     slide: np.ndarray | float = 0.0,
 ) -> np.ndarray:
-    """Phase [cycles] that range walk adds to the line's, (n, m).
+    """Phase [cycles] that range walk adds to the line's, (n, m), at places x (m,) of the record.
 
-    Parameters
-    ----------
-    x : (m,) ndarray
-        Places in the record, -1 at its first sample, 1 one sample past its last.
-    sign : int
-        Sign of the chirp: +1 up, 0 Doppler, -1 down.
-    chirp_rate, radial_velocity : (n,) ndarray
-        Chirp rate B/T [Hz/s]; radial velocity at the segment's start [m/s], positive closing.
-    start, duration : (n,) ndarray
-        Acquisition delay t_0 and length L/fs of the record [s].
-    slide : (n,) ndarray
-        Speed by which the range along the beam falls faster than at the radial velocity [m/s].
+    ``slide`` is the speed [m/s] by which the range along the beam falls faster than at the radial
+    velocity at the segment's start.
     """
     beta = 2 * np.asarray(radial_velocity, float) / SPEED_OF_LIGHT
     drift = sign * chirp_rate * (beta * (1 + beta / 2) + slide / SPEED_OF_LIGHT)
@@ -280,17 +262,7 @@ def acceleration_phase(
     start: np.ndarray,
     duration: np.ndarray,
 ) -> np.ndarray:
-    """Phase [cycles] that acceleration adds to the beat, (n, m).
-
-    Parameters
-    ----------
-    carrier : (n,) ndarray
-        Frequency f_seg at the segment's start [Hz].
-    range, acceleration : (n,) ndarray
-        Of the target at the segment's start [m, m/s^2], positive closing.
-    x, sign, chirp_rate, radial_velocity, start, duration
-        As of :func:`walk_phase`.
-    """
+    """Phase [cycles] that acceleration adds to the beat, (n, m); values at the segment's start."""
     alpha = _column(np.asarray(acceleration) / SPEED_OF_LIGHT)
     beta = _column(2 * np.asarray(radial_velocity) / SPEED_OF_LIGHT)
     delay = _column(2 * np.asarray(range) / SPEED_OF_LIGHT)
@@ -384,14 +356,8 @@ def table_phase(
 ) -> np.ndarray:
     """Phase [cycles] that a measured error of the sweep adds to the beat, (n, m).
 
-    Before its first row and after its last the table's error stays what it is there.
-
-    Parameters
-    ----------
-    table : SweepTable
-        The error; the down-chirp runs through it backwards.
-    x, sign, chirp_duration, range, radial_velocity, start, duration
-        As of :func:`sweep_phase`.
+    The down-chirp runs through the table backwards. Before its first row and after its last the
+    error stays what it is there.
     """
     if sign == 0:
         return np.zeros((np.size(range), np.size(x)))
@@ -418,14 +384,7 @@ def sweep_phase(
 ) -> np.ndarray:
     """Phase [cycles] that the sweep's error adds to the beat, (n, m).
 
-    Parameters
-    ----------
-    chirp_duration : (n,) ndarray
-        Length T of the chirp [s].
-    quadratic, cubic, sinusoidal, periods : (n,) ndarray
-        Peaks q, k and p [Hz], either sign, and periods m of the last over the sweep, > 0.
-    x, sign, range, radial_velocity, start, duration
-        As of :func:`acceleration_phase`.
+    Peaks q, k and p [Hz], either sign, and periods m > 0 of the last over a sweep of length T [s].
     """
     if sign == 0:
         return np.zeros((np.size(range), np.size(x)))

@@ -64,21 +64,12 @@ def plan(
 ) -> Plan:
     """Effects to be simulated in each tile of some points.
 
-    Parameters
-    ----------
-    points : Points
-        All points of the tiles.
-    tiles : callable
-        Largest value in each tile, (tiles,), of values that broadcast over the points.
-    modes : mapping, optional
-        Name to ``auto`` (by default), ``on`` or ``off``. An effect that the scene has nothing of
-        is left out, even if it is on. With one that is off go those that are within it; a
-        ValueError where one of these is on.
-    tolerance : float
-        On the sum of the changes by all that is left out, 0..1: of pd in the three segments
-        together, of log10 of a false alarm's probability, of a relative magnitude.
-    effects : sequence of Effect, optional
-        Those to choose from, all by default.
+    ``tiles`` gives the largest value in each tile, (tiles,), of values that broadcast over the
+    points. ``modes`` are ``auto`` (by default), ``on`` or ``off`` by name. An effect that the scene
+    has nothing of is left out, even if it is on. With one that is off go those that are within it;
+    a ValueError where one of these is on. ``tolerance`` is on the sum of the changes by all that is
+    left out, 0..1: of pd in the three segments together, of log10 of a false alarm's probability,
+    of a relative magnitude.
     """
     names = tuple(effect.name for effect in effects)
     decided = _decided(effects, modes or {})

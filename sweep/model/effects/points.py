@@ -169,12 +169,7 @@ class Points:
     @cached_property
     def window(self) -> Window:
         """Window of the record, whose length all points share."""
-        length = waveform.record_length(
-            fft_size=self[PROCESSING + "fft_size"],
-            duration=self[CHIRP + "duration"],
-            acquisition_delay=self.start,
-            sample_rate=self.sample_rate,
-        )
+        length = waveform.record_length(self.parameters)
         return window(canonical_name(self.word(PROCESSING + "window")), int(length.flat[0]))
 
     @cached_property
@@ -207,7 +202,7 @@ class Points:
     @cached_property
     def receiver(self) -> link.ReceiverNoise:
         """Noise at the ADC [V^2]."""
-        values = link.receiver_values(self.parameters, RECEIVER)
+        values = link.receiver_values(self.parameters)
         return link.receiver_noise(self.architecture, values, self.word(RECORD) == "complex")
 
     @cached_property
@@ -374,7 +369,7 @@ class Points:
     @cached_property
     def antialias(self) -> dict[str, np.ndarray]:
         """Bandwidth [Hz] and order of the filter before the ADC; empty without one."""
-        return link.antialias_of(self.parameters, RECEIVER)
+        return link.antialias_of(link.receiver_values(self.parameters))
 
     @cached_property
     def tilt(self) -> np.ndarray:

@@ -149,10 +149,10 @@ def beat_amplitude(shots: Shots) -> np.ndarray:
     ]
     lowest = np.min(np.abs(beats), axis=0)
     gain = link.transfer(
-        lowest, transimpedance=np.ones(1),
+        lowest,
         detector_bandwidth=shots.detector_bandwidth,
         amplifier_bandwidth=shots.amplifier_bandwidth,
-    )  # fmt: skip
+    )
     if shots.antialias:
         gain = gain * np.sqrt(link.antialias_power(lowest, **shots.antialias))
     echo = shots.relative_echo

@@ -4,14 +4,10 @@ A segment that starts at t finds the target at R - u t - a t^2 / 2 and v_r + a t
 at which the range along the beam falls. This is 7.5 cm nearer after 500 us at 150 m/s. [T] has all
 segments begin at one range (``segment_motion: off``).
 
-Two speeds. The light that comes back at any instant is that of the scatterers in the beam: its
-Doppler shift is their v_r = V.d, V the velocity of instrument against ground and d the beam's
-direction. The scatterers change as the beam slides over the ground, and the delay with them. So a
-plane of normal n is met at a range that falls by u = (V + R d').n / d.n, d' the rate at which the
-beam turns. On level flight u is 0, however fast the ground ahead closes. Likewise a = d(V.d)/dt is
-that of the beam, V'.d + V.d'. The acceleration of a scatterer is less by v_perp^2 / R. This
-difference bends its phase while it is in the beam, against a spread of Doppler shifts that is
-larger by as much as the footprint is than what slides past. It is left out.
+Two speeds (docs/physics.md, *The beam slides*). Doppler shifts are those of the scatterers in the
+beam, v_r = V.d for the velocity V and the direction d. The range falls by u = (V + R d').n / d.n on
+a plane of normal n, as the beam, which turns by d', slides over it. Likewise a = d(V.d)/dt is that
+of the beam, V'.d + V.d'.
 
 Beamlets keep their scatterers: their ranges differ by what their own velocities have made of it.
 

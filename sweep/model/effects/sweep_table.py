@@ -49,24 +49,12 @@ class SweepTable(NamedTuple):
 
 @lru_cache(maxsize=16)
 def sweep_table(text: str) -> SweepTable:
-    """Fit a table of the sweep's frequency error, least squares over its rows.
+    """Fit a table of rows ``time error`` [s, Hz], separated by commas, by least squares.
 
-    Parameters
-    ----------
-    text : str
-        Rows ``time error`` [s, Hz], separated by commas; the times rise.
+    A ValueError where no series whose degree suits the number of rows leaves so little as
+    :data:`TABLE_RESIDUAL`. Degrees above twice the root of the number would swing between rows.
 
-    Raises
-    ------
-    ValueError
-        No series whose degree suits the number of rows leaves so little as
-        :data:`TABLE_RESIDUAL`. Degrees above twice the root of the number would swing between rows.
-
-    Examples
-    --------
-    A straight line needs degree 1 alone.
-
-    >>> sweep_table("0.0 0.0, 1.0 1.0, 2.0 2.0").series.round(12).tolist()
+    >>> sweep_table("0.0 0.0, 1.0 1.0, 2.0 2.0").series.round(12).tolist()  # a straight line
     [1.0, 1.0]
     """
     time, error = np.array([row.split() for row in text.split(",")], float).T

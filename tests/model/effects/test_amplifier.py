@@ -5,7 +5,7 @@ import pytest
 from effect_points import points_of
 
 from sweep.model import shot
-from sweep.model.effects.amplifier import BOTH, beat_variance, emission, emission_size
+from sweep.model.effects.amplifier import BOTH, current_variance, emission, emission_size
 from sweep.model.effects.catalogue import CORE
 
 RATE, NUMBER = 600e6, 2**18
@@ -20,11 +20,20 @@ def _emission():
     return np.sqrt(DENSITY * RATE / 2) * (parts[0] + 1j * parts[1])
 
 
-def _variance(**given):
-    return beat_variance(
-        density=DENSITY, power=OSCILLATOR, apd_gain=GAIN, responsivity=RESPONSIVITY,
-        electrical_bandwidth=RATE / 2, **given,
-    )  # fmt: skip
+LIGHT = {"instrument.laser.wavelength": 1550e-9, "instrument.laser.spontaneous_emission": 1.6}
+
+
+def _variance():
+    """By an amplifier of which so much passes an isolation."""
+    receiver = {
+        "local_oscillator_power": OSCILLATOR, "mixing_efficiency": 1.0, "apd_gain": GAIN,
+        "responsivity": RESPONSIVITY, "detector_bandwidth": RATE / 2,
+        "amplifier_bandwidth": RATE / 2,
+    }  # fmt: skip
+    given = {f"instrument.receiver.{name}": value for name, value in receiver.items()}
+    given |= LIGHT | {"instrument.laser.amplifier_gain": 1000.0}
+    isolation = {"instrument.telescope.isolation": emission(given) / DENSITY}
+    return current_variance(given | isolation, "sent")
 
 
 def test_emission_beats_with_the_local_oscillator_on_both_diodes_of_a_receiver():
@@ -57,7 +66,7 @@ def test_a_shot_has_as_much_noise_more_as_the_law_says_of_its_receiver(table_4_1
         "instrument.receiver.common_mode_rejection": rejection,
     }
     density = 6.62607015e-34 * 299792458.0 / 1550e-9 * inversion * (gain - 1)
-    assert emission(wavelength=1550e-9, inversion=inversion, gain=gain) == pytest.approx(density)
+    assert emission(LIGHT | {"instrument.laser.amplifier_gain": gain}) == pytest.approx(density)
     on_detector = density / isolation  # and 1 mW of the local oscillator, of 1 W sent
     on_detector += density * 1e-3 / 1.0 / rejection if amplified == BOTH else 0.0
     (_, bare), (_, noisy) = (

@@ -64,22 +64,22 @@ def test_the_beats_noise_is_that_of_simulated_records():
         # dP/P of both beams is a half each of the beat's amplitude: their root is the power.
         record = beat * power * np.cos(phase + theta)
         density += np.abs(np.fft.rfft(record)[first:last]) ** 2 * 2 / (length * rate) / records
-    law = leak.excess_density(
-        leaked=0.0, beat=beat, delay=steps / rate, electrical_bandwidth=1.0,
-        relative_intensity_noise=rin, common_mode_rejection=1.0, local_oscillator_power=1.0,
-        line_width=width,
-    )  # fmt: skip
+    given = {
+        "laser.power": beat**2 / 4, "laser.line_width": width,
+        "laser.relative_intensity_noise": rin, "receiver.common_mode_rejection": 1e30,
+        "receiver.local_oscillator_power": 1.0,
+        "receiver.mixing_efficiency": 1.0, "receiver.apd_gain": 1.0, "receiver.responsivity": 1.0,
+        "receiver.modulation_index": 1.0, "receiver.detector_bandwidth": 1.0,
+        "receiver.amplifier_bandwidth": 1.0,
+    }  # fmt: skip
+    given = {f"instrument.{name}": value for name, value in given.items()}
+    given |= {leak.PATH: steps / rate * LIGHT, leak.ISOLATION: 1.0}
+    law = leak.excess(given, "homodyne", "lorentzian")
     # A bin's power has a relative variance of 1.
     spread = 1 / np.sqrt(records * (last - first) / 2)  # of records with all of either noise
     assert density.mean() == pytest.approx(law, rel=5 * spread)
-    parts = [
-        leak.excess_density(
-            leaked=0.0, beat=beat, delay=steps / rate, electrical_bandwidth=1.0,
-            relative_intensity_noise=a, common_mode_rejection=1.0, local_oscillator_power=1.0,
-            line_width=b,
-        )
-        for a, b in ((rin, 0.0), (0.0, width))
-    ]  # fmt: skip
+    quiet = given | {"instrument.laser.relative_intensity_noise": 0.0}
+    parts = leak.excess(given, "homodyne", "gaussian"), leak.excess(quiet, "homodyne", "lorentzian")
     assert min(parts) > 0.2 * law  # both are seen
 
 

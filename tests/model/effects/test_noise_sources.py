@@ -12,10 +12,17 @@ OTHERS = 1.53715e-13
 """Current variance of Table 4.1 [A^2]: 1.40992e-13 of it shot noise of 1 mW."""
 
 ELECTRON = 1.602176634e-19
-LASER = {
-    "relative_intensity_noise": 1e-15, "common_mode_rejection": 1.0, "local_oscillator_power": 1e-3,
-    "apd_gain": 1.0, "responsivity": 1.1, "electrical_bandwidth": 400e6,
-}  # fmt: skip
+
+
+def fluctuating(density, power, *, rejection=1.0, apd_gain=1.0, responsivity=1.1, bandwidth=400e6):
+    """Current variance of a laser's intensity noise [A^2]."""
+    receiver = {
+        "common_mode_rejection": rejection, "local_oscillator_power": power, "apd_gain": apd_gain,
+        "responsivity": responsivity, "detector_bandwidth": bandwidth,
+        "amplifier_bandwidth": bandwidth,
+    }  # fmt: skip
+    given = {f"instrument.receiver.{name}": value for name, value in receiver.items()}
+    return current_variance(given | {"instrument.laser.relative_intensity_noise": density})
 
 
 def test_the_share_of_sunlight_by_radiometry_of_the_patch_seen(table_4_1):
@@ -64,10 +71,9 @@ def test_two_diodes_that_do_not_match_see_what_is_left_of_a_fluctuating_laser():
     rng = np.random.default_rng(1)
     light = power * (1 + np.sqrt(rin * rate / 2) * rng.standard_normal(number))
     current = 3.0 * 1.1 * (1.0 * light / 2 - 0.8 * light / 2)
-    expected = current_variance(
-        relative_intensity_noise=rin, common_mode_rejection=81.0, local_oscillator_power=power,
-        apd_gain=3.0, responsivity=0.9 * 1.1, electrical_bandwidth=rate / 2,
-    )  # fmt: skip
+    expected = fluctuating(
+        rin, power, rejection=81.0, apd_gain=3.0, responsivity=0.9 * 1.1, bandwidth=rate / 2
+    )
     assert current.var() == pytest.approx(expected, rel=5 * np.sqrt(2 / number))
     hann = window.samples("hann", number)
     bins = np.fft.rfft(hann * (current - current.mean()))[4:-4:4]  # every fourth is independent
@@ -77,7 +83,5 @@ def test_two_diodes_that_do_not_match_see_what_is_left_of_a_fluctuating_laser():
 
 def test_a_milliampere_has_as_much_of_it_as_shot_noise_at_minus_155_decibels():
     level = 10**-15.494  # 2 q / 1 mA
-    seen = current_variance(
-        **LASER | {"relative_intensity_noise": level, "local_oscillator_power": 1e-3 / 1.1}
-    )
+    seen = fluctuating(level, 1e-3 / 1.1)
     assert seen == pytest.approx(2 * ELECTRON * 1e-3 * 400e6, rel=2e-3)
