@@ -302,17 +302,9 @@ def carrier_to_noise_ratio(*, snr: ArrayLike, window: Window) -> np.ndarray:
 
 
 def beat_deviation(*, cnr: ArrayLike, samples: ArrayLike, sample_rate: ArrayLike) -> np.ndarray:
-    """Least standard deviation [Hz] of a tone's frequency.
+    """Least standard deviation [Hz] of a tone's frequency in a record of `samples`, unpadded.
 
-    Parameters
-    ----------
-    cnr : array_like
-        Power of the tone over that of the noise, before the FFT; 0 gives inf. Of a complex record
-        twice that.
-    samples : array_like
-        Length of the record L, 2 or more; zeros appended to it do not count.
-    sample_rate : array_like
-        [Hz]
+    `cnr` is the tone's power over the noise's before the FFT, for a complex record twice that.
     """
     number = np.asarray(samples, float)
     with np.errstate(divide="ignore"):
@@ -324,19 +316,14 @@ def phase_deviation(*, line_width: ArrayLike, delay: ArrayLike, duration: ArrayL
     """Compute the standard deviation [Hz] of a beat's frequency from its laser's phase walk.
 
     The error is the slope over 2 pi of the least-squares line through theta(t) - theta(t - tau) in
-    a record of length T. theta is a Wiener process of variance Gamma |t| = 2 pi dnu |t|. With
-    r = tau / T, or 1 where the delay is longer,
+    a record of length T. theta is a Wiener process of variance Gamma |t| = 2 pi dnu |t|, dnu the
+    FWHM of the laser's Lorentzian line. With r = tau / T, or 1 where the delay is longer,
 
         var(f) = 12 Gamma / T r^2 (1 - r + r^3 / 5) / (2 pi)^2
 
     The maximum-likelihood frequency in white noise has this error in addition to
     :func:`beat_deviation`. Estimates that knew the walk's correlation could do better by a few
     percent for short delays, by a fifth for r = 1/3.
-
-    Parameters
-    ----------
-    line_width, delay, duration : array_like
-        FWHM dnu of the laser's Lorentzian line [Hz]; echo delay tau, and record [s].
     """
     r = np.minimum(np.asarray(delay, float) / duration, 1.0)
     walk = 12 * np.asarray(line_width, float) / np.asarray(duration, float)
@@ -372,20 +359,11 @@ def resolved_deviation(
     radial_velocity: ArrayLike,
     slopes: Sequence[ArrayLike] = SIGNS,
 ) -> Deviation:
-    """Least standard deviations of range and radial velocity, of the beats' own.
+    """Least standard deviations of range and radial velocity, of the beats' own [Hz].
 
-    Parameters
-    ----------
-    up, doppler, down : array_like
-        Standard deviations of the three beats [Hz]; inf for one that is not used.
-        :func:`sweep.model.waveform.resolve` takes no more from the Doppler beat than which
-        reading of the others is right: the bound of what it reports has ``doppler=np.inf``.
-    carriers : tuple of array_like
-        Carrier of each segment [Hz].
-    chirp_rate, range, radial_velocity : array_like
-        S [Hz/s]; where the target is [m], and how fast it closes [m/s].
-    slopes : sequence of array_like
-        Chirp rate of each segment over S, signed.
+    Those of beats that are not used are inf. :func:`sweep.model.waveform.resolve` takes no more
+    from the Doppler beat than which reading of the others is right: the bound of what it reports
+    has ``doppler=np.inf``. `slopes` are chirp rates over `chirp_rate`, signed.
     """
     per_metre = 2 / SPEED_OF_LIGHT
     delay, beta = per_metre * np.asarray(range, float), per_metre * np.asarray(radial_velocity)

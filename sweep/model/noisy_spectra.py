@@ -446,14 +446,9 @@ def look(spectra: Sequence[np.ndarray], signal: Signal, view: View) -> Found:
 
 
 def counted(view: View, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Count detections and alarms in some draws, and return what is averaged over them.
+    """Count detections and alarms in some draws, and find values to be averaged over them.
 
-    Returns
-    -------
-    counts : (names, m) int64 ndarray
-        By the names of DRAW_OUTPUTS.
-    values : (names, m) ndarray
-        By those of VALUES; nan where there is none.
+    By the names of DRAW_OUTPUTS and of VALUES, (names, m); nan where there is no value.
     """
     nothing = np.zeros(draws.size, np.int64)
     found = [Found(nothing > 0, nothing, nothing, np.zeros(draws.size))] * 3

@@ -55,9 +55,8 @@ def realise(
     first_draw: int = 0,
     draws: int,
 ) -> Iterator[Stretch]:
-    """Shots of every draw of n points on a flat plane.
+    """Shots of every draw of n points, with random `keys` (n, 2), on a flat plane.
 
-    Parameters as of :func:`sweep.model.shot.prepare`; `keys` (n, 2) are the points' random keys.
     Any part of the draws, from `first_draw` on, can be had alone.
     """
     everything = DEFAULTS | dict(parameters)
@@ -112,10 +111,9 @@ class Means:
     def moments(
         self, names: Sequence[str], points: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Means, variances of a single draw and numbers of draws, (names, points) each.
+        """Means, variances of a single draw (unbiased) and numbers of draws, (names, points) each.
 
-        Of outputs other than logarithms, nan where there is nothing of one; the variance is
-        unbiased, and nan with a single draw.
+        Of outputs other than logarithms.
         """
         rows = np.ix_(np.array([_NAMES.index(name) for name in names]), points)
         n = self._count[rows]

@@ -113,18 +113,9 @@ def draw_returns(
     draws: int = 1,
     method: str = "probabilities",
 ) -> Returns:
-    """Draw returns of every shot, draw by draw.
+    """Draw returns of n prepared shots by their :func:`groups` and keys (n, 2), draw by draw.
 
-    Parameters
-    ----------
-    shots, found
-        n prepared points, and the groups in their spectra, by :func:`groups`.
-    keys : (n, 2) uint64
-        Random key of each.
-    first_draw, draws : int
-        Number of the first draw, number of draws; any range of draws can be computed alone.
-    method : str
-        ``probabilities`` or ``noise``.
+    ``method`` is ``probabilities`` or ``noise``; any range of draws can be computed alone.
     """
     noisy, n = method == "noise", shots.size
     known, drawn = known_of(shots, found), Drawn.nothing(found, draws)
@@ -429,7 +420,7 @@ def _draw(keys, how, known, seen, tables, out):
 def report(at, how, known, found, pairs, out):
     """Pair the peaks of one point (i, draw) into returns, and judge each.
 
-    ``found``: peaks (3, most + 1, 4) of the three segments, their groups, and their numbers.
+    ``found``: peaks (3, most + 1, 4), their groups, and their number in each segment.
     """
     (i, d), (peaks, which, number) = at, found
     if how.doppler:
@@ -459,18 +450,10 @@ def report(at, how, known, found, pairs, out):
 
 @njit(cache=True, error_model="numpy")
 def draw_peaks(address, at, how, known, seen, tables, peaks, which, up):
-    """Peaks of one segment in one draw: which groups are detected, where, and one false peak.
+    """Peaks (most + 1, 4) of a segment in a draw and their groups; returns how many there are.
 
-    Parameters
-    ----------
-    address, at
-        Key of the point and number of the draw; point and segment.
-    how, known, seen, tables
-        :class:`How`, :class:`Known`, :class:`sweep.model.draws.Seen`, and the interpolator.
-    peaks, which : (most + 1, 4) float64, (most + 1,) int64
-        Result: peaks by their fields, and their groups; their number is returned.
-    up : (most,) bool
-        Groups that are detected in the up segment, which comes first.
+    ``address``: key of the point and number of the draw; ``at``: point and segment; ``up``
+    (most,): whether a group is detected in the up segment, which comes first.
     """
     (a, b, draw), (i, s) = address, at
     sigma, beta, under_lines = known.levels[i]

@@ -64,14 +64,9 @@ class Before(NamedTuple):
 
 
 class Drawn(ABC):
-    """Sums over the draws of n points so far, to be continued.
+    """Sums over the draws of n points so far, to be continued; arguments of :func:`simulate`.
 
-    Parameters
-    ----------
-    parameters, effects, keys, before
-        As of :func:`simulate`.
-    ends : (batches + 1,) ndarray
-        Numbers of draws between batches, the first of them that of the first draw.
+    ``ends`` (batches + 1,) are numbers of draws between batches, from the first draw's on.
     """
 
     def __init__(
@@ -182,41 +177,18 @@ def simulate(
 ) -> dict[str, np.ndarray]:
     """Simulate draws with all effects: outputs, their errors, and counts of draws.
 
-    Parameters
-    ----------
-    parameters, effects
-        As for :func:`sweep.model.shot.evaluate`. If random effects are among them the outputs
-        are means over the same draws that are counted. For whole spectra, parameters also by the
-        names of :data:`sweep.model.estimators.DEFAULTS`.
-    keys : (n, 2) uint64
-        Random key of each point.
-    first_draw : int
-        Number of the first draw.
-    method : str
-        ``probabilities``, ``noise`` or ``spectra``.
-    batch_sizes : sequence of int
-        Draws of each point in each batch; without them as many as `accuracy` needs.
-    batch, limit : int
-        The accuracy is checked at multiples of ``batch`` draws; a point has at most ``limit``
-        draws, by which the accuracy may not be met.
-    accuracy : Accuracy
-        Half-widths that are to be reached.
-    methods : Methods
-        Detectors and estimators by their names in the parameters.
-    before : Before, optional
-        Earlier draws, from ``first_draw`` on, for the same accuracy or a looser one, or up to a
-        lower limit.
-    stop : callable
-        Called between draws; true ends with the draws taken so far, at least some. They make a
-        `before` from which another call continues.
+    The result has the names of OUTPUTS and ERROR_OUTPUTS, or SPECTRA_OUTPUTS, and ACCURACY_OUTPUTS
+    of :mod:`sweep.model.outputs`, (n,), and those of DRAW_OUTPUTS, (n, batches). With random
+    effects or whole spectra it also has RUNNING, (n, columns), and outputs are means over the draws
+    that are counted.
 
-    Returns
-    -------
-    dict of ndarray
-        (n,) by the names of OUTPUTS and ERROR_OUTPUTS, or SPECTRA_OUTPUTS, and ACCURACY_OUTPUTS of
-        :mod:`sweep.model.outputs`; (n, batches) int64 by those of DRAW_OUTPUTS, all draws in one
-        count without batches. If random effects or whole spectra are simulated, also RUNNING,
-        (n, columns).
+    `parameters` and `effects` are as for :func:`sweep.model.shot.evaluate`, `keys` (n, 2) random,
+    `method` is ``probabilities``, ``noise`` or ``spectra``. A point has as many draws as
+    `batch_sizes` say. Without them (then all draws are one count) it has as many as `accuracy`
+    needs, which is checked at multiples of `batch` draws, but no more than `limit`. `before` are
+    earlier draws, from `first_draw` on, for the same accuracy or a looser one. If `stop`, called
+    between draws, returns true, the result holds the draws taken so far, at least some: a `before`
+    from which another call continues.
     """
     ends = first_draw + np.cumsum([0, *(batch_sizes or [limit])])
     given: dict[str, Any] = {"keys": keys, "ends": ends, "before": before}
@@ -268,13 +240,7 @@ def settle(
 
 
 class Sample(Drawn):
-    """Draws held against probabilities, or in noise, with or without random effects.
-
-    Parameters
-    ----------
-    method : str
-        ``probabilities`` or ``noise``.
-    """
+    """Draws held against probabilities, or in noise, with or without random effects."""
 
     def __init__(
         self, parameters: Parameters, effects: Collection[str], *, method: str,

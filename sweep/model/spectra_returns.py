@@ -72,16 +72,9 @@ def spectra_returns(
     first_draw: int = 0,
     draws: int = 1,
 ) -> Returns:
-    """Draw returns of every shot, draw by draw.
+    """Draw returns as :func:`sweep.model.returns.draw_returns` does, by the methods of these names.
 
-    Parameters
-    ----------
-    shots, found, keys, first_draw, draws
-        As of :func:`sweep.model.returns.draw_returns`.
-    parameters : mapping
-        Scalars; those of :data:`sweep.model.estimators.DEFAULTS` that are not given are these.
-    methods : Methods
-        Detectors and estimators by their names in the parameters.
+    `parameters` are scalars; :data:`sweep.model.estimators.DEFAULTS` stand for any not given.
     """
     p, most = {**DEFAULTS, **parameters}, found.bin.shape[2]
     known, drawn = known_of(shots, found), Drawn.nothing(found, draws)
