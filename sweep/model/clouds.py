@@ -13,8 +13,10 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 
+from sweep.model.detectors import FIXED
 from sweep.model.effects.catalogue import CORE, DEFAULTS
 from sweep.model.effects.effect import Realisation, Scene
+from sweep.model.estimators import DETECTOR
 from sweep.model.eyepoints import Eyepoints, seen_ground
 from sweep.model.geometry.mesh import Surface
 from sweep.model.ground import Footprints
@@ -28,7 +30,7 @@ from sweep.model.realisations import random_effects
 from sweep.model.returns import Returns, draw_returns
 from sweep.model.sampling import SPECTRA
 from sweep.model.shot import prepare_cast
-from sweep.model.spectra_returns import is_fixed, spectra_returns, without_chances
+from sweep.model.spectra_returns import spectra_returns
 from sweep.model.waveform import STRONGEST
 
 STRETCH = 1 << 20
@@ -76,8 +78,9 @@ def cloud(
         shots, rays, found = _groups(seen, parameters, surfaces, returns, called)
         numbers = {"first_draw": first_draw, "draws": draws}
         if method == SPECTRA:
-            if shots.peaks == STRONGEST or not is_fixed(parameters):
-                found = without_chances(found)
+            if shots.peaks == STRONGEST or parameters.get(DETECTOR + "kind", FIXED) != FIXED:
+                # Probabilities are those of crossing the fixed threshold.
+                found = found._replace(pd=found.pd * np.nan, leakage=found.leakage * np.nan)
             drawn = spectra_returns(
                 shots, found, keys=keys[part], parameters=parameters, methods=methods, **numbers
             )

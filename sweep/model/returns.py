@@ -58,7 +58,6 @@ from sweep.model.pairing import (
     TRUE,
     UNCONFIRMED,
     judge,
-    pair_by_strength,
     pair_peaks,
 )
 from sweep.model.preparation import Shots
@@ -430,7 +429,9 @@ def report(at, how, known, found, pairs, out):
             how.rising if how.signed else 0.0, TOLERANCE, pairs,
         )  # fmt: skip
     else:
-        confirmed = count = pair_by_strength(number[0], number[2], how.alone, pairs)
+        confirmed = count = min(number[0], number[2])
+        for r in range(count):
+            pairs[r, 0], pairs[r, 1], pairs[r, 2], pairs[r, 3] = r, -1, r, how.alone
     for r in range(min(count, out.flags.shape[2])):
         u, k, v, out.code[i, d, r] = pairs[r]
         group, centres = out.group[i, d, r], np.zeros(3)

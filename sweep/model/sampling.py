@@ -33,7 +33,7 @@ from sweep.model.estimators import DEFAULTS
 from sweep.model.noisy_spectra import VALUES, Methods, View, counted, view_of
 from sweep.model.outputs import DRAW_OUTPUTS, KEPT, PROMISED, RUNNING
 from sweep.model.preparation import Parameters, Shots
-from sweep.model.realisations import ROWS, Means, add, certain, random_effects, realise
+from sweep.model.realisations import ROWS, Means, certain, random_effects, realise
 from sweep.model.shot import evaluate, prepare, statistics
 
 PIECE = 1 << 16
@@ -304,9 +304,6 @@ class Sample(Drawn):
         return outputs | self.accuracy(accuracy)
 
 
-_NO_LOGARITHMS = np.zeros(len(VALUES), bool)
-
-
 class SpectraSample(Drawn):
     """Draws of whole spectra, looked at by detectors and estimators of given names."""
 
@@ -316,9 +313,7 @@ class SpectraSample(Drawn):
     ) -> None:  # fmt: skip
         super().__init__({**DEFAULTS, **parameters}, effects, before=before, **given)
         self._methods, size = methods, self.number.size
-        self._count = np.zeros((len(VALUES), size), np.int64)
-        self._mean, self._square = np.zeros((2, len(VALUES), size))  # the latter about the mean
-        self._fixed = Means(size)
+        self._values, self._fixed = Means(size, VALUES), Means(size)
         self._prepared: dict[int, tuple[Shots, int]] = {}
         if not random_effects(effects):
             everywhere = np.broadcast_to(np.asarray(parameters["target.range"]), size)
@@ -327,12 +322,10 @@ class SpectraSample(Drawn):
                 self._fixed.add(index, statistics(shots))
                 self._prepared |= {int(p): (shots, i) for i, p in enumerate(index)}
         if before is not None:
-            columns = len(VALUES) * np.arange(1, 4)
-            self._count[...], self._mean, self._square, sums = (
-                part.copy() for part in np.split(before.means[RUNNING].T, columns)
-            )
+            values, fixed = np.split(before.means[RUNNING].T, [3 * len(VALUES)])
+            self._values.restore(values)
             if not self._prepared:
-                self._fixed.restore(sums)
+                self._fixed.restore(fixed)
 
     def at_once(self, points: int) -> int:
         """Draws of each of so many points that one `take` is for: some of :data:`SAMPLES`.
@@ -349,8 +342,8 @@ class SpectraSample(Drawn):
                 batch = np.searchsorted(self.ends, draws, "right") - 1
                 found, values = counted(view, draws)
                 np.add.at(counts[:, place].T, batch, found.T)
-                sums = self._count, self._mean, self._square
-                add(np.full(draws.size, point), values, _NO_LOGARITHMS, *sums)
+                named = dict(zip(VALUES, values, strict=True))
+                self._values.add(np.full(draws.size, point), named)
 
     def _views(self, point: int, first: int, last: int) -> Iterator[tuple[View, np.ndarray]]:
         """Yield views of a point, with the numbers of the draws that each is for."""
@@ -384,15 +377,15 @@ class SpectraSample(Drawn):
 
     def results(self, accuracy: Accuracy) -> dict[str, np.ndarray]:
         """As of :class:`Drawn`."""
-        n, mean, square = (
-            dict(zip(VALUES, part, strict=True)) for part in (self._count, self._mean, self._square)
+        values, fixed = self._values, self._fixed.results()
+        n, mean, square, error = (
+            dict(zip(VALUES, part, strict=True))
+            for part in (values.count, values.mean, values.spread, values.errors())
         )
-        fixed = self._fixed.results()
         outputs = {name: fixed[name] for name in KEPT}
         shares = self.found() / self.number + self._there()
         outputs |= dict(zip(PROMISED, shares, strict=True))
         with np.errstate(divide="ignore", invalid="ignore"):
-            error = {name: np.sqrt(square[name] / (n[name] * (n[name] - 1))) for name in VALUES}
             for name in ("pfa_bin", "false_alarms"):
                 outputs |= {name: mean[name], f"{name}_error": error[name]}
             for name in ("range", "radial_velocity"):
@@ -404,6 +397,5 @@ class SpectraSample(Drawn):
                     f"{name}_bound": np.sqrt(mean[f"{name}_2"])
                     + np.where(n[f"{name}_2"] > 0, 0.0, np.nan),
                 }
-        sums = self._fixed.sums()
-        running = np.concatenate([self._count, self._mean, self._square, sums]).T
+        running = np.concatenate([values.sums(), self._fixed.sums()]).T
         return outputs | self.accuracy(accuracy) | {RUNNING: running}
