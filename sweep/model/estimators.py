@@ -52,7 +52,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -62,9 +62,6 @@ from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detectors import FIXED, Setting, taper
 from sweep.model.waveform import SIGNS
 from sweep.model.window import Window
-
-if TYPE_CHECKING:
-    from scipy import signal
 
 Estimator = Callable[[np.ndarray, np.ndarray, Setting], np.ndarray]
 """From complex spectra (m, N/2 + 1), the bins of their peaks (m,) int64, 1..N/2 - 1, and the
@@ -236,7 +233,7 @@ def jacobsen_form(window: Window, fft_size: int) -> tuple[int, float]:
 
 
 @lru_cache(maxsize=4)
-def _zoom(length: int, fft_size: int) -> signal.ZoomFFT:
+def _zoom(length: int, fft_size: int) -> Callable[[np.ndarray], np.ndarray]:
     """Chirp-z transform of a record at rest, from -1 to 1 bin."""
     from scipy import signal  # slow to import
 
@@ -339,7 +336,6 @@ def windowed_deviation(*, cnr: ArrayLike, window: Window, sample_rate: ArrayLike
 
     which is the bound for the rectangular window and more for every other: the expansion of the
     periodogram about its maximum [Rife and Vincent, Bell Syst. Tech. J. 49, 197, 1970].
-
     """
     w = taper(window)
     place = np.arange(window.length) - (w * np.arange(window.length)).sum() / w.sum()

@@ -276,7 +276,7 @@ def solve(
     jitter: float = 0.0,
     floor: ErrorFloor = NO_FLOOR,
 ) -> dict[str, np.ndarray]:
-    """Velocity and altitude of every cycle and draw, by the names of :data:`outputs.NAVIGATION`.
+    """Velocity and altitude of every cycle and draw: :data:`sweep.model.outputs.NAVIGATION`.
 
     `shots` and `points` are arrays of :data:`sweep.model.outputs.SHOTS` and POINTS, cycle by cycle;
     positions of points are used where the floor has an error of pointing. The ground's slope and

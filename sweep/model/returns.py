@@ -72,25 +72,19 @@ class Returns(NamedTuple):
     """Up to ``most`` returns of each shot and draw, each (n, draws, most); nan where there is none.
 
     Confirmed returns come before unconfirmed ones, stronger up peaks before weaker ones, a false
-    up peak last. ``_interpolated`` goes with peaks placed between bins, no suffix with whole bins.
+    up peak last. Units are those of :data:`sweep.model.outputs.POINTS`. ``_interpolated`` goes with
+    peaks placed between bins; their errors are those of noise, with what the spread of the groups'
+    own lines adds. No suffix goes with whole bins; rounding (1/sqrt(12) bin) adds to their errors.
     """
 
     range: np.ndarray
-    """[m]"""
     range_interpolated: np.ndarray
-    """[m]"""
     radial_velocity: np.ndarray
-    """[m/s], positive when closing."""
     radial_velocity_interpolated: np.ndarray
-    """[m/s]"""
     range_standard_error: np.ndarray
-    """Standard error [m]: of the interpolated range, and of rounding to bins (1/sqrt(12))."""
     range_interpolated_standard_error: np.ndarray
-    """Standard error [m] under noise, with what the spread of the groups' own lines adds."""
     radial_velocity_standard_error: np.ndarray
-    """[m/s], as for the range."""
     radial_velocity_interpolated_standard_error: np.ndarray
-    """[m/s], as for the range."""
     snr: np.ndarray
     """Power of the weaker of up and down peak as found over the mean noise power of a bin."""
     pd: np.ndarray
