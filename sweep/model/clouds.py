@@ -61,8 +61,8 @@ def cloud(
     :data:`sweep.model.outputs.POINTS`, (n, draws, returns[, 3]). `keys` (n, 2) are random, `method`
     is ``probabilities``, ``noise`` or ``spectra``. `returns` is the number of groups that are
     looked at in a segment, and of points of a shot and draw; ``surfaces_seen`` counts no more.
-    `effects` and `flags` are as of :func:`sweep.model.shot.prepare_cast`. Where powers add,
-    `estimates_rays` asks for ``beamlets_error``, which is else 0. ``surface``, ``true_range`` and
+    `effects` and `flags` are as of :func:`sweep.model.shot.prepare_cast`. `estimates_rays` asks for
+    ``beamlets_error``, which needs powers that add and is else 0. ``surface``, ``true_range`` and
     ``true_radial_velocity`` are those of the beamlet that a true or a misread point has seen: the
     error of a misread one shows.
     """

@@ -105,7 +105,7 @@ def observe(
     rotation: bool = True,
     angles: Callable[[np.ndarray], beam.Angles] | None = None,
 ) -> Eyepoints:
-    """Eyepoints of shots by number (n,), from 0; any stretch of a flight can be had alone.
+    """Eyepoints of shots by number (n,), from 0; any part of a flight can be had alone.
 
     `number` and `pattern` are those of :func:`sweep.model.footprint.beamlets`, `bodies` the motion
     of each of the caster's bodies, None for one at rest. `angles` gives the footprint by the range
