@@ -126,7 +126,7 @@ def draw_returns(
         _draw(keys[part], of_part, some._replace(alarm=alarm), seen, tables, own)
         for column, values in zip(drawn, own, strict=True):
             column[part] = values
-    return measured(shots, found, drawn)
+    return measured(shots, known, drawn)
 
 
 class How(NamedTuple):
@@ -140,10 +140,9 @@ class How(NamedTuple):
     """There is a Doppler segment."""
     half: int
     """N/2."""
-    signed: bool
-    """Bins are -N/2 .. N/2 - 1, of a complex record, not 1 .. N/2."""
-    rising: float
-    """1 where the down beat rises against the up beat as the range does, else -1."""
+    signed: float
+    """Of a complex record, of bins -N/2 .. N/2 - 1: 1 where the down beat rises against the up beat
+    as the range does, else -1. 0 of a real one, of bins 1 .. N/2."""
     alone: int
     """Reading of up and down peak without a Doppler segment."""
     ends: int
@@ -161,12 +160,12 @@ class How(NamedTuple):
     def of(cls, shots: Shots, first_draw: int, noisy: bool) -> "How":
         """Draw some shots from a draw on."""
         alone = waveform.FAST if shots.two_beats == waveform.FAST_TARGET else waveform.FAR
+        signed = 0.0
         if shots.complex_record:
-            alone = waveform.SIGNED
+            alone, signed = waveform.SIGNED, math.copysign(1.0, 1.0 - shots.slopes[2])
         return cls(
             int(first_draw), noisy, shots.incoherent, bool(shots.segments[1]), shots.fft_size // 2,
-            shots.complex_record, math.copysign(1.0, 1.0 - shots.slopes[2]), alone,
-            shots.real_ends, shots.echo_rule[1], echo_filter(shots, Seen.nothing(0)),
+            signed, alone, shots.real_ends, shots.echo_rule[1], echo_filter(shots, Seen.nothing(0)),
             shots.looks.number if shots.looks.several else 1, shots.looks.independent,
         )  # fmt: skip
 
@@ -239,13 +238,16 @@ def known_of(shots: Shots, found: Groups) -> Known:
     weight = np.where(inside, amplitude[:, None, None] ** 2, 0.0)
     total = weight.sum(axis=-1)
     total[total == 0] = 1.0
+    up, down = found.pd[:, 0], found.pd[:, 2]
+    both = shots.both(up.T, down.T, (found.magnitude[:, 0].T, found.magnitude[:, 2].T)).T
+    beside = down_given_up(up, down, both)
     mean = (weight * apart).sum(axis=-1) / total
     square = (weight * apart**2).sum(axis=-1) / total
     return Known(
         bins, found.pd, found.neighbours, np.sqrt(np.maximum(square - mean**2, 0.0)), lines,
         amplitude, np.stack([shots.bin_deviation, *noise_levels(shots)], axis=1), found.leakage,
         np.stack([np.broadcast_to(part, shots.size) for part in _third(shots)], axis=1),
-        _beside(shots, found), _searched(shots),
+        np.ascontiguousarray(np.moveaxis(beside, 0, 1)), _searched(shots),
         np.empty((shots.size, 0)) if shots.fading is None else shots.fading.mixing().T.copy(),
     )  # fmt: skip
 
@@ -272,13 +274,6 @@ def _searched(shots: Shots) -> np.ndarray:
     return found
 
 
-def _beside(shots: Shots, found: Groups) -> np.ndarray:
-    """Probabilities of groups in the down segment, as of :class:`Known`."""
-    up, down = found.pd[:, 0], found.pd[:, 2]
-    both = shots.both(up.T, down.T, (found.magnitude[:, 0].T, found.magnitude[:, 2].T)).T
-    return np.ascontiguousarray(np.moveaxis(down_given_up(up, down, both), 0, 1))
-
-
 class Told(NamedTuple):
     """Range [m] and radial velocity [m/s] of returns by WHOLE and FINE peaks, (n, draws, most, 2).
 
@@ -295,12 +290,14 @@ class Told(NamedTuple):
     """Excess of the range told over that at the shot's start [m], (n, 1, 1)."""
 
 
-def measured(shots: Shots, found: Groups, drawn: Drawn) -> Returns:
+def measured(shots: Shots, known: Known, drawn: Drawn) -> Returns:
     """Compute returns from pairs of peaks; flag those that misread their common beamlet."""
     fitted = shots.slopes != waveform.SIGNS
     told = _fitted(shots, drawn) if fitted else _read(shots, drawn)
     point, group = np.arange(shots.size)[:, None, None], np.maximum(drawn.group, 0)
-    sizes = (found.last - found.first)[point[..., None], np.arange(3), group]
+    sizes = (known.bins[:, :, LAST] - known.bins[:, :, FIRST])[
+        point[..., None], np.arange(3), group
+    ]
     reach = 2 * (4 + np.where(drawn.group >= 0, sizes, 0).sum(axis=-1))  # of half bins
     offset, doppler = shots.offset[shots.row], SPEED_OF_LIGHT / 2 * shots.doppler[shots.row]
     truth = columns(shots, shots.radial_velocity) + doppler
@@ -309,7 +306,7 @@ def measured(shots: Shots, found: Groups, drawn: Drawn) -> Returns:
     right = abs(off) <= reach * told.metre
     right &= abs(told.velocity[..., FINE] - truth[point, seen]) <= reach * told.speed
     signal = (drawn.group[..., 0] >= 0) & (drawn.group[..., 2] >= 0)
-    pd = found.pd[point, 0, group[..., 0]] * _beside(shots, found)[point, 1, group[..., 2]]
+    pd = known.pd[point, 0, group[..., 0]] * known.beside[point, 1, group[..., 2]]
     misread = (drawn.flags & TRUE > 0) & ~right
     if not fitted:  # what the ground came nearer by within the shot: the measured velocity tells
         told.velocity[..., FINE] *= 1 + columns(shots, shots.slowing, 2)
@@ -420,7 +417,7 @@ def report(at, how, known, found, pairs, out):
         confirmed, count = pair_peaks(
             peaks[0, : number[0], FINE], peaks[1, : number[1], FINE],
             peaks[2, : number[2], FINE], known.third[i], 2.0 * how.half,
-            how.rising if how.signed else 0.0, TOLERANCE, pairs,
+            how.signed, TOLERANCE, pairs,
         )  # fmt: skip
     else:
         confirmed = count = min(number[0], number[2])

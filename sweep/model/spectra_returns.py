@@ -86,7 +86,7 @@ def spectra_returns(
                     which[s, k] = groups[k]
                 number[s] = bins.size
             report((i, d), how, known, (peaks, which, number), pairs, drawn)
-    return measured(shots, found, drawn)
+    return measured(shots, known, drawn)
 
 
 def _bins_of(view: View, segment: int, signal: Signal | None) -> np.ndarray:
