@@ -9,7 +9,7 @@ import yaml
 import sweep
 from sweep.model import philox, truth, waveform
 from sweep.model.detection import RAYLEIGH_DEVIATION, Fading
-from sweep.model.draws import BOTH, Rows, count_by_chance, count_in_noise, fading_of_draws
+from sweep.model.draws import BOTH, Rows, count_by_chance, count_in_noise, fading_factors
 from sweep.model.estimators import resolved_deviation
 from sweep.model.looks import fading_any_two
 from sweep.model.outputs import DRAW_OUTPUTS
@@ -125,9 +125,8 @@ def test_any_two_of_three_that_fade(snr, near):
     number, level, snr = 200_000, 4.0, np.array(snr)
     over = near**4  # of Gaussian footprints
     fading = Fading(*np.array([[near + 0j], [over + 0j], [near + 0j]]))
-    factors = np.empty((3, number))
-    mixing = fading.mixing()[:, 0].copy()
-    fading_of_draws(np.array([3, 5], np.uint64), np.arange(number), 0, mixing, factors)
+    key, mixing = (np.uint64(3), np.uint64(5)), fading.mixing()[:, 0]
+    factors = np.array([fading_factors(key, draw, 0, mixing) for draw in np.arange(number)]).T
     rng = np.random.default_rng(5)
     real, imaginary = rng.normal(size=(2, 3, number))
     hit = np.hypot(np.sqrt(2 * snr)[:, None] * factors + real, imaginary) >= level

@@ -13,8 +13,10 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 
+from sweep.model.detectors import FIXED
 from sweep.model.effects.catalogue import CORE, DEFAULTS
 from sweep.model.effects.effect import Realisation, Scene
+from sweep.model.estimators import DETECTOR
 from sweep.model.eyepoints import Eyepoints, seen_ground
 from sweep.model.geometry.mesh import Surface
 from sweep.model.ground import Footprints
@@ -28,7 +30,7 @@ from sweep.model.realisations import random_effects
 from sweep.model.returns import Returns, draw_returns
 from sweep.model.sampling import SPECTRA
 from sweep.model.shot import prepare_cast
-from sweep.model.spectra_returns import is_fixed, spectra_returns, without_chances
+from sweep.model.spectra_returns import spectra_returns
 from sweep.model.waveform import STRONGEST
 
 STRETCH = 1 << 20
@@ -53,36 +55,16 @@ def cloud(
     flags: np.ndarray | None = None,
     estimates_rays: bool = False,
 ) -> dict[str, np.ndarray]:
-    """Statistics and points of n shots.
+    """Statistics and points of n shots, whether they see anything or not.
 
-    Parameters
-    ----------
-    eyepoints : Eyepoints
-        n shots, whether they see anything or not.
-    parameters, surfaces
-        As of :func:`sweep.model.eyepoints.seen_ground`.
-    keys : (n, 2) uint64 ndarray
-        Random key of each shot.
-    first_draw, draws, method
-        As of :func:`sweep.model.returns.draw_returns`; or method ``spectra``
-        (:mod:`sweep.model.spectra_returns`).
-    methods : Methods
-        Detectors and estimators by their names in the parameters, which look at spectra.
-    returns : int
-        Strongest groups of bins that are looked at in a segment, and points at the most of a
-        shot and draw; at least 1.
-    effects, flags
-        As of :func:`sweep.model.shot.prepare_cast`.
-    estimates_rays : bool
-        Whether ``beamlets_error`` is estimated, for which powers have to add (0 where not).
-
-    Returns
-    -------
-    dict of ndarray
-        By the names, units and types of :data:`sweep.model.outputs.STATISTICS`, (n,), and
-        :data:`sweep.model.outputs.POINTS`, (n, draws, returns[, 3]). ``surfaces_seen`` is
-        `returns` at the most. ``surface``, ``true_range`` and ``true_radial_velocity`` are those
-        of the beamlet that a true or a misread point has seen; the error of a misread one shows.
+    Arrays are those of :data:`sweep.model.outputs.STATISTICS`, (n,), and
+    :data:`sweep.model.outputs.POINTS`, (n, draws, returns[, 3]). `keys` (n, 2) are random, `method`
+    is ``probabilities``, ``noise`` or ``spectra``. `returns` is the number of groups that are
+    looked at in a segment, and of points of a shot and draw; ``surfaces_seen`` counts no more.
+    `effects` and `flags` are as of :func:`sweep.model.shot.prepare_cast`. `estimates_rays` asks for
+    ``beamlets_error``, which needs powers that add and is else 0. ``surface``, ``true_range`` and
+    ``true_radial_velocity`` are those of the beamlet that a true or a misread point has seen: the
+    error of a misread one shows.
     """
     n = len(eyepoints.time)
     sizes = {"shot": n, "draw": draws, "return_number": returns, "xyz": 3}
@@ -96,8 +78,9 @@ def cloud(
         shots, rays, found = _groups(seen, parameters, surfaces, returns, called)
         numbers = {"first_draw": first_draw, "draws": draws}
         if method == SPECTRA:
-            if shots.peaks == STRONGEST or not is_fixed(parameters):
-                found = without_chances(found)
+            if shots.peaks == STRONGEST or parameters.get(DETECTOR + "kind", FIXED) != FIXED:
+                # Probabilities are those of crossing the fixed threshold.
+                found = found._replace(pd=found.pd * np.nan, leakage=found.leakage * np.nan)
             drawn = spectra_returns(
                 shots, found, keys=keys[part], parameters=parameters, methods=methods, **numbers
             )

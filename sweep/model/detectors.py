@@ -95,15 +95,8 @@ the same shape."""
 def crossing_probability(kind: str, factor: float, *, training: int, rank: int) -> float:
     """Probability that a cell of exponential power exceeds its CFAR threshold.
 
-    Parameters
-    ----------
-    kind : str
-        ``ca_cfar``, ``os_cfar`` or ``goca_cfar``.
-    factor : float
-        Threshold over the level that training cells give, >= 0; where the cell's own mean is
-        1 + snr times theirs, over 1 + snr.
-    training, rank : int
-        Number of training cells, even; rank of the ordered statistic, 1..training.
+    `factor` is the threshold over the level that training cells give; where the cell's own mean is
+    1 + snr times theirs, over 1 + snr. `rank` is 1..training, and training even.
     """
     if kind == CA:
         return float((1 + factor / training) ** -training)

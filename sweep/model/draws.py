@@ -284,13 +284,6 @@ def _count(rows, ends, levels, chances, how, seen, mixing, counts):
 
 
 @njit(cache=True, error_model="numpy")
-def fading_of_draws(key, draws, group, mixing, out):
-    """Factors of a group, as of :func:`fading_factors`, (3, m) of m draws."""
-    for d in range(draws.size):
-        out[:, d] = fading_factors((key[0], key[1]), draws[d], group, mixing)
-
-
-@njit(cache=True, error_model="numpy")
 def fading_factors(key, draw, group, mixing):
     """Factors of a draw on the magnitudes of a group in the three segments; their mean square is 1.
 

@@ -52,7 +52,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -62,9 +62,6 @@ from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detectors import FIXED, Setting, taper
 from sweep.model.waveform import SIGNS
 from sweep.model.window import Window
-
-if TYPE_CHECKING:
-    from scipy import signal
 
 Estimator = Callable[[np.ndarray, np.ndarray, Setting], np.ndarray]
 """From complex spectra (m, N/2 + 1), the bins of their peaks (m,) int64, 1..N/2 - 1, and the
@@ -236,7 +233,7 @@ def jacobsen_form(window: Window, fft_size: int) -> tuple[int, float]:
 
 
 @lru_cache(maxsize=4)
-def _zoom(length: int, fft_size: int) -> signal.ZoomFFT:
+def _zoom(length: int, fft_size: int) -> Callable[[np.ndarray], np.ndarray]:
     """Chirp-z transform of a record at rest, from -1 to 1 bin."""
     from scipy import signal  # slow to import
 
@@ -302,17 +299,9 @@ def carrier_to_noise_ratio(*, snr: ArrayLike, window: Window) -> np.ndarray:
 
 
 def beat_deviation(*, cnr: ArrayLike, samples: ArrayLike, sample_rate: ArrayLike) -> np.ndarray:
-    """Least standard deviation [Hz] of a tone's frequency.
+    """Least standard deviation [Hz] of a tone's frequency in a record of `samples`, unpadded.
 
-    Parameters
-    ----------
-    cnr : array_like
-        Power of the tone over that of the noise, before the FFT; 0 gives inf. Of a complex record
-        twice that.
-    samples : array_like
-        Length of the record L, 2 or more; zeros appended to it do not count.
-    sample_rate : array_like
-        [Hz]
+    `cnr` is the tone's power over the noise's before the FFT, for a complex record twice that.
     """
     number = np.asarray(samples, float)
     with np.errstate(divide="ignore"):
@@ -324,19 +313,14 @@ def phase_deviation(*, line_width: ArrayLike, delay: ArrayLike, duration: ArrayL
     """Compute the standard deviation [Hz] of a beat's frequency from its laser's phase walk.
 
     The error is the slope over 2 pi of the least-squares line through theta(t) - theta(t - tau) in
-    a record of length T. theta is a Wiener process of variance Gamma |t| = 2 pi dnu |t|. With
-    r = tau / T, or 1 where the delay is longer,
+    a record of length T. theta is a Wiener process of variance Gamma |t| = 2 pi dnu |t|, dnu the
+    FWHM of the laser's Lorentzian line. With r = tau / T, or 1 where the delay is longer,
 
         var(f) = 12 Gamma / T r^2 (1 - r + r^3 / 5) / (2 pi)^2
 
     The maximum-likelihood frequency in white noise has this error in addition to
     :func:`beat_deviation`. Estimates that knew the walk's correlation could do better by a few
     percent for short delays, by a fifth for r = 1/3.
-
-    Parameters
-    ----------
-    line_width, delay, duration : array_like
-        FWHM dnu of the laser's Lorentzian line [Hz]; echo delay tau, and record [s].
     """
     r = np.minimum(np.asarray(delay, float) / duration, 1.0)
     walk = 12 * np.asarray(line_width, float) / np.asarray(duration, float)
@@ -352,7 +336,6 @@ def windowed_deviation(*, cnr: ArrayLike, window: Window, sample_rate: ArrayLike
 
     which is the bound for the rectangular window and more for every other: the expansion of the
     periodogram about its maximum [Rife and Vincent, Bell Syst. Tech. J. 49, 197, 1970].
-
     """
     w = taper(window)
     place = np.arange(window.length) - (w * np.arange(window.length)).sum() / w.sum()
@@ -372,20 +355,11 @@ def resolved_deviation(
     radial_velocity: ArrayLike,
     slopes: Sequence[ArrayLike] = SIGNS,
 ) -> Deviation:
-    """Least standard deviations of range and radial velocity, of the beats' own.
+    """Least standard deviations of range and radial velocity, of the beats' own [Hz].
 
-    Parameters
-    ----------
-    up, doppler, down : array_like
-        Standard deviations of the three beats [Hz]; inf for one that is not used.
-        :func:`sweep.model.waveform.resolve` takes no more from the Doppler beat than which
-        reading of the others is right: the bound of what it reports has ``doppler=np.inf``.
-    carriers : tuple of array_like
-        Carrier of each segment [Hz].
-    chirp_rate, range, radial_velocity : array_like
-        S [Hz/s]; where the target is [m], and how fast it closes [m/s].
-    slopes : sequence of array_like
-        Chirp rate of each segment over S, signed.
+    Those of beats that are not used are inf. :func:`sweep.model.waveform.resolve` takes no more
+    from the Doppler beat than which reading of the others is right: the bound of what it reports
+    has ``doppler=np.inf``. `slopes` are chirp rates over `chirp_rate`, signed.
     """
     per_metre = 2 / SPEED_OF_LIGHT
     delay, beta = per_metre * np.asarray(range, float), per_metre * np.asarray(radial_velocity)

@@ -105,28 +105,16 @@ def observe(
     rotation: bool = True,
     angles: Callable[[np.ndarray], beam.Angles] | None = None,
 ) -> Eyepoints:
-    """Eyepoints of shots by number.
+    """Eyepoints of shots by number (n,), from 0; any part of a flight can be had alone.
 
-    Parameters
-    ----------
-    index : (n,) int array
-        Numbers of the shots, from 0; any stretch of a flight can be had without the rest.
-    flight, scanner, caster
-        What carries the instrument; where its beams point in the body frame, and when; the scene.
-    beam_divergence : float
-        Full angle between the 1/e^2 intensity points [rad].
-    number, pattern
-        Of :func:`sweep.model.footprint.beamlets`.
-    bodies : sequence of Flight or None, optional
-        Motion of each of the caster's bodies, None for one at rest; all at rest by default.
-    jitter : PointingJitter, optional
-        Turns the light of each shot, of which the instrument knows nothing: position, velocity
-        and `direction` stay those commanded. None draws nothing.
-    rotation : bool
-        Whether the surfaces of turning bodies move as they turn.
-    angles : callable, optional
-        Footprint by the range (n,) of the beam's axis, infinite where that hits nothing
-        (:func:`sweep.model.beam.angles`); by default `beam_divergence` everywhere.
+    `number` and `pattern` are those of :func:`sweep.model.footprint.beamlets`, `bodies` the motion
+    of each of the caster's bodies, None for one at rest. `angles` gives the footprint by the range
+    (n,) of the beam's axis, infinite where that hits nothing (:func:`sweep.model.beam.angles`);
+    without it the beam is `beam_divergence` wide everywhere [rad, between 1/e^2 points].
+
+    `jitter` turns the light of each shot, of which the instrument knows nothing: position, velocity
+    and `direction` stay those commanded. Without `rotation` the surfaces of turning bodies stand
+    still.
     """
     index = np.asarray(index)
     shots = scanner.shots(index)
@@ -249,15 +237,8 @@ def seen_ground(
 ) -> tuple[Parameters, Cast]:
     """Parameters of shots, and their footprints; a beamlet that misses sends nothing back.
 
-    Parameters
-    ----------
-    eyepoints : Eyepoints
-        n shots, each :attr:`Eyepoints.seen`.
-    parameters : mapping
-        Instrument, footprint and accuracy as for :func:`sweep.model.shot.evaluate`, scalars.
-        Range, velocity, reflectance and law come from the eyepoints and their surfaces.
-    surfaces : sequence of Surface
-        What the surface numbers mean.
+    All n shots see something. Range, velocity, reflectance and law come from the eyepoints and the
+    surfaces that their numbers mean, all other parameters are given, as scalars.
     """
     surface = eyepoints.surface
     hit = surface >= 0

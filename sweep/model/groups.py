@@ -1,7 +1,4 @@
-"""Groups of adjacent bins at or above the threshold in noiseless spectra: targets and sidelobes.
-
-Each is a target, or a strong one's sidelobe (PHYSICS section 6).
-"""
+"""Groups of adjacent bins at or above the threshold in noiseless spectra (PHYSICS section 6)."""
 
 from typing import NamedTuple
 

@@ -98,18 +98,10 @@ def velocity(
 ) -> Solution:
     """Velocity vector and covariance of each cycle of b beams.
 
-    Leading dimensions broadcast: directions (cycles, 1, b, 3) serve velocities (cycles, draws, b).
-
-    Parameters
-    ----------
-    direction : (..., b, 3) array_like
-        Unit vectors from the instrument; their frame is that of the result.
-    radial_velocity, standard_error : (..., b) array_like
-        Closing velocity along each beam, not finite where it has not returned, and its standard
-        error > 0 [m/s].
-    level : float or None
-        Level of the test for one false beam (:func:`_screened`), which needs
-        five beams to find it; with four it withholds the solution. None: no test.
+    Directions (..., b, 3) are unit vectors from the instrument. Velocities along them, positive
+    when closing and not finite for a beam that has not returned, and their errors are (..., b).
+    Leading dimensions broadcast. `level` is that of the test for one false beam, None for no test:
+    it needs five beams to find it; with four it withholds the solution.
     """
     u, closing, error, shape = _flat_cycles(direction, radial_velocity, standard_error)
 
@@ -143,21 +135,14 @@ def altitude(
 ) -> Solution:
     """Altitude above the plane through each cycle's ground points, and its variance.
 
+    Arrays and `level` are as for :func:`velocity`, z up. `offset` (..., b, 3) is the place of the
+    instrument when each beam fires, from that whose altitude is asked [m].
+
     The ground's slope, known beforehand to be 0 with the standard deviation `slope`, is weighed
     against the points, whatever their number. 0 states level ground; then every second beam is a
-    check on the first, and three are enough to find a false one.
-
-    Parameters
-    ----------
-    direction, range, standard_error, level
-        As of :func:`velocity`, z up [m].
-    slope : float
-        Standard deviation of the ground's slope along any horizontal [1], >= 0, finite.
-    offset : (..., b, 3) array_like or None
-        Place of the instrument when each beam fires, from that whose altitude is asked [m].
-    relief : float
-        Standard deviation of heights about the plane [m], which adds to the errors of range. Real
-        ground fails the test for a false beam without it.
+    check on the first, and three are enough to find a false one. `relief` is the standard deviation
+    of heights about the plane [m], which adds to the errors of range. Real ground fails the test
+    for a false beam without it.
     """
     u, distance, error, shape = _flat_cycles(direction, range, standard_error)
     points = u * distance[..., None]
@@ -187,8 +172,7 @@ def _plane(
 
     The plane is z = -altitude + gradient . (x, y) with the platform at the zero. An error of range
     moves a point off the plane by the error times ``gradient . (u_x, u_y) - u_z``, so the weights
-    need a gradient beforehand. Slopes known beforehand are two more observations of 0. Points and
-    beams are (3, b, n), gradients (2, n).
+    need a gradient beforehand. Points and beams are (3, b, n), gradients (2, n).
     """
     b, n = used.shape
     sine = gradient[0] * beams[0] + gradient[1] * beams[1] - beams[2]
@@ -292,32 +276,13 @@ def solve(
     jitter: float = 0.0,
     floor: ErrorFloor = NO_FLOOR,
 ) -> dict[str, np.ndarray]:
-    """Velocity and altitude of every cycle and draw.
+    """Velocity and altitude of every cycle and draw: :data:`sweep.model.outputs.NAVIGATION`.
 
-    Parameters
-    ----------
-    shots : mapping
-        ``platform_position``, ``platform_velocity`` and ``beam_direction`` of
-        :data:`sweep.model.outputs.SHOTS`, (n, 3).
-    points : mapping
-        Interpolated ranges and radial velocities, their standard errors and the flags of
-        :data:`sweep.model.outputs.POINTS`, (n, draws, returns); positions too, (..., 3), where
-        the floor has an error of pointing.
-    shots_a_cycle : int
-        Shots of a cycle, in the order of the arrays; n is a multiple of it.
-    ground_slope, relief, test_level
-        Of :func:`altitude` [1], [m]; None or 0: no test.
-    jitter : float
-        Standard deviation of the pointing jitter, of each angle [rad].
-    floor : ErrorFloor
-        Standard deviations of the instrument's errors that the points have
-        (:func:`sweep.model.error_floor.stray`).
-
-    Returns
-    -------
-    dict of ndarray
-        By the names, units and types of :data:`sweep.model.outputs.NAVIGATION`, (cycles,
-        draws[, 3[, 3]]); the numbers of beams are 0 where there is no solution.
+    `shots` and `points` are arrays of :data:`sweep.model.outputs.SHOTS` and POINTS, cycle by cycle;
+    positions of points are used where the floor has an error of pointing. The ground's slope and
+    relief and the level are those of :func:`altitude`, level None or 0 for no test. `jitter` is the
+    standard deviation of each angle of the pointing [rad], and `floor` has those of the
+    instrument's other errors. Numbers of beams are 0 where there is no solution.
     """
     n, draws = points["flags"].shape[:2]
     cycles = n // shots_a_cycle

@@ -42,7 +42,7 @@ from sweep.model import waveform
 from sweep.model.band import is_searched
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detectors import DETECTORS, Detector, Setting, main_lobe, taper
-from sweep.model.draws import fading_of_draws
+from sweep.model.draws import fading_factors
 from sweep.model.effects.line_width import seen_line, walk_steps, walked_phase
 from sweep.model.effects.segment_motion import looks_of
 from sweep.model.estimators import (
@@ -273,11 +273,10 @@ def fading_of(
     shots: Shots, i: int, *, key: np.ndarray, draws: np.ndarray, echo: int = 0
 ) -> np.ndarray:
     """Factors on an echo of point i by which it fades, (3, m) by segment; 1 where it does not."""
-    factors = np.ones((3, draws.size))
-    if shots.fading is not None:
-        mixing = np.ascontiguousarray(shots.fading.mixing()[:, i])
-        fading_of_draws(key, draws, echo, mixing, factors)
-    return factors
+    if shots.fading is None:
+        return np.ones((3, draws.size))
+    mixing = shots.fading.mixing()[:, i]
+    return np.array([fading_factors(tuple(key), draw, echo, mixing) for draw in draws]).T
 
 
 _LOOK = np.int64(1 << 48)
@@ -446,14 +445,9 @@ def look(spectra: Sequence[np.ndarray], signal: Signal, view: View) -> Found:
 
 
 def counted(view: View, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Count detections and alarms in some draws, and return what is averaged over them.
+    """Count detections and alarms in some draws, and find values to be averaged over them.
 
-    Returns
-    -------
-    counts : (names, m) int64 ndarray
-        By the names of DRAW_OUTPUTS.
-    values : (names, m) ndarray
-        By those of VALUES; nan where there is none.
+    By the names of DRAW_OUTPUTS and of VALUES, (names, m); nan where there is no value.
     """
     nothing = np.zeros(draws.size, np.int64)
     found = [Found(nothing > 0, nothing, nothing, np.zeros(draws.size))] * 3

@@ -107,18 +107,6 @@ def pair_peaks(up, doppler, down, third, fft_size, signed, tolerance, pairs):
 
 
 @njit(cache=True, error_model="numpy")
-def pair_by_strength(ups, downs, code, pairs):
-    """Pairs of as many up and down peaks in their order, as of :func:`pair_peaks`; their number.
-
-    All have the reading ``code``.
-    """
-    number = min(ups, downs)
-    for i in range(number):
-        pairs[i, 0], pairs[i, 1], pairs[i, 2], pairs[i, 3] = i, -1, i, code
-    return number
-
-
-@njit(cache=True, error_model="numpy")
 def confirm(up, doppler, down, third, fft_size, signed, tolerance):
     """Doppler peak and reading of an up and a down peak that fit best, within a tolerance [bins].
 

@@ -68,11 +68,10 @@ def words4(key0, key1, draw, stream, block):
 
 @njit(cache=True)
 def fill_words(address, stream, block, steps, number, words):
-    """Words of `words4` into the first columns of (4, >= number).
+    """Words of `words4` into the first columns of (4, >= number), in C order.
 
     From an address (key0, key1, draw) on, draw and block rise by the steps each time. All take one
-    round after the other, which the processor does for several at once: some six times as fast as
-    one by one. The array is in C order, or it would not.
+    round after the other, which the processor does for several at once: some six times as fast.
     """
     k0, k1, draw = np.uint64(address[0]), np.uint64(address[1]), np.uint64(address[2])
     x0, x1, x2, x3 = words[0], words[1], words[2], words[3]
@@ -110,8 +109,7 @@ def to_normals(word0, word1):
 def uniform(key0, key1, draw, stream, index):
     """Return uniform number `index` of a stream of a draw, 2^-53 .. 1 - 2^-53.
 
-    A probability below 1.1e-16 can not be drawn by comparison. One block of four costs one
-    evaluation.
+    A probability below 1.1e-16 can not be drawn by comparison.
     """
     return to_uniform(words4(key0, key1, draw, stream, index >> 2)[index & 3])
 
@@ -156,27 +154,11 @@ def normals(uniforms: np.ndarray) -> np.ndarray:
 
 
 def point_keys(rows: np.ndarray, *, domain: str, seed: int) -> np.ndarray:
-    """Philox keys of points, from what the points are and not from where they stand in a grid.
+    """Philox keys (n, 2) of points, from what they are and not from where they stand in a grid.
 
-    Parameters
-    ----------
-    rows : (n, m) array_like
-        One row of float64 parameters (SI) per point, in a fixed order. -0.0 counts as 0.0.
-    domain : str
-        What the rows mean (names and order of the columns, say), so that equal numbers of
-        different meaning give different keys.
-    seed : int
-        The study's seed, >= 0.
-
-    Returns
-    -------
-    (n, 2) uint64 ndarray
-        BLAKE2b-128 of domain, seed and row: equal rows have equal keys, others different ones.
-
-    Raises
-    ------
-    ValueError
-        `rows` has not two dimensions or holds a nan, or `seed` is negative.
+    BLAKE2b-128 of domain, seed and row (n, m): equal rows have equal keys, others different ones.
+    The domain tells what the rows mean (names and order of the columns, say), so that equal numbers
+    of different meaning give different keys.
     """
     table = np.asarray(rows, dtype="<f8")
     if table.ndim != 2:

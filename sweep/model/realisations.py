@@ -29,8 +29,6 @@ ROWS = 4096
 BEAMLETS = 1 << 19
 """Beamlets of all these draws, of some 100 bytes each."""
 
-_NAMES = list(OUTPUTS)
-
 
 class Stretch(NamedTuple):
     """Some draws of some points, (m,) each, a point's draws in their order."""
@@ -55,9 +53,8 @@ def realise(
     first_draw: int = 0,
     draws: int,
 ) -> Iterator[Stretch]:
-    """Shots of every draw of n points on a flat plane.
+    """Shots of every draw of n points, with random `keys` (n, 2), on a flat plane.
 
-    Parameters as of :func:`sweep.model.shot.prepare`; `keys` (n, 2) are the points' random keys.
     Any part of the draws, from `first_draw` on, can be had alone.
     """
     everything = DEFAULTS | dict(parameters)
@@ -93,69 +90,75 @@ def certain(outputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 class Means:
-    """Means of the outputs over the draws of n points, added up draw after draw.
+    """Means of values over the draws of n points, added up draw after draw.
 
-    A draw in which an output is nan is no draw of that output. Logarithms are those of the mean.
+    By default of the outputs. A draw in which a value is nan is no draw of that value. Logarithms
+    are those of the mean.
     """
 
-    def __init__(self, size: int) -> None:
-        shape = len(OUTPUTS), size
-        self._count = np.zeros(shape, np.int64)
-        self._mean = np.where(LOGARITHMS[:, None], -np.inf, np.zeros(shape))
-        self._spread = np.zeros(shape)
+    def __init__(self, size: int, names: Sequence[str] = tuple(OUTPUTS)) -> None:
+        self.names, shape = list(names), (len(names), size)
+        self._logarithms = np.array([name.startswith("log10_") for name in names])
+        self.count = np.zeros(shape, np.int64)
+        self.mean = np.where(self._logarithms[:, None], -np.inf, np.zeros(shape))
+        self.spread = np.zeros(shape)
+        """Sums of squares about the means."""
 
-    def add(self, point: np.ndarray, outputs: Mapping[str, np.ndarray]) -> None:
+    def add(self, point: np.ndarray, values: Mapping[str, np.ndarray]) -> None:
         """Add draws, (m,) each, in the order of their numbers for each point."""
-        values = np.array([outputs[name] for name in OUTPUTS])
-        add(point, values, LOGARITHMS, self._count, self._mean, self._spread)
+        rows = np.array([values[name] for name in self.names])
+        add(point, rows, self._logarithms, self.count, self.mean, self.spread)
 
     def moments(
         self, names: Sequence[str], points: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Means, variances of a single draw and numbers of draws, (names, points) each.
+        """Means, variances of a single draw (unbiased) and numbers of draws, (names, points) each.
 
-        Of outputs other than logarithms, nan where there is nothing of one; the variance is
-        unbiased, and nan with a single draw.
+        Of outputs other than logarithms.
         """
-        rows = np.ix_(np.array([_NAMES.index(name) for name in names]), points)
-        n = self._count[rows]
+        rows = np.ix_(np.array([self.names.index(name) for name in names]), points)
+        n = self.count[rows]
         with np.errstate(invalid="ignore"):
-            return np.where(n > 0, self._mean[rows], np.nan), self._spread[rows] / (n - 1.0), n
+            return np.where(n > 0, self.mean[rows], np.nan), self.spread[rows] / (n - 1.0), n
 
     def running(self) -> np.ndarray:
         """Return the sums that further draws are added to, besides means, (n, RUNNING_COLUMNS)."""
-        kept = self._count, self._spread[SPREAD_OF], self._mean[LOGARITHMS]
+        kept = self.count, self.spread[SPREAD_OF], self.mean[LOGARITHMS]
         return np.concatenate(kept).T
 
     def go_on_from(self, means: Mapping[str, np.ndarray]) -> None:
         """Go on from what `results` and `running` gave before; zeros where nothing was drawn."""
-        columns = np.cumsum([len(_NAMES), SPREAD_OF.sum()])
+        columns = np.cumsum([len(self.names), SPREAD_OF.sum()])
         count, spread, largest = np.split(means[RUNNING].T, columns)
-        self._count[...] = count
-        self._spread[SPREAD_OF] = spread
-        mean = np.array([means[name] for name in OUTPUTS])
+        self.count[...] = count
+        self.spread[SPREAD_OF] = spread
+        mean = np.array([means[name] for name in self.names])
         mean[LOGARITHMS] = largest
-        self._mean[...] = np.where(count > 0, mean, self._mean)
+        self.mean[...] = np.where(count > 0, mean, self.mean)
 
     def sums(self) -> np.ndarray:
-        """All that draws have come to, (3 * outputs, n); :meth:`restore` goes on from there."""
-        return np.concatenate([self._count, self._mean, self._spread])
+        """All that draws have come to, (3 * names, n); :meth:`restore` goes on from there."""
+        return np.concatenate([self.count, self.mean, self.spread])
 
     def restore(self, sums: np.ndarray) -> None:
         """Go on from what :meth:`sums` gave before."""
-        self._count[...], self._mean[...], self._spread[...] = np.split(sums, 3)
+        self.count[...], self.mean[...], self.spread[...] = np.split(sums, 3)
+
+    def errors(self) -> np.ndarray:
+        """Compute standard errors of the means, (names, n)."""
+        n = self.count
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.sqrt(self.spread / (n * (n - 1.0)))
 
     def results(self) -> dict[str, np.ndarray]:
         """Return means by the names of OUTPUTS, standard errors by ERROR_OUTPUTS, (n,)."""
-        n = self._count
         with np.errstate(divide="ignore", invalid="ignore"):
-            logarithm = self._mean + np.log10(self._spread / n)
-            error = np.sqrt(self._spread / (n * (n - 1.0)))
+            logarithm = self.mean + np.log10(self.spread / self.count)
         # The running maximum of logarithms that are all -inf has nothing to add to it.
-        logarithm = np.where(np.isneginf(self._mean), self._mean, logarithm)
-        mean = np.where(LOGARITHMS[:, None], logarithm, self._mean)
-        means = dict(zip(OUTPUTS, np.where(n > 0, mean, np.nan), strict=True))
-        errors = dict(zip(OUTPUTS, error, strict=True))
+        logarithm = np.where(np.isneginf(self.mean), self.mean, logarithm)
+        mean = np.where(self._logarithms[:, None], logarithm, self.mean)
+        means = dict(zip(self.names, np.where(self.count > 0, mean, np.nan), strict=True))
+        errors = dict(zip(self.names, self.errors(), strict=True))
         return means | {name: errors[name.removesuffix("_error")] for name in ERROR_OUTPUTS}
 
 

@@ -58,7 +58,6 @@ from sweep.model.pairing import (
     TRUE,
     UNCONFIRMED,
     judge,
-    pair_by_strength,
     pair_peaks,
 )
 from sweep.model.preparation import Shots
@@ -73,25 +72,19 @@ class Returns(NamedTuple):
     """Up to ``most`` returns of each shot and draw, each (n, draws, most); nan where there is none.
 
     Confirmed returns come before unconfirmed ones, stronger up peaks before weaker ones, a false
-    up peak last. ``_interpolated`` goes with peaks placed between bins, no suffix with whole bins.
+    up peak last. Units are those of :data:`sweep.model.outputs.POINTS`. ``_interpolated`` goes with
+    peaks placed between bins; their errors are those of noise, with what the spread of the groups'
+    own lines adds. No suffix goes with whole bins; rounding (1/sqrt(12) bin) adds to their errors.
     """
 
     range: np.ndarray
-    """[m]"""
     range_interpolated: np.ndarray
-    """[m]"""
     radial_velocity: np.ndarray
-    """[m/s], positive when closing."""
     radial_velocity_interpolated: np.ndarray
-    """[m/s]"""
     range_standard_error: np.ndarray
-    """Standard error [m]: of the interpolated range, and of rounding to bins (1/sqrt(12))."""
     range_interpolated_standard_error: np.ndarray
-    """Standard error [m] under noise, with what the spread of the groups' own lines adds."""
     radial_velocity_standard_error: np.ndarray
-    """[m/s], as for the range."""
     radial_velocity_interpolated_standard_error: np.ndarray
-    """[m/s], as for the range."""
     snr: np.ndarray
     """Power of the weaker of up and down peak as found over the mean noise power of a bin."""
     pd: np.ndarray
@@ -113,18 +106,9 @@ def draw_returns(
     draws: int = 1,
     method: str = "probabilities",
 ) -> Returns:
-    """Draw returns of every shot, draw by draw.
+    """Draw returns of n prepared shots by their :func:`groups` and keys (n, 2), draw by draw.
 
-    Parameters
-    ----------
-    shots, found
-        n prepared points, and the groups in their spectra, by :func:`groups`.
-    keys : (n, 2) uint64
-        Random key of each.
-    first_draw, draws : int
-        Number of the first draw, number of draws; any range of draws can be computed alone.
-    method : str
-        ``probabilities`` or ``noise``.
+    ``method`` is ``probabilities`` or ``noise``; any range of draws can be computed alone.
     """
     noisy, n = method == "noise", shots.size
     known, drawn = known_of(shots, found), Drawn.nothing(found, draws)
@@ -142,7 +126,7 @@ def draw_returns(
         _draw(keys[part], of_part, some._replace(alarm=alarm), seen, tables, own)
         for column, values in zip(drawn, own, strict=True):
             column[part] = values
-    return measured(shots, found, drawn)
+    return measured(shots, known, drawn)
 
 
 class How(NamedTuple):
@@ -156,10 +140,9 @@ class How(NamedTuple):
     """There is a Doppler segment."""
     half: int
     """N/2."""
-    signed: bool
-    """Bins are -N/2 .. N/2 - 1, of a complex record, not 1 .. N/2."""
-    rising: float
-    """1 where the down beat rises against the up beat as the range does, else -1."""
+    signed: float
+    """Of a complex record, of bins -N/2 .. N/2 - 1: 1 where the down beat rises against the up beat
+    as the range does, else -1. 0 of a real one, of bins 1 .. N/2."""
     alone: int
     """Reading of up and down peak without a Doppler segment."""
     ends: int
@@ -177,12 +160,12 @@ class How(NamedTuple):
     def of(cls, shots: Shots, first_draw: int, noisy: bool) -> "How":
         """Draw some shots from a draw on."""
         alone = waveform.FAST if shots.two_beats == waveform.FAST_TARGET else waveform.FAR
+        signed = 0.0
         if shots.complex_record:
-            alone = waveform.SIGNED
+            alone, signed = waveform.SIGNED, math.copysign(1.0, 1.0 - shots.slopes[2])
         return cls(
             int(first_draw), noisy, shots.incoherent, bool(shots.segments[1]), shots.fft_size // 2,
-            shots.complex_record, math.copysign(1.0, 1.0 - shots.slopes[2]), alone,
-            shots.real_ends, shots.echo_rule[1], echo_filter(shots, Seen.nothing(0)),
+            signed, alone, shots.real_ends, shots.echo_rule[1], echo_filter(shots, Seen.nothing(0)),
             shots.looks.number if shots.looks.several else 1, shots.looks.independent,
         )  # fmt: skip
 
@@ -255,13 +238,16 @@ def known_of(shots: Shots, found: Groups) -> Known:
     weight = np.where(inside, amplitude[:, None, None] ** 2, 0.0)
     total = weight.sum(axis=-1)
     total[total == 0] = 1.0
+    up, down = found.pd[:, 0], found.pd[:, 2]
+    both = shots.both(up.T, down.T, (found.magnitude[:, 0].T, found.magnitude[:, 2].T)).T
+    beside = down_given_up(up, down, both)
     mean = (weight * apart).sum(axis=-1) / total
     square = (weight * apart**2).sum(axis=-1) / total
     return Known(
         bins, found.pd, found.neighbours, np.sqrt(np.maximum(square - mean**2, 0.0)), lines,
         amplitude, np.stack([shots.bin_deviation, *noise_levels(shots)], axis=1), found.leakage,
         np.stack([np.broadcast_to(part, shots.size) for part in _third(shots)], axis=1),
-        _beside(shots, found), _searched(shots),
+        np.ascontiguousarray(np.moveaxis(beside, 0, 1)), _searched(shots),
         np.empty((shots.size, 0)) if shots.fading is None else shots.fading.mixing().T.copy(),
     )  # fmt: skip
 
@@ -288,13 +274,6 @@ def _searched(shots: Shots) -> np.ndarray:
     return found
 
 
-def _beside(shots: Shots, found: Groups) -> np.ndarray:
-    """Probabilities of groups in the down segment, as of :class:`Known`."""
-    up, down = found.pd[:, 0], found.pd[:, 2]
-    both = shots.both(up.T, down.T, (found.magnitude[:, 0].T, found.magnitude[:, 2].T)).T
-    return np.ascontiguousarray(np.moveaxis(down_given_up(up, down, both), 0, 1))
-
-
 class Told(NamedTuple):
     """Range [m] and radial velocity [m/s] of returns by WHOLE and FINE peaks, (n, draws, most, 2).
 
@@ -311,12 +290,14 @@ class Told(NamedTuple):
     """Excess of the range told over that at the shot's start [m], (n, 1, 1)."""
 
 
-def measured(shots: Shots, found: Groups, drawn: Drawn) -> Returns:
+def measured(shots: Shots, known: Known, drawn: Drawn) -> Returns:
     """Compute returns from pairs of peaks; flag those that misread their common beamlet."""
     fitted = shots.slopes != waveform.SIGNS
     told = _fitted(shots, drawn) if fitted else _read(shots, drawn)
     point, group = np.arange(shots.size)[:, None, None], np.maximum(drawn.group, 0)
-    sizes = (found.last - found.first)[point[..., None], np.arange(3), group]
+    sizes = (known.bins[:, :, LAST] - known.bins[:, :, FIRST])[
+        point[..., None], np.arange(3), group
+    ]
     reach = 2 * (4 + np.where(drawn.group >= 0, sizes, 0).sum(axis=-1))  # of half bins
     offset, doppler = shots.offset[shots.row], SPEED_OF_LIGHT / 2 * shots.doppler[shots.row]
     truth = columns(shots, shots.radial_velocity) + doppler
@@ -325,7 +306,7 @@ def measured(shots: Shots, found: Groups, drawn: Drawn) -> Returns:
     right = abs(off) <= reach * told.metre
     right &= abs(told.velocity[..., FINE] - truth[point, seen]) <= reach * told.speed
     signal = (drawn.group[..., 0] >= 0) & (drawn.group[..., 2] >= 0)
-    pd = found.pd[point, 0, group[..., 0]] * _beside(shots, found)[point, 1, group[..., 2]]
+    pd = known.pd[point, 0, group[..., 0]] * known.beside[point, 1, group[..., 2]]
     misread = (drawn.flags & TRUE > 0) & ~right
     if not fitted:  # what the ground came nearer by within the shot: the measured velocity tells
         told.velocity[..., FINE] *= 1 + columns(shots, shots.slowing, 2)
@@ -429,17 +410,19 @@ def _draw(keys, how, known, seen, tables, out):
 def report(at, how, known, found, pairs, out):
     """Pair the peaks of one point (i, draw) into returns, and judge each.
 
-    ``found``: peaks (3, most + 1, 4) of the three segments, their groups, and their numbers.
+    ``found``: peaks (3, most + 1, 4), their groups, and their number in each segment.
     """
     (i, d), (peaks, which, number) = at, found
     if how.doppler:
         confirmed, count = pair_peaks(
             peaks[0, : number[0], FINE], peaks[1, : number[1], FINE],
             peaks[2, : number[2], FINE], known.third[i], 2.0 * how.half,
-            how.rising if how.signed else 0.0, TOLERANCE, pairs,
+            how.signed, TOLERANCE, pairs,
         )  # fmt: skip
     else:
-        confirmed = count = pair_by_strength(number[0], number[2], how.alone, pairs)
+        confirmed = count = min(number[0], number[2])
+        for r in range(count):
+            pairs[r, 0], pairs[r, 1], pairs[r, 2], pairs[r, 3] = r, -1, r, how.alone
     for r in range(min(count, out.flags.shape[2])):
         u, k, v, out.code[i, d, r] = pairs[r]
         group, centres = out.group[i, d, r], np.zeros(3)
@@ -459,18 +442,10 @@ def report(at, how, known, found, pairs, out):
 
 @njit(cache=True, error_model="numpy")
 def draw_peaks(address, at, how, known, seen, tables, peaks, which, up):
-    """Peaks of one segment in one draw: which groups are detected, where, and one false peak.
+    """Peaks (most + 1, 4) of a segment in a draw and their groups; returns how many there are.
 
-    Parameters
-    ----------
-    address, at
-        Key of the point and number of the draw; point and segment.
-    how, known, seen, tables
-        :class:`How`, :class:`Known`, :class:`sweep.model.draws.Seen`, and the interpolator.
-    peaks, which : (most + 1, 4) float64, (most + 1,) int64
-        Result: peaks by their fields, and their groups; their number is returned.
-    up : (most,) bool
-        Groups that are detected in the up segment, which comes first.
+    ``address``: key of the point and number of the draw; ``at``: point and segment; ``up``
+    (most,): whether a group is detected in the up segment, which comes first.
     """
     (a, b, draw), (i, s) = address, at
     sigma, beta, under_lines = known.levels[i]

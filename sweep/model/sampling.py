@@ -33,7 +33,7 @@ from sweep.model.estimators import DEFAULTS
 from sweep.model.noisy_spectra import VALUES, Methods, View, counted, view_of
 from sweep.model.outputs import DRAW_OUTPUTS, KEPT, PROMISED, RUNNING
 from sweep.model.preparation import Parameters, Shots
-from sweep.model.realisations import ROWS, Means, add, certain, random_effects, realise
+from sweep.model.realisations import ROWS, Means, certain, random_effects, realise
 from sweep.model.shot import evaluate, prepare, statistics
 
 PIECE = 1 << 16
@@ -64,14 +64,9 @@ class Before(NamedTuple):
 
 
 class Drawn(ABC):
-    """Sums over the draws of n points so far, to be continued.
+    """Sums over the draws of n points so far, to be continued; arguments of :func:`simulate`.
 
-    Parameters
-    ----------
-    parameters, effects, keys, before
-        As of :func:`simulate`.
-    ends : (batches + 1,) ndarray
-        Numbers of draws between batches, the first of them that of the first draw.
+    ``ends`` (batches + 1,) are numbers of draws between batches, from the first draw's on.
     """
 
     def __init__(
@@ -182,41 +177,18 @@ def simulate(
 ) -> dict[str, np.ndarray]:
     """Simulate draws with all effects: outputs, their errors, and counts of draws.
 
-    Parameters
-    ----------
-    parameters, effects
-        As for :func:`sweep.model.shot.evaluate`. If random effects are among them the outputs
-        are means over the same draws that are counted. For whole spectra, parameters also by the
-        names of :data:`sweep.model.estimators.DEFAULTS`.
-    keys : (n, 2) uint64
-        Random key of each point.
-    first_draw : int
-        Number of the first draw.
-    method : str
-        ``probabilities``, ``noise`` or ``spectra``.
-    batch_sizes : sequence of int
-        Draws of each point in each batch; without them as many as `accuracy` needs.
-    batch, limit : int
-        The accuracy is checked at multiples of ``batch`` draws; a point has at most ``limit``
-        draws, by which the accuracy may not be met.
-    accuracy : Accuracy
-        Half-widths that are to be reached.
-    methods : Methods
-        Detectors and estimators by their names in the parameters.
-    before : Before, optional
-        Earlier draws, from ``first_draw`` on, for the same accuracy or a looser one, or up to a
-        lower limit.
-    stop : callable
-        Called between draws; true ends with the draws taken so far, at least some. They make a
-        `before` from which another call continues.
+    The result has the names of OUTPUTS and ERROR_OUTPUTS, or SPECTRA_OUTPUTS, and ACCURACY_OUTPUTS
+    of :mod:`sweep.model.outputs`, (n,), and those of DRAW_OUTPUTS, (n, batches). With random
+    effects or whole spectra it also has RUNNING, (n, columns), and outputs are means over the draws
+    that are counted.
 
-    Returns
-    -------
-    dict of ndarray
-        (n,) by the names of OUTPUTS and ERROR_OUTPUTS, or SPECTRA_OUTPUTS, and ACCURACY_OUTPUTS of
-        :mod:`sweep.model.outputs`; (n, batches) int64 by those of DRAW_OUTPUTS, all draws in one
-        count without batches. If random effects or whole spectra are simulated, also RUNNING,
-        (n, columns).
+    `parameters` and `effects` are as for :func:`sweep.model.shot.evaluate`, `keys` (n, 2) random,
+    `method` is ``probabilities``, ``noise`` or ``spectra``. A point has as many draws as
+    `batch_sizes` say. Without them (then all draws are one count) it has as many as `accuracy`
+    needs, which is checked at multiples of `batch` draws, but no more than `limit`. `before` are
+    earlier draws, from `first_draw` on, for the same accuracy or a looser one. If `stop`, called
+    between draws, returns true, the result holds the draws taken so far, at least some: a `before`
+    from which another call continues.
     """
     ends = first_draw + np.cumsum([0, *(batch_sizes or [limit])])
     given: dict[str, Any] = {"keys": keys, "ends": ends, "before": before}
@@ -268,13 +240,7 @@ def settle(
 
 
 class Sample(Drawn):
-    """Draws held against probabilities, or in noise, with or without random effects.
-
-    Parameters
-    ----------
-    method : str
-        ``probabilities`` or ``noise``.
-    """
+    """Draws held against probabilities, or in noise, with or without random effects."""
 
     def __init__(
         self, parameters: Parameters, effects: Collection[str], *, method: str,
@@ -338,9 +304,6 @@ class Sample(Drawn):
         return outputs | self.accuracy(accuracy)
 
 
-_NO_LOGARITHMS = np.zeros(len(VALUES), bool)
-
-
 class SpectraSample(Drawn):
     """Draws of whole spectra, looked at by detectors and estimators of given names."""
 
@@ -350,9 +313,7 @@ class SpectraSample(Drawn):
     ) -> None:  # fmt: skip
         super().__init__({**DEFAULTS, **parameters}, effects, before=before, **given)
         self._methods, size = methods, self.number.size
-        self._count = np.zeros((len(VALUES), size), np.int64)
-        self._mean, self._square = np.zeros((2, len(VALUES), size))  # the latter about the mean
-        self._fixed = Means(size)
+        self._values, self._fixed = Means(size, VALUES), Means(size)
         self._prepared: dict[int, tuple[Shots, int]] = {}
         if not random_effects(effects):
             everywhere = np.broadcast_to(np.asarray(parameters["target.range"]), size)
@@ -361,12 +322,10 @@ class SpectraSample(Drawn):
                 self._fixed.add(index, statistics(shots))
                 self._prepared |= {int(p): (shots, i) for i, p in enumerate(index)}
         if before is not None:
-            columns = len(VALUES) * np.arange(1, 4)
-            self._count[...], self._mean, self._square, sums = (
-                part.copy() for part in np.split(before.means[RUNNING].T, columns)
-            )
+            values, fixed = np.split(before.means[RUNNING].T, [3 * len(VALUES)])
+            self._values.restore(values)
             if not self._prepared:
-                self._fixed.restore(sums)
+                self._fixed.restore(fixed)
 
     def at_once(self, points: int) -> int:
         """Draws of each of so many points that one `take` is for: some of :data:`SAMPLES`.
@@ -383,8 +342,8 @@ class SpectraSample(Drawn):
                 batch = np.searchsorted(self.ends, draws, "right") - 1
                 found, values = counted(view, draws)
                 np.add.at(counts[:, place].T, batch, found.T)
-                sums = self._count, self._mean, self._square
-                add(np.full(draws.size, point), values, _NO_LOGARITHMS, *sums)
+                named = dict(zip(VALUES, values, strict=True))
+                self._values.add(np.full(draws.size, point), named)
 
     def _views(self, point: int, first: int, last: int) -> Iterator[tuple[View, np.ndarray]]:
         """Yield views of a point, with the numbers of the draws that each is for."""
@@ -418,15 +377,15 @@ class SpectraSample(Drawn):
 
     def results(self, accuracy: Accuracy) -> dict[str, np.ndarray]:
         """As of :class:`Drawn`."""
-        n, mean, square = (
-            dict(zip(VALUES, part, strict=True)) for part in (self._count, self._mean, self._square)
+        values, fixed = self._values, self._fixed.results()
+        n, mean, square, error = (
+            dict(zip(VALUES, part, strict=True))
+            for part in (values.count, values.mean, values.spread, values.errors())
         )
-        fixed = self._fixed.results()
         outputs = {name: fixed[name] for name in KEPT}
         shares = self.found() / self.number + self._there()
         outputs |= dict(zip(PROMISED, shares, strict=True))
         with np.errstate(divide="ignore", invalid="ignore"):
-            error = {name: np.sqrt(square[name] / (n[name] * (n[name] - 1))) for name in VALUES}
             for name in ("pfa_bin", "false_alarms"):
                 outputs |= {name: mean[name], f"{name}_error": error[name]}
             for name in ("range", "radial_velocity"):
@@ -438,6 +397,5 @@ class SpectraSample(Drawn):
                     f"{name}_bound": np.sqrt(mean[f"{name}_2"])
                     + np.where(n[f"{name}_2"] > 0, 0.0, np.nan),
                 }
-        sums = self._fixed.sums()
-        running = np.concatenate([self._count, self._mean, self._square, sums]).T
+        running = np.concatenate([values.sums(), self._fixed.sums()]).T
         return outputs | self.accuracy(accuracy) | {RUNNING: running}

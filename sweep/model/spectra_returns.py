@@ -16,12 +16,11 @@ does not know better; those of ``peak_bin`` count its rounding.
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
-from sweep.model.detectors import FIXED, main_lobe
-from sweep.model.estimators import DEFAULTS, DETECTOR, ESTIMATOR, PEAK_BIN
+from sweep.model.detectors import main_lobe
+from sweep.model.estimators import DEFAULTS, ESTIMATOR, PEAK_BIN
 from sweep.model.groups import Groups
 from sweep.model.interpolation import interpolator, sub_bin_error
 from sweep.model.noisy_spectra import (
@@ -42,26 +41,6 @@ from sweep.model.returns import Drawn, How, Returns, known_of, measured, put, re
 from sweep.model.waveform import STRONGEST
 
 
-class Peak(NamedTuple):
-    """Adjacent bins that a detector flags."""
-
-    bin: int
-    """Index of the strongest of them."""
-    group: int
-    """Echo whose bins they touch, or FALSE."""
-
-
-def is_fixed(parameters: Parameters) -> bool:
-    """Tell whether spectra are held against the threshold that closed forms know."""
-    return str(parameters.get(DETECTOR + "kind", FIXED)) == FIXED
-
-
-def without_chances(found: Groups) -> Groups:
-    """Strip groups of probabilities: they are those of crossing the threshold alone."""
-    pd, leakage = (np.full_like(chances, np.nan) for chances in (found.pd, found.leakage))
-    return found._replace(pd=pd, leakage=leakage)
-
-
 def spectra_returns(
     shots: Shots,
     found: Groups,
@@ -72,16 +51,9 @@ def spectra_returns(
     first_draw: int = 0,
     draws: int = 1,
 ) -> Returns:
-    """Draw returns of every shot, draw by draw.
+    """Draw returns as :func:`sweep.model.returns.draw_returns` does, by the methods of these names.
 
-    Parameters
-    ----------
-    shots, found, keys, first_draw, draws
-        As of :func:`sweep.model.returns.draw_returns`.
-    parameters : mapping
-        Scalars; those of :data:`sweep.model.estimators.DEFAULTS` that are not given are these.
-    methods : Methods
-        Detectors and estimators by their names in the parameters.
+    `parameters` are scalars; :data:`sweep.model.estimators.DEFAULTS` stand for any not given.
     """
     p, most = {**DEFAULTS, **parameters}, found.bin.shape[2]
     known, drawn = known_of(shots, found), Drawn.nothing(found, draws)
@@ -100,22 +72,21 @@ def spectra_returns(
                 if signal is None:
                     continue
                 spectra = list(spectra_of(view, s, np.array([first_draw + d])))
-                power, listed = peaks_of(spectra, signal, echoes[s], view, kept)
-                bins = np.array([peak.bin for peak in listed], np.int64)
+                power, bins, groups = peaks_of(spectra, signal, echoes[s], view, kept)
                 alike = [np.repeat(each, bins.size, axis=0) for each in spectra]
                 places = placed(alike, bins, view) if bins.size else np.empty(0)
-                for k, (peak, place) in enumerate(zip(listed, places.tolist(), strict=True)):
-                    ratio = math.sqrt(power[peak.bin]) / sigma
-                    delta = min(max(place - peak.bin, -0.5), 0.5)
+                for k, (bin_, place) in enumerate(zip(bins.tolist(), places.tolist(), strict=True)):
+                    ratio = math.sqrt(power[bin_]) / sigma
+                    delta = min(max(place - bin_, -0.5), 0.5)
                     error = sub_bin_error(delta, ratio / under_lines, tables) / looks
-                    wide = known.spread[i, s, peak.group] if peak.group >= 0 else 0.0
+                    wide = known.spread[i, s, groups[k]] if groups[k] >= 0 else 0.0
                     error = math.hypot(error, rounded)
-                    at = peak.bin - zero, place - zero
+                    at = bin_ - zero, place - zero
                     put(peaks[s, k], *at, error, ratio, wide, how, tables)
-                    which[s, k] = peak.group
+                    which[s, k] = groups[k]
                 number[s] = bins.size
             report((i, d), how, known, (peaks, which, number), pairs, drawn)
-    return measured(shots, found, drawn)
+    return measured(shots, known, drawn)
 
 
 def _bins_of(view: View, segment: int, signal: Signal | None) -> np.ndarray:
@@ -148,10 +119,11 @@ def _bins_of(view: View, segment: int, signal: Signal | None) -> np.ndarray:
 
 def peaks_of(
     spectra: Sequence[np.ndarray], signal: Signal, echoes: np.ndarray, view: View, most: int
-) -> tuple[np.ndarray, list[Peak]]:
+) -> tuple[np.ndarray, np.ndarray, list[int]]:
     """Power (bins,) of one draw of a segment, and the peaks in it, strongest first.
 
-    ``spectra``: (1, bins) each, of one or several looks; ``echoes``: of :func:`_bins_of`.
+    Of each the strongest bin, and the echo whose bins it touches, or FALSE. ``spectra``: (1, bins)
+    each, of one or several looks; ``echoes``: of :func:`_bins_of`.
     """
     (whole,), (flags,) = flagged(spectra, view, signal.segment)
     shots, turn = view.shots, turn_of(view.shots, signal.strongest)
@@ -163,20 +135,20 @@ def peaks_of(
     flags[[0, -1]] = False
     edges = np.diff(flags.astype(np.int8))
     starts, ends = np.flatnonzero(edges > 0) + 1, np.flatnonzero(edges < 0) + 1
-    found: list[Peak] = []
-    seen: set[int] = set()
+    bins: list[int] = []
+    groups: list[int] = []
     least = view.shots.searched_from
-    if not starts.size:
-        return whole, []
-    strength = np.maximum.reduceat(np.where(flags, power, 0.0), starts)
-    for run in np.argsort(-strength, kind="stable"):
+    strength = [power[start:end].max() for start, end in zip(starts, ends, strict=True)]
+    for run in np.argsort(-np.array(strength), kind="stable"):
         start, end = int(starts[run]), int(ends[run])
         own = np.flatnonzero((echoes[:, 0] < end) & (start <= echoes[:, 1]))
         group = int(own[0]) if own.size else FALSE
-        if group in seen or (group == FALSE and (start > half - least or end <= least)):
+        if group == FALSE and (start > half - least or end <= least):
             continue
-        seen |= {group} - {FALSE}
-        found.append(Peak((start + int(power[start:end].argmax()) - turn) % whole.size, group))
-        if len(found) == most:
+        if group != FALSE and group in groups:
+            continue
+        bins.append((start + int(power[start:end].argmax()) - turn) % whole.size)
+        groups.append(group)
+        if len(bins) == most:
             break
-    return whole, found
+    return whole, np.array(bins, np.int64), groups

@@ -10,15 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from sweep.model.geometry import quaternion as quat
 from sweep.model.geometry.quaternion import rotate
-
-if TYPE_CHECKING:
-    from scipy.interpolate import PPoly
 
 _VERTICAL, _STILL = 1e-9, 1e-100
 """Horizontal share of the speed, and horizontal speed [m/s], under which there is no heading."""
@@ -256,7 +253,7 @@ class Waypoints:
     smooth: bool = True
     """A cubic spline, whose velocity and acceleration are steady (through two or three points,
     the line or parabola); False joins the points by straight lines at constant velocities."""
-    _curve: PPoly = field(init=False, repr=False)
+    _curve: Any = field(init=False, repr=False)
     _origin: np.ndarray = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -268,7 +265,7 @@ class Waypoints:
         # Far-off positions would cost the spline its last digits: it runs from the first one.
         origin, x = x[0], x - x[0]
         if self.smooth:
-            curve: PPoly = CubicSpline(t, x)
+            curve = CubicSpline(t, x)
         else:
             curve = PPoly(np.stack([np.diff(x, axis=0) / np.diff(t)[:, None], x[:-1]]), t)
         object.__setattr__(self, "_curve", curve)

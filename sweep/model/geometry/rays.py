@@ -67,18 +67,11 @@ class Caster:
         *,
         poses: Sequence[Pose | None] | None = None,
     ) -> Bundle:
-        """First hits of bundles of beamlets, each bundle from one origin.
+        """First hits of bundles of beamlets, each bundle from one origin (n, 3) [m].
 
-        Parameters
-        ----------
-        origins : (n, 3) array_like
-            Places where bundles start [m]. A facet on which a ray starts, within rounding, may
-            count as hit or not.
-        directions : (n, b, 3) array_like
-            Unit vectors of each bundle's beamlets, b >= 1, the beam's centre first, in the world's
-            frame.
-        poses : sequence of Pose or None, optional
-            Of each body, None for one that rests in the world's frame; default all at rest.
+        Directions (n, b, 3) are unit vectors in the world's frame, the beam's centre first. A pose
+        of None is that of a body that rests in the world's frame. A facet on which a ray starts,
+        within rounding, may count as hit or not.
         """
         start, along = (np.ascontiguousarray(a, np.float64) for a in (origins, directions))
         frames = self._frames(poses, len(start))

@@ -7,7 +7,7 @@ import pytest
 
 from sweep.model import philox
 from sweep.model.detection import Fading, fading_together, found_pair
-from sweep.model.draws import Rows, count_by_chance, count_in_noise, fading_of_draws
+from sweep.model.draws import Rows, count_by_chance, count_in_noise, fading_factors
 from sweep.model.effects.catalogue import CORE
 from sweep.model.footprint import plane_footprint
 from sweep.model.ground import Cast, Footprints
@@ -162,11 +162,9 @@ def test_drawn_factors_have_the_correlations(near):
     number = 50_000
     far = 0.1 - 0.4j if near != 1.0 else 1.0
     fading = Fading(*np.array([[near + 0j], [far + 0j], [near + 0j]]))
-    found = np.empty((3, number))
-    fading_of_draws(
-        np.array([3, 4], np.uint64), np.arange(number), 0, fading.mixing()[:, 0].copy(), found
-    )
-    power = found**2
+    key, mixing = (np.uint64(3), np.uint64(4)), fading.mixing()[:, 0]
+    found = [fading_factors(key, draw, 0, mixing) for draw in np.arange(number)]
+    power = np.array(found).T ** 2
     assert power.mean(axis=1) == pytest.approx(np.ones(3), abs=5 / np.sqrt(number))
     pairs = np.corrcoef(power)[[0, 1, 0], [1, 2, 2]]  # of powers, |mu|^2
     squares = np.abs([near, near, far]) ** 2
