@@ -128,7 +128,7 @@ def candidates(settings: Iterable[Setting]) -> list[Setting]:
 
 
 def front(settings: Sequence[Setting]) -> list[Setting]:
-    """Return the settings on the front of time and error, the fastest first."""
+    """Return the settings that none is both as fast and as accurate as, the fastest first."""
     best: list[Setting] = []
     for setting in sorted(settings, key=lambda s: (s.seconds, s.error)):
         if not best or max(setting.error, EXACT) < max(best[-1].error, EXACT):
@@ -207,7 +207,7 @@ def rows(settings: Sequence[Setting]) -> list[list[str]]:
 
 
 def short_rows(settings: Sequence[Setting]) -> list[list[str]]:
-    """Return the rows by SHORT: settings on the front have a star before their names."""
+    """Return the rows by SHORT: settings on the Pareto front have a star before their names."""
     return [
         [f"{star or ' '} {name}", f"{time} us", *errors]
         for name, time, _, _, *errors, star in rows(settings)
@@ -408,7 +408,7 @@ def sheet(dataset: xr.Dataset, settings: Sequence[Setting]) -> Sheet:
     sheet, (axes,) = canvas.panels(10.0, 6.2, 1, 1)
     axes.step(
         *zip(*map(_place, front(drawn)), strict=True), where="post", color="0.35", linewidth=1.2,
-        linestyle="--", zorder=1, label="front of the best",
+        linestyle="--", zorder=1, label="Pareto front of time and error",
     )  # fmt: skip
     for kind, (marker, colour, words) in MARKS.items():
         some = of_kinds(drawn, kind)

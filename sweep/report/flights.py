@@ -360,7 +360,7 @@ def returns(found: Sequence[Seen]) -> Table:
         named = dict(zip(map(labels.coordinate, KINDS), counts.tolist(), strict=True))
         rows.append({"what": seen.words or "all", "shots": shots} | named)
     caption = ["Shots times draws, and points by kind."]
-    return Table("What came back", caption, pandas.DataFrame(rows), "returns")
+    return Table("Shots and points", caption, pandas.DataFrame(rows), "returns")
 
 
 def came_back(
