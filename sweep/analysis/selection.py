@@ -229,10 +229,7 @@ def spread(parts: list[tuple[str, Points]], most: int) -> tuple[list[tuple[str, 
 
 def coordinate_of(spec: Spec, path: str) -> Member | None:
     """Return the parameter of a path where it is on an axis."""
-    try:
-        return spec.member(path)
-    except KeyError:
-        return None
+    return next((m for axis in spec.axes for m in axis.members if m.path == path), None)
 
 
 def parameters_at(spec: Spec | SceneSpec, position: Mapping[str, int]) -> dict[str, Any]:

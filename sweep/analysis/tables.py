@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas
 import xarray as xr
 
 from sweep.analysis import labels, noise_only
@@ -66,10 +66,8 @@ class Page:
         directory.mkdir(parents=True, exist_ok=True)
         text, table = directory / f"{stem}.txt", directory / f"{stem}.csv"
         text.write_text(self.text(), encoding="utf-8")
-        with table.open("w", encoding="utf-8", newline="") as file:
-            writer = csv.DictWriter(file, list(self.records[0]) if self.records else [])
-            writer.writeheader()
-            writer.writerows(self.records)
+        frame = pandas.DataFrame(self.records)
+        frame.to_csv(table, index=False, na_rep="nan", lineterminator="\r\n")
         return [text, table]
 
 
