@@ -34,7 +34,7 @@ NOT_IN_THE_MODEL = {
 """Pure physics: arrays in, arrays out."""
 
 LARGEST_HOUSE = {
-    "lines": 49_875, "modules": 182, "lines of the model": 19_907, "modules of the model": 77,
+    "lines": 49_690, "modules": 182, "lines of the model": 19_907, "modules of the model": 77,
     "compiled functions": 137, "arguments of a compiled function": 10,
 }  # fmt: skip
 """Upper limits on the size of sweep/."""

@@ -298,8 +298,9 @@ def _thesis(settings: Sequence[Setting], beamlets: int) -> list[str]:
     if not duels:
         return []
     met = " and ".join(
-        f"{'met' if duel.times_faster >= TIMES_FASTER else 'NOT met'} over {_name(duel)}"
+        f"{'met' if duel.times_faster >= TIMES_FASTER else 'NOT met'} over {duel.other.name}"
         for duel in duels
+        if duel.other
     )
     least = f"Requirement, at least {TIMES_FASTER:g}: {met}."
     if beamlets != OF_THESIS:
@@ -318,10 +319,6 @@ def _speed_ups(duels: Sequence[Duel]) -> str:
             of = f"{duel.adaptive.name}, error {error(duel.other.error)}"
             groups.setdefault(of, []).append(f"{duel.times_faster:.2g} over {duel.other.name}")
     return " ".join(f"Speed-up of {of}: {'; '.join(each)}." for of, each in groups.items())
-
-
-def _name(duel: Duel) -> str:
-    return duel.other.name if duel.other else ""
 
 
 def _like_for_like(settings: Sequence[Setting]) -> list[str]:
