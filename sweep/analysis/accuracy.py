@@ -128,7 +128,7 @@ def candidates(settings: Iterable[Setting]) -> list[Setting]:
 
 
 def front(settings: Sequence[Setting]) -> list[Setting]:
-    """Return the settings on the front of time and error, the fastest first."""
+    """Return the settings that none is both as fast and as accurate as, the fastest first."""
     best: list[Setting] = []
     for setting in sorted(settings, key=lambda s: (s.seconds, s.error)):
         if not best or max(setting.error, EXACT) < max(best[-1].error, EXACT):
@@ -207,7 +207,7 @@ def rows(settings: Sequence[Setting]) -> list[list[str]]:
 
 
 def short_rows(settings: Sequence[Setting]) -> list[list[str]]:
-    """Return the rows by SHORT: settings on the front have a star before their names."""
+    """Return the rows by SHORT: settings on the Pareto front have a star before their names."""
     return [
         [f"{star or ' '} {name}", f"{time} us", *errors]
         for name, time, _, _, *errors, star in rows(settings)
@@ -298,8 +298,9 @@ def _thesis(settings: Sequence[Setting], beamlets: int) -> list[str]:
     if not duels:
         return []
     met = " and ".join(
-        f"{'met' if duel.times_faster >= TIMES_FASTER else 'NOT met'} over {_name(duel)}"
+        f"{'met' if duel.times_faster >= TIMES_FASTER else 'NOT met'} over {duel.other.name}"
         for duel in duels
+        if duel.other
     )
     least = f"Requirement, at least {TIMES_FASTER:g}: {met}."
     if beamlets != OF_THESIS:
@@ -318,10 +319,6 @@ def _speed_ups(duels: Sequence[Duel]) -> str:
             of = f"{duel.adaptive.name}, error {error(duel.other.error)}"
             groups.setdefault(of, []).append(f"{duel.times_faster:.2g} over {duel.other.name}")
     return " ".join(f"Speed-up of {of}: {'; '.join(each)}." for of, each in groups.items())
-
-
-def _name(duel: Duel) -> str:
-    return duel.other.name if duel.other else ""
 
 
 def _like_for_like(settings: Sequence[Setting]) -> list[str]:
@@ -408,7 +405,7 @@ def sheet(dataset: xr.Dataset, settings: Sequence[Setting]) -> Sheet:
     sheet, (axes,) = canvas.panels(10.0, 6.2, 1, 1)
     axes.step(
         *zip(*map(_place, front(drawn)), strict=True), where="post", color="0.35", linewidth=1.2,
-        linestyle="--", zorder=1, label="front of the best",
+        linestyle="--", zorder=1, label="Pareto front of time and error",
     )  # fmt: skip
     for kind, (marker, colour, words) in MARKS.items():
         some = of_kinds(drawn, kind)

@@ -8,11 +8,11 @@ valid or not: of the mean or the last of the period's valid shots.
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+import pandas
 import xarray as xr
 
 from sweep.analysis.export import chosen
@@ -106,10 +106,9 @@ def reports(
 
 
 def _write(table: Table, path: Path) -> None:
-    with path.open("w", encoding="utf-8", newline="") as text:
-        writer = csv.writer(text)
-        writer.writerow(f"{n} [{u}]" if u != "1" else n for n, (u, _) in COLUMNS.items())
-        writer.writerows(zip(*(table[name].tolist() for name in COLUMNS), strict=True))
+    names = {n: f"{n} [{u}]" if u != "1" else n for n, (u, _) in COLUMNS.items()}
+    frame = pandas.DataFrame({header: table[name] for name, header in names.items()})
+    frame.to_csv(path, index=False, na_rep="nan", lineterminator="\r\n")
 
 
 def _shots(recording: Recording, draw: int, ranges: str) -> Table:

@@ -7,13 +7,11 @@ Arrays of any size are reduced to as many cells as a picture or a page can hold,
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise, product
 from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any
 
-import dask
 import dask.array
 import numpy as np
 import xarray as xr
@@ -25,6 +23,9 @@ if TYPE_CHECKING:
 
 
 MEAN, LOWEST, HIGHEST = "mean", "lowest", "highest"
+
+PIECE = 2**20
+"""Values that are added up at a time."""
 
 
 @dataclass(frozen=True)
@@ -66,32 +67,12 @@ def coarsened(
     for side, _ in sides:
         if not np.array_equal(side.positions, np.arange(array.sizes[side.dim])):
             array = array.isel({side.dim: side.positions})
-    array, order = known(array), [side.dim for side, _ in sides]
+    array = xr.DataArray(known(array).variable)
     together = {side.dim: side.together(most) for side, most in sides}
-    if max(together.values()) == 1:
-        return array.transpose(*order)
-    data, by = array.chunk().data, [together[str(dim)] for dim in array.dims]
-    lacking = [(0, -size % number) for size, number in zip(data.shape, by, strict=True)]
-    if any(after for _, after in lacking):
-        data = dask.array.pad(data, lacking, constant_values=np.nan)
-    # in the order of the store: turned before, every piece would be copied
-    cells = dask.array.coarsen(_REDUCTIONS[kind], data, dict(enumerate(by)))
-    return xr.DataArray(cells, dims=array.dims).transpose(*order)
-
-
-def _mean(values: np.ndarray, axis: tuple[int, ...] | None = None) -> np.ndarray:
-    """Mean of what is not nan; nan without any."""
-    there = ~np.isnan(values)
-    number = there.sum(axis=axis)
-    total = np.sum(values, axis=axis, where=there)
-    return np.where(number > 0, total / np.maximum(number, 1), np.nan)
-
-
-_REDUCTIONS = {
-    MEAN: _mean,
-    LOWEST: lambda values, axis=None: np.fmin.reduce(values, axis=axis),
-    HIGHEST: lambda values, axis=None: np.fmax.reduce(values, axis=axis),
-}
+    if max(together.values()) > 1:
+        cells = array.coarsen(together, boundary="pad")
+        array = {MEAN: cells.mean, LOWEST: cells.min, HIGHEST: cells.max}[kind]()
+    return array.transpose(*together)
 
 
 @dataclass(frozen=True)
@@ -191,21 +172,6 @@ class Points:
         dim = self.dim_of(name)
         return [(values[i], self.at(dim, members[i])) for i in np.argsort(first)]
 
-    def within(self, block: Mapping[str, tuple[int, int]]) -> Points:
-        """Points at places from a first to before a last one along each dimension."""
-        found = self
-        for dim, positions in self.positions.items():
-            first, last = np.searchsorted(positions, block[dim])
-            found = found.at(dim, slice(int(first), int(last)))
-        return found
-
-    def spread(self, name: str) -> np.ndarray:
-        """Return a coordinate at every point, (n,)."""
-        shape = [own.size for own in self.positions.values()]
-        along = [n if d == self.dim_of(name) else 1
-                 for d, n in zip(self.positions, shape, strict=True)]  # fmt: skip
-        return np.broadcast_to(self.values(name).reshape(along), shape).ravel()
-
     def side(self, name: str) -> Side:
         """Places along a coordinate, in rising order, each value of the coordinate once."""
         values, first = np.unique(self.values(name), return_index=True)
@@ -263,10 +229,7 @@ def spread(parts: list[tuple[str, Points]], most: int) -> tuple[list[tuple[str, 
 
 def coordinate_of(spec: Spec, path: str) -> Member | None:
     """Return the parameter of a path where it is on an axis."""
-    try:
-        return spec.member(path)
-    except KeyError:
-        return None
+    return next((m for axis in spec.axes for m in axis.members if m.path == path), None)
 
 
 def parameters_at(spec: Spec | SceneSpec, position: Mapping[str, int]) -> dict[str, Any]:
@@ -354,87 +317,37 @@ def beyond(found: Points, spec: Spec, distance: str, *, included: bool = False) 
     return found.at(found.dim_of(member.name), ranges >= least if included else ranges > least)
 
 
-def _position(member: Member, values: np.ndarray) -> np.ndarray:
-    """Index along an axis of each value of its coordinate."""
-    order = np.argsort(member.display, kind="stable")
-    return order[np.searchsorted(member.display[order], values)]
+@dataclass(frozen=True)
+class Statistics:
+    """Number of the finite values of some points; their mean, median and extremes, nan of none."""
+
+    number: int
+    mean: float
+    median: float
+    least: float
+    largest: float
+
+    @classmethod
+    def of(cls, values: np.ndarray) -> Statistics:
+        """Return those of values without infinity, which are sorted in place."""
+        total = sum(np.nansum(part) for part in np.array_split(values, values.size // PIECE + 1))
+        values.sort()  # nan comes last
+        number = int(np.searchsorted(values, np.nan))
+        if not number:
+            return cls(0, *[math.nan] * 4)
+        middle = values[(number - 1) // 2 : number // 2 + 1].mean()
+        return cls(number, float(total / number), float(middle), *values[[0, number - 1]].tolist())
 
 
-def si_value(member: Member, value: object) -> float | int | str:
-    """SI value of a coordinate's value."""
-    if isinstance(member.values, tuple):
-        return str(value)
-    return member.values[_position(member, np.array([value]))[0]].item()
-
-
-# Means, extremes and medians of any number of values, which are read piece by piece.
-
-
-def pieces(
-    groups: Sequence[Points], variables: Sequence[str]
-) -> Iterator[tuple[int, Points, dict[str, np.ndarray]]]:
-    """Points of some groups of one dataset, each piece of it read once for all groups.
-
-    Yields which group, those of its points that lie in a piece, and the variables there, (n,)
-    each.
-    """
-    dataset = groups[0].dataset
-    array = dataset[variables[0]]
-    chunks = array.chunks or [(size,) for size in array.shape]
-    edges = [pairwise(np.cumsum((0, *lengths)).tolist()) for lengths in chunks]
-    for place in product(*edges):
-        block = dict(zip(map(str, array.dims), place, strict=True))
-        inside = [(n, own) for n, own in enumerate(g.within(block) for g in groups) if own.size]
-        if not inside:
-            continue
-        at = {dim: slice(*ends) for dim, ends in block.items()}
-        read = dask.compute(*(known(dataset[v].transpose(*block).isel(at)).data for v in variables))
-        for number, part in inside:
-            local = np.ix_(*(part.positions[dim] - first for dim, (first, _) in block.items()))
-            values = zip(variables, (np.asarray(own)[local].ravel() for own in read), strict=True)
-            yield number, part, dict(values)
-
-
-@dataclass
-class Tally:
-    """Number, sum and extremes of the finite values that were added."""
-
-    number: int = 0
-    total: float = 0.0
-    least: float = math.inf
-    largest: float = -math.inf
-
-    def add(self, values: np.ndarray) -> None:
-        """Add values (n,), which numbers of nan and infinity are none of."""
-        values = values[np.isfinite(values)]
-        if values.size:
-            self.number += values.size
-            self.total += float(values.sum())
-            self.least = min(self.least, float(values.min()))
-            self.largest = max(self.largest, float(values.max()))
-
-    @property
-    def mean(self) -> float:
-        """Their mean; nan where there is none."""
-        return self.total / self.number if self.number else math.nan
-
-
-def tallied(groups: Sequence[Points], variable: str) -> list[Tally]:
-    """Tally of a variable over the points of each group."""
-    tallies = [Tally() for _ in groups]
-    for number, _, values in pieces(groups, [variable]):
-        tallies[number].add(values[variable])
-    return tallies
-
-
-def medians(groups: Sequence[Points], variable: str, numbers: Sequence[int]) -> list[float]:
-    """Median of a variable over the points of each group, of which so many are finite; else nan."""
+def statistics(groups: Sequence[Points], variable: str) -> list[Statistics]:
+    """Statistics of a variable over the points of each group, read once for all of them."""
+    arrays = [known(group.dataset[variable].isel(dict(group.positions))) for group in groups]
     with TemporaryFile() as file:  # which holds the values, as memory may not
-        room = np.memmap(file, float, "w+", shape=(sum(numbers) + 1,)).view(np.ndarray)
-        found = np.split(room, np.cumsum(numbers))[:-1]
-        filled = [0] * len(found)
-        for number, _, values in pieces(groups, [variable]):
-            own = values[variable][np.isfinite(values[variable])]
-            found[number][filled[number] : filled[number] + own.size] = own
-            filled[number] += own.size
-        return [float(np.median(v, overwrite_input=True)) if v.size else math.nan for v in found]
+        sizes = [array.size for array in arrays]
+        room = np.memmap(file, float, "w+", shape=(sum(sizes) + 1,)).view(np.ndarray)
+        parts = np.split(room, np.cumsum(sizes))[:-1]
+        dask.array.store(
+            [array.where(np.isfinite(array)).chunk().data for array in arrays],
+            [part.reshape(array.shape) for part, array in zip(parts, arrays, strict=True)],
+        )
+        return [Statistics.of(part) for part in parts]

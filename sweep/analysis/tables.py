@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas
 import xarray as xr
 
 from sweep.analysis import labels, noise_only
@@ -17,15 +17,13 @@ from sweep.analysis.answers.probability import of_a_shot
 from sweep.analysis.selection import (
     NEAREST,
     Points,
-    Tally,
+    Statistics,
     beyond,
     confined,
     cuts,
-    medians,
     parameters_at,
-    si_value,
     split,
-    tallied,
+    statistics,
 )
 from sweep.model.looks import Looks
 from sweep.model.shot import evaluate
@@ -68,10 +66,8 @@ class Page:
         directory.mkdir(parents=True, exist_ok=True)
         text, table = directory / f"{stem}.txt", directory / f"{stem}.csv"
         text.write_text(self.text(), encoding="utf-8")
-        with table.open("w", encoding="utf-8", newline="") as file:
-            writer = csv.DictWriter(file, list(self.records[0]) if self.records else [])
-            writer.writeheader()
-            writer.writerows(self.records)
+        frame = pandas.DataFrame(self.records)
+        frame.to_csv(table, index=False, na_rep="nan", lineterminator="\r\n")
         return [text, table]
 
 
@@ -122,17 +118,14 @@ def mean_page(found: Points, spec: Spec, asked: Asked, units: str, title: str) -
         for row, of_row in found.apart(asked.rows)
         for column in columns
     ]
-    parts = [part for _, _, part in named]
-    tallies = tallied(parts, asked.variable)
-    middles = medians(parts, asked.variable, [tally.number for tally in tallies])
     records = [
         {
             "row": labels.quantity(row, found.units(asked.rows)),
             "column": _column(found, asked.columns, column),
-            **_statistics(tally, middle, _published(asked.printed, *divmod(k, len(columns)))),
+            **_figures(own, _published(asked.printed, *divmod(k, len(columns)))),
         }
-        for k, ((row, column, _), tally, middle) in enumerate(
-            zip(named, tallies, middles, strict=True)
+        for k, ((row, column, _), own) in enumerate(
+            zip(named, statistics([part for *_, part in named], asked.variable), strict=True)
         )
     ]
     names = list(dict.fromkeys(str(r["column"]) for r in records))
@@ -158,15 +151,15 @@ def _published(printed: Any, row: int, column: int) -> float:
     return float(values[column]) if column < len(values) else math.nan
 
 
-def _statistics(tally: Tally, middle: float, printed: float) -> dict[str, Cell]:
+def _figures(own: Statistics, printed: float) -> dict[str, Cell]:
     return {
-        "points": tally.number,
-        "mean": tally.mean,
-        "median": middle,
-        "lowest": tally.least if tally.number else math.nan,
-        "highest": tally.largest if tally.number else math.nan,
+        "points": own.number,
+        "mean": own.mean,
+        "median": own.median,
+        "lowest": own.least,
+        "highest": own.largest,
         "printed": printed,
-        "printed_over_mean": printed / tally.mean if tally.mean else math.nan,
+        "printed_over_mean": printed / own.mean if own.mean else math.nan,
     }
 
 
@@ -206,10 +199,8 @@ def leakage(groups: Sequence[Points]) -> list[dict[str, Cell]]:
     groups = [replace(group, dataset=with_shot) for group in groups]
     found: list[dict[str, Cell]] = [{} for _ in groups]
     for name in ("p_leakage_up", "p_leakage_down", "shot_with_leakage"):
-        tallies = tallied(groups, name)
-        middles = medians(groups, name, [tally.number for tally in tallies])
-        for own, tally, middle in zip(found, tallies, middles, strict=True):
-            own |= {f"{name}_mean": tally.mean, f"{name}_median": middle}
+        for record, own in zip(found, statistics(groups, name), strict=True):
+            record |= {f"{name}_mean": own.mean, f"{name}_median": own.median}
     return found
 
 
@@ -246,10 +237,12 @@ def settings(found: Points, spec: Spec, by: str) -> list[tuple[str, dict[str, An
     """Points apart by `by` and what else varies but range and angle: name, SI values, points."""
     cut_names = {name for cut in cuts(spec) for name in (cut.along, cut.held)}
     names = [by, *(n for n in found.varying() if n != by and n not in cut_names)]
-    members = [spec.member(name) for name in names]
+    paths = [spec.member(name).path for name in names]
+    parts, _ = split(found, names, MOST_ROWS)
+    values = [parameters_at(spec, part.first()) for _, part in parts]
     return [
-        (name, {m.path: si_value(m, part.values(m.name)[0]) for m in members}, part)
-        for name, part in split(found, names, MOST_ROWS)[0]
+        (name, {path: own[path] for path in paths}, part)
+        for (name, part), own in zip(parts, values, strict=True)
     ]
 
 
@@ -264,20 +257,20 @@ def false_alarms(
         for i, (_, _, part) in enumerate(settled)
         for j, cut in enumerate(cuts(spec))
     ]
-    tallies = tallied([points for *_, points in groups], "pfa_both_chirps")
+    alarms = statistics([points for *_, points in groups], "pfa_both_chirps")
     leaked = leakage([points for *_, points in groups])
     records: list[dict[str, Cell]] = []
-    for (i, j, cut, points), tally, leak in zip(groups, tallies, leaked, strict=True):
+    for (i, j, cut, points), both, leak in zip(groups, alarms, leaked, strict=True):
         noise, figure = alone[i], _published(printed, i, j)
         mean_excess, excess = (
             noise_only.variance_excess_of_shot(p, noise.tnr, noise.bins)
-            for p in (tally.mean, figure)
+            for p in (both.mean, figure)
         )
         records.append(
             {
                 "setting": settled[i][0], "cut": cut, "points": points.size, "tnr": noise.tnr,
                 "bins": noise.bins, "closed_form": noise.closed_form, "noise_only": noise.model,
-                "study_mean": tally.mean, "study_variance_excess": mean_excess,
+                "study_mean": both.mean, "study_variance_excess": mean_excess,
                 "printed": figure, "printed_over_closed_form": figure / noise.closed_form,
                 "printed_variance_excess": excess, **leak,
             }
@@ -337,7 +330,7 @@ def threshold_page(found: Points, spec: Spec, *, by: str, printed: Any = (), tit
     """Table 4.2: false alarms of a bin, a row for each threshold."""
     records: list[dict[str, Cell]] = []
     settled = settings(found, spec, by)
-    means = tallied([beyond(part, spec, NEAREST) for _, _, part in settled], "pfa_bin")
+    means = statistics([beyond(part, spec, NEAREST) for _, _, part in settled], "pfa_bin")
     for i, (name, setting, _) in enumerate(settled):
         alone = reference(spec, setting)
         closed = noise_only.bin_probability(alone.tnr)

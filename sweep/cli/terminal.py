@@ -283,7 +283,7 @@ def _print_scene(store: Location) -> None:
     from sweep.tasks.summary import scene_summary
 
     print_table(
-        "What came back",
+        "Shots and points by scanner",
         ["scanner", "shots", "mean pd", "true points", "false points", "velocity solved"],
         [
             [

@@ -83,19 +83,15 @@ class Track:
         size = self.side.values.size
         return np.unique(np.linspace(0, size - 1, min(most, size)).round().astype(int))
 
-    def position(self, place: int) -> dict[str, int]:
-        """Position along every axis of one of its places."""
+    def position(self, place: Any) -> dict[str, Any]:
+        """Position along every axis of one of its places, or of several."""
         if self.side is None:
             return self.part.first()
-        return self.part.first(self.side) | {self.side.dim: int(self.side.positions[place])}
+        return self.part.first(self.side) | {self.side.dim: self.side.positions[place]}
 
     def values(self, variable: str, places: np.ndarray) -> np.ndarray:
         """Return a variable at some of its places."""
-        array = self.part.dataset[variable]
-        if self.side is None:
-            return np.ravel(array.isel(self.part.first()).values)
-        array = array.isel(self.part.first(self.side))
-        return np.ravel(array.isel({self.side.dim: self.side.positions[places]}).values)
+        return np.ravel(self.part.dataset[variable].isel(self.position(places)).values)
 
 
 def main_coordinate(spec: Spec) -> str:

@@ -280,7 +280,7 @@ BINS = 20
 
 def along(found: Sequence[Seen]) -> Chart | None:
     """Quantities of shots over time; none where none is computed."""
-    panels = []
+    panels: list[Panel] = []
     every = 1
     quantities = [name for name in SHOTS if name in found[0].recording.dataset]
     for seen in found:
@@ -289,28 +289,21 @@ def along(found: Sequence[Seen]) -> Chart | None:
         table = rows.rows()
         for name in quantities if table else ():
             up = Axis(label(name), limits=CHANCE if name == "pd_shot" else None)
-            when = {"cloud": seen.words, "quantity": label(name)}
-            panels.append(Panel(when, Axis("time (s)"), up, _by_beam(table, name)))
-    if not panels:
-        return None
+            panels.append(_over_time(seen, label(name), up, _by_beam(table, name)))
     told = [
         f"{panel.y.words}: {labels.extent(np.concatenate([line.y for line in panel.lines]))}"
         for panel in panels[: len(quantities)]
     ]
-    return Chart(
-        "Shots over time",
-        f"Marks of a quantity of each shot over time. {'; '.join(told)}.",
-        [f"One shot in {every} shown: reduced for this page" if every > 1 else ""],
-        panels,
-        {"cloud": "Shown for", "quantity": "Quantity"},
-    )
+    alt = f"Marks of a quantity of each shot over time. {'; '.join(told)}."
+    return _times("Shots over time", alt, [_reduced("shot", every)], panels)
 
 
 def errors(found: Sequence[Seen]) -> Chart | None:
     """Errors of range and velocity of true points against truth; none where there are none."""
-    panels, every = [], 1
+    panels: list[Panel] = []
+    every = 1
+    names = ["time", "beam", "flags", *MEASURED, *(f"true_{name}" for name in MEASURED)]
     for seen in found:
-        names = ["time", "beam", "flags", *MEASURED, *(f"true_{name}" for name in MEASURED)]
         rows = seen.recording.rows(names, MOST_SHOTS // len(found), ranges=INTERPOLATED)
         every = max(every, rows.every)
         table = rows.rows()
@@ -320,19 +313,26 @@ def errors(found: Sequence[Seen]) -> Chart | None:
             own = {key: values[true] for key, values in (table | error).items()}
             words = label(name).replace(" (", " error (")
             spread = labels.number(float(f"{np.sqrt(np.mean(own['error'] ** 2)):.3g}"))
-            when = {"cloud": seen.words, "quantity": f"{words}, rms {spread}"}
-            panels.append(Panel(when, Axis("time (s)"), Axis(words), _by_beam(own, "error")))
-    if not panels:
-        return None
-    return Chart(
-        "Errors against truth",
-        "Marks of the error of each true point over time. "
-        + "; ".join(panel.when["quantity"] for panel in panels[: len(MEASURED)]) + ".",
-        ["Measured less true, of true points, interpolated between bins",
-         f"One point in {every} shown: reduced for this page" if every > 1 else ""],
-        panels,
-        {"cloud": "Shown for", "quantity": "Quantity"},
-    )  # fmt: skip
+            lines = _by_beam(own, "error")
+            panels.append(_over_time(seen, f"{words}, rms {spread}", Axis(words), lines))
+    told = "; ".join(panel.when["quantity"] for panel in panels[: len(MEASURED)])
+    alt = f"Marks of the error of each true point over time. {told}."
+    how = "Measured less true, of true points, interpolated between bins"
+    return _times("Errors against truth", alt, [how, _reduced("point", every)], panels)
+
+
+def _over_time(seen: Seen, quantity: str, up: Axis, lines: Sequence[Line]) -> Panel:
+    return Panel({"cloud": seen.words, "quantity": quantity}, Axis("time (s)"), up, lines)
+
+
+def _reduced(thing: str, every: int) -> str:
+    return f"One {thing} in {every} shown: reduced for this page" if every > 1 else ""
+
+
+def _times(heading: str, alt: str, caption: list[str], panels: list[Panel]) -> Chart | None:
+    """Return a chart of quantities over time; none without panels."""
+    facets = {"cloud": "Shown for", "quantity": "Quantity"}
+    return Chart(heading, alt, caption, panels, facets) if panels else None
 
 
 def _by_beam(table: dict[str, np.ndarray], name: str) -> list[Line]:
@@ -360,7 +360,7 @@ def returns(found: Sequence[Seen]) -> Table:
         named = dict(zip(map(labels.coordinate, KINDS), counts.tolist(), strict=True))
         rows.append({"what": seen.words or "all", "shots": shots} | named)
     caption = ["Shots times draws, and points by kind."]
-    return Table("What came back", caption, pandas.DataFrame(rows), "returns")
+    return Table("Shots and points", caption, pandas.DataFrame(rows), "returns")
 
 
 def came_back(

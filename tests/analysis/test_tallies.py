@@ -9,7 +9,8 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sweep.analysis.selection import Points, Tally, medians, pieces, tallied
+from sweep.analysis import selection
+from sweep.analysis.selection import Points, Statistics, statistics
 
 floats = st.floats(-1e300, 1e300, allow_nan=False)
 some = st.lists(
@@ -19,21 +20,21 @@ some = st.lists(
 
 @given(values=some, cut=st.integers(1, 9))
 def test_a_mean_is_the_exact_one_but_for_rounding(values, cut):
-    tally = Tally()
-    for k in range(0, len(values), cut):
-        tally.add(np.array(values[k : k + cut]))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(selection, "PIECE", cut)
+        found = Statistics.of(np.array(values))
     exact, size = sum(map(Fraction, values)), sum(abs(Fraction(v)) for v in values)
-    assert abs(Fraction(tally.mean) * len(values) - exact) <= size * len(values) * Fraction(
+    assert abs(Fraction(found.mean) * len(values) - exact) <= size * len(values) * Fraction(
         1, 2**51
     )
-    assert (tally.least, tally.largest) == (min(values), max(values))
+    assert (found.least, found.largest) == (min(values), max(values))
 
 
 def test_values_that_are_not_finite_count_for_nothing():
-    tally = Tally()
-    tally.add(np.array([np.nan, 2.0, np.inf, -np.inf]))
-    assert (tally.number, tally.mean, tally.least, tally.largest) == (1, 2.0, 2.0, 2.0)
-    assert math.isnan(Tally().mean)
+    values = xr.Dataset({"v": ("x", [np.nan, 2.0, np.inf, -np.inf])})
+    (found,) = statistics([Points.of(values)], "v")
+    assert (found.number, found.mean, found.least, found.largest) == (1, 2.0, 2.0, 2.0)
+    assert math.isnan(Statistics.of(np.array([np.nan])).mean)
 
 
 @settings(max_examples=20)
@@ -45,16 +46,11 @@ def test_groups_hold_their_own_points_whatever_the_pieces(chunks, seed):
     dataset = xr.Dataset({"v": (("y", "x"), values)}, {"kind": ("y", along)})
     cut = dataset.chunk(dict(zip("yx", chunks, strict=True)))
     groups = [part for _, part in Points.of(cut).where("x", [1, 2, 5, 8]).apart("kind")]
-    tallies = tallied(groups, "v")
-    middles = medians(groups, "v", [tally.number for tally in tallies])
-    for (kind, part), tally, middle in zip(
-        Points.of(dataset).apart("kind"), tallies, middles, strict=True
+    for (kind, part), found in zip(
+        Points.of(dataset).apart("kind"), statistics(groups, "v"), strict=True
     ):
         own = values[along == kind][:, [1, 2, 5, 8]]
-        assert tally.number == np.isfinite(own).sum()
-        assert tally.mean == pytest.approx(np.nanmean(own), rel=1e-14)
-        assert middle == np.nanmedian(own)
+        assert found.number == np.isfinite(own).sum()
+        assert found.mean == pytest.approx(np.nanmean(own), rel=1e-14)
+        assert found.median == np.nanmedian(own)
         assert part.size == 9 * (along == kind).sum()
-    read = [(part.spread("kind"), found["v"]) for _, part, found in pieces(groups, ["v"])]
-    for kind, own in ((k, v) for kinds, found in read for k, v in zip(kinds, found, strict=True)):
-        assert np.isnan(own) or own in values[along == kind]

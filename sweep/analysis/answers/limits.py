@@ -7,7 +7,6 @@ pd itself bends from 1 to 0. Digits near 1 come from the probability of a miss.
 
 from __future__ import annotations
 
-import dask.array
 import numpy as np
 import xarray as xr
 from contourpy import contour_generator
@@ -127,18 +126,26 @@ def _ordered(dataset: xr.Dataset, x: xr.DataArray, from_highest: bool) -> tuple[
 def _answers(
     pd: xr.DataArray, miss: xr.DataArray | None, x: xr.DataArray, dim: str, level: float
 ) -> dict[str, xr.DataArray]:
-    """Both answers and their reasons."""
+    """Both answers and their reasons.
+
+    Places are counted in steps along the axis, so that they rise whichever way it is walked; those
+    that there are none of are infinite.
+    """
     z = deviate(pd, miss) - float(ndtri(level))
-    marks = _marks(z, dim)
-    starts, ends = marks["first"] >= 0, marks["last"] >= 0
-    break_at, left_at = marks["break_at"], marks["left_at"]
+    steps = xr.DataArray(np.arange(float(x.size)), dims=[dim])
+    after = z.shift({dim: -1})
+    falls = (z >= 0) & (after < 0)
+    places = steps + z / (z - after).where(falls, 1.0)
+    break_at, unknown_from = (_first(places, falls, dim), _first(steps, z.isnull(), dim))
+    left_at, unknown_to = (-_first(-places, falls, dim), -_first(-steps, z.isnull(), dim))
+    starts, ends = (z.isel({dim: end}, drop=True) >= 0 for end in (0, -1))
     unbroken = xr.where(
-        marks["first_unknown"] < xr.where(starts, break_at, 0.5),
+        unknown_from < xr.where(starts, break_at, 0.5),
         NOT_COMPUTED,
         xr.where(~starts, NEVER, xr.where(np.isinf(break_at), ALWAYS, FOUND)),
     )
     farthest = xr.where(
-        marks["last_unknown"] > xr.where(ends, float(x.size), left_at),
+        unknown_to > xr.where(ends, float(x.size), left_at),
         NOT_COMPUTED,
         xr.where(ends, ALWAYS, xr.where(np.isinf(left_at), NEVER, FOUND)),
     )
@@ -150,68 +157,9 @@ def _answers(
     }
 
 
-_MARKS = ("first", "last", "break_at", "left_at", "first_unknown", "last_unknown")
-
-
-def _marks(z: xr.DataArray, dim: str) -> xr.Dataset:
-    """All that answers need to know of z along a dimension, each piece of it read once.
-
-    Places are counted in steps along the axis, so that they rise whichever way it is walked; those
-    that there are none of are infinite.
-    """
-    z = z.transpose(dim, ...)
-    data = z.data if z.chunks else dask.array.from_array(z.values, chunks=-1)
-    after = np.cumsum((0, *data.chunks[0]))
-    starts = dask.array.from_array(after[:-1], chunks=1).reshape(-1, *(1,) * (z.ndim - 1))
-    parts = dask.array.map_blocks(
-        _marks_of_piece, data, starts, dtype=float, new_axis=z.ndim,
-        chunks=((1,) * data.numblocks[0], *data.chunks[1:], (len(_MARKS),)),
-    )  # fmt: skip
-    whole = parts.rechunk({0: -1}).map_blocks(
-        _marks_of_all, after[1:-1], dtype=float, drop_axis=0,
-    )  # fmt: skip
-    others = {name: c for name, c in z.coords.items() if dim not in c.dims}
-    found = xr.DataArray(whole, dims=[*z.dims[1:], "mark"], coords=others)
-    marks = xr.Dataset({name: found.isel(mark=i) for i, name in enumerate(_MARKS)})
-    return marks if z.chunks else marks.compute()
-
-
-def _marks_of_piece(z: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Return marks (1, ..., 6) of a piece (n, ...) whose first value is at the step `start`."""
-    steps = start.ravel()[0] + np.arange(float(len(z))).reshape(-1, *(1,) * (z.ndim - 1))
-    falls, place = _falls(z[:-1], z[1:], steps[:-1])
-    unknown = np.isnan(z)
-    marks = [
-        z[0],
-        z[-1],
-        np.min(place, axis=0, where=falls, initial=np.inf),
-        np.max(place, axis=0, where=falls, initial=-np.inf),
-        np.min(np.broadcast_to(steps, z.shape), axis=0, where=unknown, initial=np.inf),
-        np.max(np.broadcast_to(steps, z.shape), axis=0, where=unknown, initial=-np.inf),
-    ]
-    return np.stack(marks, axis=-1)[np.newaxis]
-
-
-def _marks_of_all(parts: np.ndarray, starts: np.ndarray) -> np.ndarray:
-    """Combine marks (k, ..., 6) of pieces to (..., 6); all but the first begin at `starts`."""
-    first, last, break_at, left_at, first_unknown, last_unknown = np.moveaxis(parts, -1, 0)
-    steps = starts.reshape(-1, *(1,) * (first.ndim - 1)) - 1.0
-    falls, place = _falls(last[:-1], first[1:], steps)
-    marks = [
-        first[0],
-        last[-1],
-        np.fmin(break_at.min(0), np.min(place, axis=0, where=falls, initial=np.inf)),
-        np.fmax(left_at.max(0), np.max(place, axis=0, where=falls, initial=-np.inf)),
-        first_unknown.min(0),
-        last_unknown.max(0),
-    ]
-    return np.stack(marks, axis=-1)
-
-
-def _falls(here: np.ndarray, there: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Between which neighbours z falls below 0, and at which place."""
-    falls = (here >= 0) & (there < 0)
-    return falls, steps + here / np.where(falls, here - there, 1.0)
+def _first(places: xr.DataArray, chosen: xr.DataArray, dim: str) -> xr.DataArray:
+    """Least of the chosen places along a dimension; infinity where none is chosen."""
+    return xr.where(chosen, places, np.inf).min(dim, skipna=False)
 
 
 def _value(place: xr.DataArray, x: xr.DataArray) -> xr.DataArray:

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 
+import dask
 import numpy as np
 import xarray as xr
 
@@ -132,18 +133,12 @@ def curves(named: Sequence[tuple[str, Recording]], *, quantity: str, bins: int) 
 
 def _edges(datasets: Sequence[xr.Dataset], bins: int) -> np.ndarray | None:
     """Edges of the bins; none where no cycle's altitude is known."""
-    lows, highs = [], []
-    for dataset in datasets:
-        altitude = dataset["true_altitude"]
-        for part in stretches(altitude, "cycle", STRETCH):
-            known = np.asarray(altitude.isel(cycle=part).values)
-            known = known[np.isfinite(known)]
-            if known.size:
-                lows.append(float(known.min()))
-                highs.append(float(known.max()))
-    if not lows:
+    altitudes = [dataset["true_altitude"].chunk(cycle=STRETCH) for dataset in datasets]
+    ends = dask.compute([altitude.min() for altitude in altitudes],
+                        [altitude.max() for altitude in altitudes])  # fmt: skip
+    if not np.isfinite(ends).any():
         return None
-    low, high = min(lows), max(highs)
+    low, high = float(np.nanmin(ends[0])), float(np.nanmax(ends[1]))
     if high - low < 1e-6 * max(abs(high), 1.0):
         low, high, bins = low - 0.5, high + 0.5, 1
     edges = np.linspace(low, high, bins + 1)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import textwrap
-from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -18,7 +17,6 @@ from matplotlib.figure import Figure as Sheet
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from mpl_toolkits.mplot3d import proj3d
-from scipy.ndimage import map_coordinates
 
 from sweep.analysis import canvas, labels
 from sweep.analysis.scenes import colours
@@ -74,15 +72,10 @@ class Ground:
         if any(high <= low for low, high in cuts):
             return None
         step = max(high - low for low, high in cuts) / (most - 1)
-        nodes = [np.linspace(low, high, max(2, round((high - low) / step) + 1))
-                 for low, high in cuts]  # fmt: skip
-        places = [
-            np.interp(node, own, np.arange(own.size))
-            for node, own in zip(nodes, (self.x, self.y), strict=True)
-        ]
-        rows, columns = np.meshgrid(places[1], places[0], indexing="ij")
-        height = map_coordinates(self.height, [rows, columns], order=1, mode="nearest")
-        return Ground(nodes[0], nodes[1], height)
+        x, y = (np.linspace(low, high, max(2, round((high - low) / step) + 1))
+                for low, high in cuts)  # fmt: skip
+        height = xr.DataArray(self.height, [("y", self.y), ("x", self.x)]).interp(x=x, y=y)
+        return Ground(x, y, height.values)
 
     def without_walls(self) -> Ground:
         """Return the ground without what is too steep to be drawn as a surface."""
@@ -104,62 +97,6 @@ class Ground:
 
 DROPOUT, PATH, GROUND = "#C1121F", "#1A1A1A", "0.86"
 
-
-class _Picture(ABC):
-    """Points, dropouts and path on axes of two or three dimensions."""
-
-    cloud: Cloud
-    stage: Stage
-    axes: Any
-    scale: float
-    size: tuple[float, float]
-    further: Mapping[str, Any] = MappingProxyType({})  # further options of marks
-
-    @abstractmethod
-    def _columns(self, places: np.ndarray) -> Sequence[np.ndarray]:
-        """Columns of world positions (3, n) as the axes take them."""
-
-    @abstractmethod
-    def _on_paper(self, places: np.ndarray) -> np.ndarray:
-        """World positions (3, n) on the picture (2, n) [inches]."""
-
-    def _order(self, chosen: np.ndarray) -> np.ndarray:
-        """Numbers of the points of a mask, in the order in which they are drawn."""
-        return np.flatnonzero(chosen)
-
-    def points(self, colour: np.ndarray) -> None:
-        """Points, false ones as crosses; dropouts and path."""
-        places = np.array([self.cloud.points[axis] for axis in AXES])
-        size = colours.mark_size(self._on_paper(places), *self.size)
-        true, false = self._order(self.cloud.true), self._order(~self.cloud.true)
-        self.axes.scatter(
-            *self._columns(places[:, true]), s=size, c=colour[true], linewidths=0, zorder=3,
-            **self.further,
-        )  # fmt: skip
-        if false.size:
-            self.axes.scatter(
-                *self._columns(places[:, false]), c=colour[false], zorder=4,
-                **self.further, **colours.false_marks(size),
-            )  # fmt: skip
-        if self.cloud.dropouts:
-            self.axes.scatter(
-                *self._columns(self._within(self.cloud.dropouts)), s=max(1.6 * size, 10.0),
-                facecolors="none", edgecolors=DROPOUT, linewidths=0.8, zorder=5, **self.further,
-            )  # fmt: skip
-        if self.cloud.path:
-            track = self._columns(self._within(self.cloud.path))
-            self.axes.plot(*track, color=PATH, linewidth=1.5, zorder=6)
-            start = [column[:1] for column in track]
-            self.axes.plot(*start, "o", color=PATH, markersize=5, zorder=6)
-
-    def _within(self, table: Table) -> np.ndarray:
-        """Places (3, n), nan outside of the box."""
-        columns = np.array([table[axis] for axis in AXES])
-        low, high = np.array([self.cloud.box[axis] for axis in AXES]).T
-        inside = ((columns >= low[:, None]) & (columns <= high[:, None])).all(axis=0)
-        return np.where(inside, columns, np.nan)
-
-
 SOLID_WIDEST, SOLID_TALLEST = 7.6, 6.4
 """Sizes of the box as drawn [inches]."""
 
@@ -169,15 +106,16 @@ SOLID_LABELS = (0.55, 0.75, 0.85, 0.1)
 _UNIT = 10.0
 
 
-class Solid(_Picture):
+class Solid:
     """A picture at an angle: azimuth of the eye from x towards y, elevation above it [deg]."""
 
-    further = MappingProxyType({"depthshade": False})
+    marks: Mapping[str, Any] = MappingProxyType({"depthshade": False})
 
     def __init__(
         self, cloud: Cloud, azimuth: float, elevation: float, *, title: str, note: str
     ) -> None:
         self.cloud = cloud
+        self.order = np.arange(cloud.true.size)
         low, high = self._outline(azimuth, elevation)
         scale = min(SOLID_WIDEST / (high[0] - low[0]), SOLID_TALLEST / (high[1] - low[1]))
         self.scale = scale
@@ -234,10 +172,12 @@ class Solid(_Picture):
         seen = axes.viewLim
         return np.array([(x - seen.x0) / seen.width, (y - seen.y0) / seen.height])
 
-    def _columns(self, places: np.ndarray) -> Sequence[np.ndarray]:
+    def columns(self, places: np.ndarray) -> Sequence[np.ndarray]:
+        """World positions (3, n) as the axes take them."""
         return list(places)
 
-    def _on_paper(self, places: np.ndarray) -> np.ndarray:
+    def on_paper(self, places: np.ndarray) -> np.ndarray:
+        """World positions (3, n) on the picture (2, n) [inches]."""
         return self.scale * self._projected(self.axes, places)
 
     def ground(self, ground: Ground) -> bool:
@@ -263,16 +203,19 @@ WIDEST, TALLEST, LEAST = 7.4, 7.0, 1.5
 """Sizes of the picture [inches]."""
 
 
-class Flat(_Picture):
+class Flat:
     """A picture along one of the world's axes: those across, up and along the look.
 
     `nearest` is 1 where the eye is at the upper end of the last, -1 at its lower one.
     """
 
+    marks: Mapping[str, Any] = MappingProxyType({})
+
     def __init__(
         self, cloud: Cloud, along: tuple[str, str, str], nearest: int, *, title: str, note: str
     ) -> None:
-        self.cloud, self.along, self.nearest = cloud, along, nearest
+        self.cloud, self.along = cloud, along
+        self.order = np.argsort(nearest * cloud.points[along[2]], kind="stable")
         sides = [cloud.box[axis][1] - cloud.box[axis][0] for axis in along[:2]]
         self.scale = min(WIDEST / sides[0], TALLEST / sides[1])
         self.size = max(self.scale * sides[0], LEAST), max(self.scale * sides[1], LEAST)
@@ -290,16 +233,13 @@ class Flat(_Picture):
         """Limits as they are meant to be, whatever is drawn."""
         self.axes.set(xlim=self.cloud.box[self.along[0]], ylim=self.cloud.box[self.along[1]])
 
-    def _columns(self, places: np.ndarray) -> Sequence[np.ndarray]:
+    def columns(self, places: np.ndarray) -> Sequence[np.ndarray]:
+        """World positions (3, n) as the axes take them."""
         return [places[AXES.index(axis)] for axis in self.along[:2]]
 
-    def _on_paper(self, places: np.ndarray) -> np.ndarray:
-        return self.scale * np.array(self._columns(places))
-
-    def _order(self, chosen: np.ndarray) -> np.ndarray:
-        depth = self.nearest * self.cloud.points[self.along[2]]
-        order = np.argsort(depth, kind="stable")
-        return order[chosen[order]]
+    def on_paper(self, places: np.ndarray) -> np.ndarray:
+        """World positions (3, n) on the picture (2, n) [inches]."""
+        return self.scale * np.array(self.columns(places))
 
     def ground(self, ground: Ground) -> bool:
         """Shaded relief with contours from above; the heights that there are from the side."""
@@ -334,6 +274,40 @@ class Flat(_Picture):
         self.axes.fill_between(
             across, low, high, where=known.any(axis=over), color=GROUND, linewidth=0, zorder=0
         )
+
+
+def _draw(picture: Flat | Solid, colour: np.ndarray) -> None:
+    """Points, false ones as crosses; dropouts and path."""
+    cloud, axes, columns = picture.cloud, picture.axes, picture.columns
+    places = np.array([cloud.points[axis] for axis in AXES])
+    size = colours.mark_size(picture.on_paper(places), *picture.size)
+    is_true = cloud.true[picture.order]
+    true, false = picture.order[is_true], picture.order[~is_true]
+    axes.scatter(
+        *columns(places[:, true]), s=size, c=colour[true], linewidths=0, zorder=3, **picture.marks
+    )
+    if false.size:
+        axes.scatter(
+            *columns(places[:, false]), c=colour[false], zorder=4, **picture.marks,
+            **colours.false_marks(size),
+        )  # fmt: skip
+    if cloud.dropouts:
+        axes.scatter(
+            *columns(_within(cloud, cloud.dropouts)), s=max(1.6 * size, 10.0), facecolors="none",
+            edgecolors=DROPOUT, linewidths=0.8, zorder=5, **picture.marks,
+        )  # fmt: skip
+    if cloud.path:
+        track = columns(_within(cloud, cloud.path))
+        axes.plot(*track, color=PATH, linewidth=1.5, zorder=6)
+        axes.plot(*(own[:1] for own in track), "o", color=PATH, markersize=5, zorder=6)
+
+
+def _within(cloud: Cloud, table: Table) -> np.ndarray:
+    """Places (3, n), nan outside of the box."""
+    columns = np.array([table[axis] for axis in AXES])
+    low, high = np.array([cloud.box[axis] for axis in AXES]).T
+    inside = ((columns >= low[:, None]) & (columns <= high[:, None])).all(axis=0)
+    return np.where(inside, columns, np.nan)
 
 
 def _paper(ground: Ground) -> np.ndarray:
@@ -375,7 +349,7 @@ def cloud_sheet(
         angles = OBLIQUE if isinstance(view, str) else view
         picture = Solid(cloud, *angles, title=title, note=note)
     in_legend = ground is not None and picture.ground(ground)
-    picture.points(scale.of(values))
+    _draw(picture, scale.of(values))
     picture.stage.explain(scale, _handles(cloud, ground=in_legend))
     return picture.stage.sheet
 
