@@ -286,7 +286,7 @@ def test_draws_and_returns_see_what_the_spectrum_shows(effects, table_4_1):
 # What is not there, and company
 
 
-@pytest.mark.parametrize(("phases", "left_out"), every(3, PHASES, [(), ("image", "leakage")]))
+@pytest.mark.parametrize(("left_out", "phases"), every(3, [("image", "leakage"), ()], PHASES))
 def test_the_company_of_points_changes_no_bit(phases, left_out, table_4_1):
     """Of points in several stretches; of their order; of one alone. All kinds of drift at once."""
     number = 2 * POINTS + 40
