@@ -10,7 +10,7 @@ from scipy import special, stats
 from sweep.analysis.shot_figure import simulated
 from sweep.model import alarms, truth, window
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.detection import RAYLEIGH_DEVIATION, fading_together
+from sweep.model.detection import RAYLEIGH_DEVIATION
 from sweep.model.effects.line_width import coherent_share, seen_line
 from sweep.model.effects.segment_motion import looks_of
 from sweep.model.estimators import ESTIMATOR
@@ -56,7 +56,7 @@ def drawn(looks, speckle, signals, level, alike=1.0):
 @pytest.mark.parametrize("speckle", ["steady", "independent", "common"])
 @pytest.mark.parametrize(
     ("number", "combine", "votes"),
-    [(1, "power", 1), (2, "power", 1), (8, "power", 1), (2, "binary", 1), (8, "binary", 3),
+    [(2, "power", 1), (8, "power", 1), (2, "binary", 1), (8, "binary", 3),
      pytest.param(32, "power", 1, marks=pytest.mark.slow),
      pytest.param(32, "binary", 12, marks=pytest.mark.slow)],
 )  # fmt: skip
@@ -67,11 +67,8 @@ def test_closed_forms_are_the_mean_over_draws(number, combine, votes, speckle):
     law = looks.steady if speckle == "steady" else looks.faded
     told = [float(law(np.array(a), level)[0]) for a in signals]
     together = told[0] * told[1]
-    if speckle != "steady" and number > 1:
+    if speckle != "steady":
         together = float(looks.faded_together(one, other, level, np.array(1.0)))
-    elif speckle != "steady":
-        both = fading_together(*map(np.asarray, told), level, np.array(1.0))
-        together = float(both)
     for share, chance in zip(drawn(looks, speckle, signals, level), [*told, together], strict=True):
         assert abs(share - chance) < 5 * np.sqrt(chance * (1 - chance) / DRAWS)
     for a in signals:

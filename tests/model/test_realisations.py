@@ -216,7 +216,11 @@ def test_the_mean_over_a_log_normal_echo_is_gauss_and_hermites(table_4_1):
     "changes, sigma",
     [
         ({"grazing_angle": 0.6, "phases": "incoherent", "beamlets": 7}, 4e-6),
-        ({"grazing_angle": 0.2, "reflectance_law": "lambert", "beamlets": 1, "power": 0.3}, 2e-6),
+        pytest.param(
+            {"grazing_angle": 0.2, "reflectance_law": "lambert", "beamlets": 1, "power": 0.3},
+            2e-6,
+            marks=pytest.mark.slow,
+        ),
         ({"grazing_angle": np.pi / 2, "beamlets": 1}, 3e-3),
     ],
 )

@@ -7,7 +7,7 @@ import pytest
 from engine import DRAWS, keys, prepared, within_5_sigma
 from scipy import ndimage, stats
 
-from sweep.model import truth, waveform
+from sweep.model import truth
 from sweep.model.draws import Seen
 from sweep.model.effects.catalogue import CORE
 from sweep.model.groups import groups
@@ -18,11 +18,9 @@ from sweep.model.returns import (
     WHOLE,
     How,
     Known,
-    beamlet_lines,
     draw_peaks,
     draw_returns,
     free_bin,
-    judge,
     largest_of,
 )
 from sweep.model.sampling import simulate
@@ -397,39 +395,6 @@ def test_reported_errors_hold_for_a_footprint_that_spreads(table_4_1, phases):
 
 
 # Truth
-
-
-def test_beamlets_appear_where_their_beats_fold_to(table_4_1):
-    shots = prepared(table_4_1(range=8000.0, radial_velocity=-170.0, beamlets=7, grazing_angle=0.3))
-    shots = dataclasses.replace(shots, doppler=np.linspace(-1e-9, 1e-9, 7)[None])
-    velocity = -170.0 + shots.doppler[0] * LIGHT / 2
-    lines = beamlet_lines(shots)[0]
-    for s, (sign, carrier) in enumerate(zip((1, 0, -1), shots.carriers, strict=True)):
-        beats = waveform.beat_frequency(
-            sign, carrier=carrier, chirp_rate=2e12, range=8000.0 * (1 + shots.offset[0]),
-            radial_velocity=velocity,
-        )  # fmt: skip
-        expected = waveform.fold(beats, np.array(600e6)) / 600e6 * 2**17
-        np.testing.assert_allclose(lines[s], expected, atol=1e-6)
-    assert np.ptp(lines[0]) > 0.1
-
-
-def test_the_common_beamlet_lies_in_all_groups_and_nearest_to_the_peaks():
-    lines = np.array([[10.0, 11.0, 50.0], [5.0, 5.0, 5.0], [30.0, 31.0, 70.0]])
-    bins = np.array([  # strongest, first and last of two groups in each segment
-        [[10, 10], [9, 9], [12, 12]], [[5, 5], [4, 4], [6, 6]], [[30, 70], [29, 69], [32, 71]],
-    ])  # fmt: skip
-    nowhere = bins + np.array([0, 0, 20])[:, None, None]
-    centres, all_three = np.array([10.9, 5.0, 31.2]), np.zeros(3, np.int8)
-    lit, dim = np.ones(3), np.array([1.0, 0.0, 1.0])
-    assert judge(all_three, centres, bins, lines, lit) == (TRUE, 1)
-    assert judge(all_three, centres, bins, lines, dim) == (TRUE, 0)
-    apart = np.array([0, 0, 1], np.int8)
-    assert judge(apart, centres, bins, lines, lit) == (MISPAIRED, -1)
-    assert judge(all_three, centres, nowhere, lines, lit) == (SIDELOBE, -1)
-    no_doppler, noise = np.array([0, -2, 0], np.int8), np.array([0, 0, -1], np.int8)
-    assert judge(no_doppler, centres, bins, lines, lit) == (TRUE, 1)
-    assert judge(noise, centres, bins, lines, lit) == (FALSE_ALARM, -1)
 
 
 # Flags
