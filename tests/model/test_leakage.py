@@ -2,11 +2,13 @@
 
 from dataclasses import replace
 
+import mpmath
 import numpy as np
 import pytest
 from engine import difference, every, run_of_bins, shape_of
 
 from sweep.model import truth
+from sweep.model.crossings import any_crossing, silence
 from sweep.model.ground import Cast, Footprints
 from sweep.model.groups import groups
 from sweep.model.lines import IM, LEAST_WIDTH, PLACE, RE
@@ -246,3 +248,14 @@ def test_groups_are_those_of_every_bin(table_4_1, apart):
         np.testing.assert_allclose(fast.neighbours, slow.neighbours, rtol=1e-7)
         found += (slow.bin >= 0).sum(axis=-1).max()
     assert found >= 5 * (2 if apart > 1 else 1)
+
+
+def test_many_small_chances_keep_their_digits():
+    chances = np.array([1e-300, 1e-20, 3e-17, 1e-9, 0.2, 0.0, 1e-16, 1e-12, 0.5])
+    with mpmath.workdps(60):
+        exact = 1 - mpmath.fprod(1 - mpmath.mpf(c) for c in chances)
+        assert any_crossing(chances, 0, chances.size) == pytest.approx(float(exact), rel=1e-15)
+        few = 1 - mpmath.fprod(1 - mpmath.mpf(c) for c in chances[:4])
+        assert any_crossing(chances, 0, 4) == pytest.approx(float(few), rel=1e-15)
+        for c in [*chances, 9.9e-5, 1.01e-4]:
+            assert silence(c) == pytest.approx(float(-mpmath.log(1 - mpmath.mpf(c))), rel=1e-15)

@@ -21,6 +21,7 @@ from sweep.model.returns import (
     draw_peaks,
     draw_returns,
     free_bin,
+    judge,
     largest_of,
 )
 from sweep.model.sampling import simulate
@@ -394,10 +395,25 @@ def test_reported_errors_hold_for_a_footprint_that_spreads(table_4_1, phases):
     assert np.median(stated) > 2 * noise_alone / np.sqrt(2)
 
 
-# Truth
-
-
 # Flags
+
+
+def test_the_common_beamlet_lies_in_all_groups_and_nearest_to_the_peaks():
+    lines = np.array([[10.0, 11.0, 50.0], [5.0, 5.0, 5.0], [30.0, 31.0, 70.0]])
+    bins = np.array([  # strongest, first and last of two groups in each segment
+        [[10, 10], [9, 9], [12, 12]], [[5, 5], [4, 4], [6, 6]], [[30, 70], [29, 69], [32, 71]],
+    ])  # fmt: skip
+    nowhere = bins + np.array([0, 0, 20])[:, None, None]
+    centres, all_three = np.array([10.9, 5.0, 31.2]), np.zeros(3, np.int8)
+    lit, dim = np.ones(3), np.array([1.0, 0.0, 1.0])
+    assert judge(all_three, centres, bins, lines, lit) == (TRUE, 1)
+    assert judge(all_three, centres, bins, lines, dim) == (TRUE, 0)
+    apart = np.array([0, 0, 1], np.int8)
+    assert judge(apart, centres, bins, lines, lit) == (MISPAIRED, -1)
+    assert judge(all_three, centres, nowhere, lines, lit) == (SIDELOBE, -1)
+    no_doppler, noise = np.array([0, -2, 0], np.int8), np.array([0, 0, -1], np.int8)
+    assert judge(no_doppler, centres, bins, lines, lit) == (TRUE, 1)
+    assert judge(noise, centres, bins, lines, lit) == (FALSE_ALARM, -1)
 
 
 def _only(found, present):

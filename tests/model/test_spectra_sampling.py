@@ -108,7 +108,7 @@ def test_a_fixed_threshold_detects_as_the_closed_form_says(table_4_1, record):
     sigma = np.sqrt(pd * (1 - pd) / 1000)
     assert (np.abs(drawn["pd_doppler"] - pd) < 5 * sigma + 2.2 * closed["pfa_bin"]).all()
     assert (np.abs(drawn["pfa_bin"] - closed["pfa_bin"]) < 5 * drawn["pfa_bin_error"]).all()
-    assert (drawn["pfa_bin_error"] < 0.05 * drawn["pfa_bin"]).all()
+    assert (drawn["pfa_bin_error"] < 0.07 * drawn["pfa_bin"]).all()  # at 5 sigma under sqrt 2
 
 
 @BOTH

@@ -149,6 +149,7 @@ TURNING = Waypoints(NODES_AT, [[0, 0, 90], [20, 5, 80], [45, 30, 85], [50, 60, 6
 NODES = Rotation.random(5, rng=np.random.default_rng(1)).as_quat(scalar_first=True)
 
 angles = st.floats(-math.pi, math.pi)
+vectors = st.tuples(*[st.floats(-3, 3)] * 3).map(np.array)
 
 
 def scipys(q):
@@ -162,6 +163,17 @@ def same_rotation(p, q, atol=1e-12):
 def turned(law, t):
     motion = TURNING.motion(t)
     return law.turn(t, motion.velocity, motion.acceleration)
+
+
+@given(vectors)
+def test_rotation_vectors_agree_with_scipy_there_and_back(vector):
+    q = quat.from_rotation_vector(vector)
+    same_rotation(q, Rotation.from_rotvec(vector).as_quat(scalar_first=True))
+    back = quat.to_rotation_vector(q)
+    assert np.linalg.norm(back) <= math.pi + 1e-12
+    same_rotation(quat.from_rotation_vector(back), q)
+    if np.linalg.norm(vector) < 3.14:
+        np.testing.assert_allclose(back, vector, atol=1e-12)
 
 
 @given(angles, st.floats(-1.5, 1.5), angles)
