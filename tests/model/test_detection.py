@@ -120,7 +120,9 @@ def test_the_first_of_equal_peaks_is_the_detection_and_a_threshold_met_is_crosse
     assert assess(np.array([5.0, 0, 0, 4.999, 0, 0]), 1.0, 5.0, 0.0)[:2] == (0, {0, 1})
 
 
-@pytest.mark.parametrize("window", ["hamming", "rectangular", "flattop"])
+@pytest.mark.parametrize(
+    "window", ["hamming", "rectangular", pytest.param("flattop", marks=pytest.mark.slow)]
+)
 def test_evaluate_reports_what_brute_force_finds_in_the_truths_spectrum(window, table_4_1):
     scenes = (
         {"range": 30.0, "grazing_angle": 0.9}, {"range": 300.0, "grazing_angle": 0.1},

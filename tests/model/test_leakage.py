@@ -82,9 +82,10 @@ def test_no_sum_of_strengths_is_seen_from_afar_as_more_than_it_is_said_to_be(nam
     assert min(gained) < {0.05: 0.02}.get(half, 1.1)
 
 
-@pytest.mark.parametrize("phases", ["coherent", "incoherent"])
-@pytest.mark.parametrize("window", EVERY_FORM)
-@pytest.mark.parametrize("allowed", [1e-1, 1e-3, 1e-6])
+@pytest.mark.parametrize(
+    ("allowed", "window", "phases"),
+    every(5, [1e-1, 1e-3, 1e-6], EVERY_FORM, ["coherent", "incoherent"]),
+)
 def test_leakage_far_from_the_lines_is_left_out_up_to_what_is_allowed(
     table_4_1, window, phases, allowed
 ):

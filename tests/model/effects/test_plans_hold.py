@@ -58,7 +58,10 @@ def magnitudes_moved(on, off, sigma):
     return np.nanmax(abs(on[:, 2] - off[:, 2]) / np.maximum(off[:, 2], sigma), axis=0)
 
 
-@pytest.mark.parametrize("kind", range(len(KINDS)))
+@pytest.mark.parametrize(
+    "kind",
+    [pytest.param(k, marks=[pytest.mark.slow] * (k in (2, 5, 7))) for k in range(len(KINDS))],
+)
 def test_no_effect_changes_more_than_its_size_whatever_else_there_is(table_4_1, kind):
     noticed = 0
     for seed in range(3):
