@@ -130,7 +130,7 @@ def test_a_grid_of_both_records(tmp_path):
     assert np.abs(more).max() < 1e-5  # the threshold follows the noise, but for the echo's own
 
 
-@pytest.mark.parametrize("speed", [15, 90])
+@pytest.mark.parametrize("speed", [pytest.param(15, marks=pytest.mark.slow), 90])
 def test_a_street_in_complex_records(speed, tmp_path):
     """Two segments and signs: every return is read right, whichever of its beats is larger."""
     clouds = {}

@@ -24,7 +24,7 @@ from sweep.tasks.grid_study import GridStudy
 
 SOME = settings(
     derandomize=True, deadline=None, database=None, suppress_health_check=list(HealthCheck),
-    phases=[Phase.generate], max_examples=15,
+    phases=[Phase.generate], max_examples=8,
 )  # fmt: skip
 
 SIGNAL = ("snr_up", "snr_down", "snr_doppler", "pd_up", "pd_down", "pd_doppler", "pd_shot")

@@ -51,7 +51,7 @@ def test_a_segment_alarms_as_often_as_drawn_noise_does(table_4_1, name, length):
     low, high = first_circular(window(name, length), n), n // 2 + 1
     low += 3  # evaluate has three bins occupied by the detection of no echo
     crossed = [
-        (m[:, low : high - low + 3] >= level).any(axis=1) for m in noise(name, length, n, 40_000, 7)
+        (m[:, low : high - low + 3] >= level).any(axis=1) for m in noise(name, length, n, 20_000, 7)
     ]
     drawn = np.mean(crossed)
     spread = 5 * np.sqrt(drawn / np.size(crossed))

@@ -83,8 +83,8 @@ def test_counts_over_random_effects_have_the_means_over_their_draws(effects, met
         "footprint.phases": "incoherent",
         "footprint.beamlets": 7,
     }
-    chosen, draws = (*CORE, *effects), 3000
-    found = simulate(parameters, chosen, keys=keys(6), batch_sizes=[2000, 1000], method=method)
+    chosen, draws = (*CORE, *effects), 1500
+    found = simulate(parameters, chosen, keys=keys(6), batch_sizes=[1000, 500], method=method)
     names = ("pd_up", "pd_doppler", "pd_down", "pd_shot", "alarm")
     table = {name: np.empty((6, draws)) for name in names}
     for point, number, shots in realise(parameters, chosen, keys=keys(6), draws=draws):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from engine import every
 
 from sweep.model import shot
 from sweep.model.accuracy import Accuracy
@@ -10,7 +11,7 @@ from sweep.model.effects.catalogue import CORE, DEFAULTS
 from sweep.model.footprint import beamlets
 from sweep.model.shot import prepare
 
-NUMBER = 400
+NUMBER = 200
 FINE = {"footprint.beamlets": 8192, "footprint.pattern": "line", "accuracy.line_error": 1e-9}
 AUTO = {"footprint.beamlets": 0}
 PDS = ("pd_up", "pd_down", "pd_doppler", "pd_shot")
@@ -34,11 +35,12 @@ def scenes(table_4_1, seed, **fixed):
 
 
 @pytest.mark.parametrize(
-    ("window", "law"),
-    [("hamming", "lambert"), ("rectangular", "thesis"), ("flattop", "lambert"),
-     ("kaiser(8.6)", "thesis"), ("blackman", "thesis")],
+    "case",
+    every(3, [("rectangular", "thesis"), ("hamming", "lambert"), ("flattop", "lambert"),
+              ("kaiser(8.6)", "lambert"), ("blackman", "thesis")]),
 )  # fmt: skip
-def test_pd_and_magnitudes_are_within_the_tolerance_of_a_continuum(table_4_1, window, law):
+def test_pd_and_magnitudes_are_within_the_tolerance_of_a_continuum(table_4_1, case):
+    window, law = case
     parameters = scenes(table_4_1, 1, window=window, reflectance_law=law)
     exact = shot.evaluate(parameters | FINE)
     for tolerance in (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6):

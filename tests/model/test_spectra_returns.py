@@ -17,7 +17,8 @@ from sweep.model.waveform import PEAKS, STRONGEST
 EFFECTS = ("footprint", "doppler")
 RECORD = "instrument.receiver.record"
 HEIGHT, CLOSING = 412.0, 20.0
-NUMBER = 600
+NUMBER = 400
+"""5 sigma of a root mean square are 5 / sqrt(2 * 400) = 18 %: a factor of sqrt 2 shows."""
 TARGET = {
     "target.range": np.array([HEIGHT]), "target.radial_velocity": CLOSING,
     "target.grazing_angle": np.pi / 2, "target.reflectance": 0.1,
@@ -54,8 +55,8 @@ def _grid(parameters, methods=None):
 @pytest.mark.parametrize(
     "way",
     every(2, [
-        ("peak_bin", "real"), ("jacobsen", "real"), ("jacobsen", "complex"), ("centroid", "real"),
-        ("maximum_likelihood", "real"),
+        ("jacobsen", "complex"), ("peak_bin", "real"), ("maximum_likelihood", "real"),
+        ("jacobsen", "real"), ("centroid", "real"),
     ]),
 )  # fmt: skip
 def test_an_estimators_bias_and_scatter_are_those_of_a_grid(table_4_1, way):
@@ -97,12 +98,12 @@ def test_a_detector_detects_as_often_as_in_a_grid(table_4_1, way):
         assert got["pd_shot"][0] == pytest.approx(pd, abs=5 * np.sqrt(pd * (1 - pd) / NUMBER))
 
 
-@pytest.mark.parametrize("record", ["real", "complex"])
+@pytest.mark.parametrize("record", [pytest.param("real", marks=pytest.mark.slow), "complex"])
 def test_the_strongest_peak_is_as_often_wrong_as_the_closed_form_of_a_grid_says(table_4_1, record):
     """A return of both right peaks may be misread for want of a Doppler peak."""
     changes = {PEAKS: STRONGEST, RECORD: record}
     parameters = _given(table_4_1, tnr=3.0, power=1e-2, **changes)
-    got = _flown(parameters, draws=4000)
+    got = _flown(parameters, draws=2000)
     grid = evaluate(parameters | TARGET, EFFECTS)
     flags = got["flags"][0]
     assert not flags[:, 1:].any()  # a shot has one return
@@ -110,7 +111,7 @@ def test_the_strongest_peak_is_as_often_wrong_as_the_closed_form_of_a_grid_says(
     pd, wrong = grid["pd_shot"][0], grid["p_wrong_range_shot"][0]
     assert 0.2 < pd < 0.8 and wrong > 0.05
     for found, told in ((right, pd), ((flags[:, 0] > 0).mean() - right, wrong)):
-        assert found == pytest.approx(told, abs=0.006 + 5 * np.sqrt(told * (1 - told) / 4000))
+        assert found == pytest.approx(told, abs=0.006 + 5 * np.sqrt(told * (1 - told) / 2000))
     assert np.isnan(got["pd_shot"]).all()
 
 

@@ -102,23 +102,23 @@ def test_a_fixed_threshold_detects_as_the_closed_form_says(table_4_1, record):
             RECORD: record,
         },
     )
-    closed, drawn = evaluate(parameters, EFFECTS), _drawn(parameters, 2000)
+    closed, drawn = evaluate(parameters, EFFECTS), _drawn(parameters, 1000)
     pd = closed["pd_doppler"]
     assert ((pd > 0.02) & (pd < 0.98)).sum() >= 2
-    sigma = np.sqrt(pd * (1 - pd) / 2000)
+    sigma = np.sqrt(pd * (1 - pd) / 1000)
     assert (np.abs(drawn["pd_doppler"] - pd) < 5 * sigma + 2.2 * closed["pfa_bin"]).all()
     assert (np.abs(drawn["pfa_bin"] - closed["pfa_bin"]) < 5 * drawn["pfa_bin_error"]).all()
-    assert (drawn["pfa_bin_error"] < 0.05 * drawn["pfa_bin"]).all()
+    assert (drawn["pfa_bin_error"] < 0.07 * drawn["pfa_bin"]).all()  # at 5 sigma under sqrt 2
 
 
 @BOTH
 def test_the_most_likely_range_and_velocity_reach_the_bound(table_4_1, record):
-    """Within 10 %, of a lone line; 5 standard errors of 1500 draws are 9 %."""
+    """Within 15 %, of a lone line; 5 standard errors of 600 draws are 14 %."""
     parameters = _points(table_4_1, **{"footprint.beamlets": 1, "target.range": np.array([600.0])})
     parameters |= {ESTIMATOR + "kind": "maximum_likelihood", RECORD: record}
-    found = _drawn(parameters, 1500)
+    found = _drawn(parameters, 600)
     for name in ("range", "radial_velocity"):
-        assert found[f"{name}_rmse"] == pytest.approx(found[f"{name}_bound"], rel=0.1)
+        assert found[f"{name}_rmse"] == pytest.approx(found[f"{name}_bound"], rel=0.15)
         assert np.abs(found[f"{name}_bias"]) < 5 * found[f"{name}_bias_error"]
     coarse = _drawn(parameters | {ESTIMATOR + "kind": "peak_bin"}, 100)
     assert coarse["range_rmse"] > 2 * found["range_bound"]
@@ -207,7 +207,7 @@ def test_cells_of_an_iq_spectrum_have_neighbours_all_round(table_4_1, kind):
 def test_an_iq_echo_on_the_seam_or_at_zero_is_found_as_any_other(table_4_1, edge):
     """A beat walked across 0 and across Nyquist: detected as often, and placed as well.
 
-    5 sigma of two shares of 600 draws, and of two root mean squares.
+    5 sigma of two shares of 300 draws, and of a root mean square: 20 %.
     """
     bins = edge + np.array([-0.3, 0.3, 200.3])  # of the Doppler segment's beat
     parameters = COMPLEX | {
@@ -218,9 +218,9 @@ def test_an_iq_echo_on_the_seam_or_at_zero_is_found_as_any_other(table_4_1, edge
     parameters = _points(table_4_1, **parameters) | {"instrument.laser.power": 0.06}
     snr = evaluate(parameters, EFFECTS)["snr_doppler"]  # of three bins that the receiver passes
     as_loud = {"instrument.laser.power": 0.06 * 5.0 / snr}
-    pd = _drawn(parameters | as_loud, 600)["pd_doppler"]
+    pd = _drawn(parameters | as_loud, 300)["pd_doppler"]
     assert 0.2 < pd[2] < 0.8
-    assert np.abs(pd - pd[2]).max() < 5 * np.sqrt(2 * pd[2] * (1 - pd[2]) / 600)
+    assert np.abs(pd - pd[2]).max() < 5 * np.sqrt(2 * pd[2] * (1 - pd[2]) / 300)
     found = _drawn(parameters | {"instrument.laser.power": 10.0}, 300)
     assert (found["pd_shot"] == 1).all()
     np.testing.assert_allclose(found["range_rmse"], found["range_bound"], rtol=5 / np.sqrt(600))

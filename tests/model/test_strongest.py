@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from engine import DRAWS, prepared, within_5_sigma
-from hypothesis import given, settings
+from engine import DRAWS, every, prepared, within_5_sigma
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy import integrate, stats
 
@@ -83,10 +83,10 @@ def shares(shots, alike):
     return replace(shots, fading=fading)
 
 
-@pytest.mark.parametrize("record", ["real", "complex"])
-@pytest.mark.parametrize("alike", [None, 1.0, 0.7])
-@pytest.mark.parametrize("detection", ["any_bin", "peak_bin"])
-@pytest.mark.parametrize("tnr", [2.5, 4.5])
+@pytest.mark.parametrize(
+    ("tnr", "detection", "alike", "record"),
+    every(5, [2.5, 4.5], ["any_bin", "peak_bin"], [None, 1.0, 0.7], ["real", "complex"]),
+)
 def test_drawn_records_whose_largest_bin_is_reported(tnr, detection, alike, record, table_4_1):
     """At TNR 2.5 noise nearly always alarms, at 4.5 hardly ever. Segments share their speckle."""
     speckle = "none" if alike is None else "developed"
@@ -130,7 +130,6 @@ def of_one_bin(law, bins, level, reach):
     return integrate.simpson(law.pdf(z) * -np.expm1(bins * np.log1p(-np.exp(-z * z / 2))), x=z)
 
 
-@settings(deadline=None, max_examples=200)
 @given(st.floats(0.5, 14), st.floats(-3, 1.5), st.sampled_from(["none", "developed"]))
 def test_chances_are_the_integrals_that_they_stand_for(table_4_1, tnr, decades, speckle):
     """Of single bins in independent noise, down to chances of 1e-20."""
@@ -177,11 +176,6 @@ def test_right_wrong_and_nothing_add_to_one(detection, speckle, record, table_4_
     both = found["pd_shot"] + found["p_wrong_range_shot"]
     assert both[0] == pytest.approx(1, abs=1e-3)  # both chirps report something
     assert {name for name in found if name not in crosses} == set(STRONGEST_OUTPUTS)
-
-
-def test_of_strong_echoes_no_peak_is_wrong(table_4_1):
-    found = evaluate(scene_of(table_4_1, tnr=1.0, power=10.0), CORE)
-    assert found["pd_shot"] == pytest.approx([1]) and found["p_wrong_range_shot"] < 1e-6
 
 
 @pytest.mark.parametrize("record", ["real", "complex"])

@@ -62,7 +62,7 @@ def disagreement(shots):
 
 
 @pytest.mark.parametrize(
-    "batch", [pytest.param(b, marks=[pytest.mark.slow] * (b % 4 > 0)) for b in range(BATCHES)]
+    "batch", [pytest.param(b, marks=[pytest.mark.slow] * (b % 6 > 0)) for b in range(BATCHES)]
 )
 def test_the_fast_path_is_the_truth_over_the_whole_range_of_every_parameter(batch, table_4_1):
     for scene in map(drawn_scene, range(batch * BATCH, (batch + 1) * BATCH)):

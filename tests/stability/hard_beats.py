@@ -47,7 +47,7 @@ def looked_at(one: Shots, segment: int) -> list[int]:
     """Bins about the line, at both ends of the spectrum and in between."""
     _, found = segments.spectrum(one, 0, segment)
     centre, half = int(np.argmax(found)), one.fft_size // 2
-    near = range(centre - 8, centre + 9)
+    near = range(centre - 4, centre + 5)
     return sorted({k for k in (0, 1, 2, *near, half - 1, half, 77, 1234) if 0 <= k <= half})
 
 
@@ -75,10 +75,10 @@ def on_frequency(
 
 @FAMILY.case("each segment's beat at DC", **of_the_peak(1e8, 2e-12, 459))
 def at_dc() -> float:
-    return max(departure(one) for one in on_frequency([0.0] * 4))
+    return max(departure(one) for one in on_frequency([0.0] * 2))
 
 
-@FAMILY.case("beats 1e-18 to 1e-6 bins off DC", **of_the_peak(1e8, 1e-12))
+@FAMILY.case("beats 1e-18 to 1e-6 bins off DC", slow=True, **of_the_peak(1e8, 1e-12))
 def beside_dc() -> float:
     return max(
         departure(
@@ -102,7 +102,7 @@ def folded() -> float:
     return max(departure(one) for one in on_frequency(frequencies, segments=(1, 2)))
 
 
-@FAMILY.case("10 km/s, closing and receding", **of_the_peak(1.3e10, 3e-11))
+@FAMILY.case("10 km/s, closing and receding", slow=True, **of_the_peak(1.3e10, 3e-11))
 def ten_kilometres_a_second() -> float:
     return max(
         departure(shots(radial_velocity=v, window=window, fft_size=SIZE))
@@ -132,7 +132,7 @@ def on_bins() -> float:
     return max(departure(one) for bins in (1.0, 777.0) for one in tones(bins))
 
 
-@FAMILY.case("tones half-way between bins", **of_the_peak(3e8, 1e-12))
+@FAMILY.case("tones half-way between bins", slow=True, **of_the_peak(3e8, 1e-12))
 def between_bins() -> float:
     return max(departure(one) for bins in (0.5, 2047.5) for one in tones(bins))
 

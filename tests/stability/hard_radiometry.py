@@ -206,7 +206,7 @@ def clipping_faint() -> float:
 @FAMILY.case(
     "a beat of 100 to 1e4 times full scale",
     allowed=1e-11, limit=1e4 * EPS,
-    because="one less what is lost, which is all but 1e-4", **CLIPPING,
+    because="one less what is lost, which is all but 1e-4", slow=True, **CLIPPING,
 )  # fmt: skip
 def clipping_hard() -> float:
     return clipping_error((100, 0.1, 1), (1e4, 1, 1))

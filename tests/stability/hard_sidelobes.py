@@ -182,6 +182,7 @@ STRONG = {
     allowed=1e-9,
     limit=EPS**0.5,
     because="a rounding of the peak's power, in a null",
+    slow=True,
 )
 def sidelobes_of_many() -> float:
     worst = 0.0

@@ -83,7 +83,7 @@ def padded(length: int, size: int, **changes: Any) -> Shots:
 @FAMILY.case("records that end with the chirp: 2 to 997 samples of an FFT of 1024 or 1000",
              allowed=2e-10, limit=place(2e8, 1024) + 2 * math.pi * 2e8 * 300e-6 * EPS,
              because="beats, and 6e4 cycles of them until the record begins, rounded",
-             **EXACT)  # fmt: skip
+             slow=True, **EXACT)  # fmt: skip
 def short_records() -> float:
     return max(
         departure(padded(length, size, window=window, range=500.0))

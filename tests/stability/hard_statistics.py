@@ -105,6 +105,7 @@ def near_equal() -> float:
     allowed=0.0,
     limit=0.0,
     because="nothing is rounded",
+    slow=True,
 )
 def equal_numbers() -> float:
     worst = 0.0

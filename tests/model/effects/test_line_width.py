@@ -126,7 +126,7 @@ def test_the_walk_of_a_phase_has_the_lag_and_the_growth_of_a_wiener_process(dela
             assert found == pytest.approx(expected, rel=5 * np.sqrt(2 / number))
 
 
-@pytest.mark.parametrize("g", [0.4, 1.3, 3.8])
+@pytest.mark.parametrize("g", [0.4, pytest.param(1.3, marks=pytest.mark.slow), 3.8])
 def test_a_walking_phase_is_detected_as_records_of_the_time_domain_are(table_4_1, g):
     """A delay of a sixteenth of the record, at thresholds below and above the line."""
     length, rate, number, rng = 4096, 600e6, 3000, np.random.default_rng(6)

@@ -20,7 +20,7 @@ def promise_instruments():
 
 @pytest.mark.parametrize("asked", ["nothing", "leakage", "jitter"])
 def test_random_instruments_keep_each_tolerance(promise_instruments, asked):
-    studies = promise_instruments.studies(120, np.random.default_rng(6))
+    studies = promise_instruments.studies(36, np.random.default_rng(6))
     chosen = [study for study in studies if study["title"].endswith(asked)]
     for study in chosen:
         for tolerance, off in zip(

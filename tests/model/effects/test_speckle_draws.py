@@ -184,7 +184,9 @@ def test_one_beamlet_fades_alike_in_up_and_down(table_4_1):
     assert (means["pd_shot"] > alone + 10 * means["pd_shot_error"]).all()
 
 
-@pytest.mark.parametrize(("share", "beamlets"), [(0.05, 7), (0.99, 1), (0.5, 7)])
+@pytest.mark.parametrize(
+    ("share", "beamlets"), [pytest.param(0.05, 7, marks=pytest.mark.slow), (0.99, 1), (0.5, 7)]
+)
 def test_partly_rough_surfaces_are_ricean(share, beamlets, table_4_1):
     parameters = at_snrs(
         table_4_1, [15.0, 60.0], phases="coherent", beam_divergence=5e-6, beamlets=beamlets

@@ -112,7 +112,7 @@ def closed():
 def test_ranges_on_real_terrain_are_exact_but_for_their_rounding(gale):
     """From 2 km off, steeply and at 20 degrees of grazing angle; worst phase 2e-6 rad."""
     vertices, faces = facets(gale)
-    rng, number = np.random.default_rng(2), 36
+    rng, number = np.random.default_rng(2), 18
     target = vertices[rng.integers(0, len(vertices), number)] + [[0.3, 0.2, 0.0]]
     target += rng.uniform(-0.4, 0.4, (number, 3))
     away = unit([[0.02, 0.01, 1.0], [1.0, 0.6, 0.42]])[np.arange(number) % 2]
@@ -128,7 +128,7 @@ def test_ranges_on_real_terrain_are_exact_but_for_their_rounding(gale):
         assert hits.face[i] == truth[1]
         assert last_places(hits.range[i], truth[0]) <= 1.0
         worst = max(worst, abs(float(Fraction(hits.range[i]) - truth[0])) * PHASE_PER_METRE)
-    assert (hits.face >= 0).sum() > 30
+    assert (hits.face >= 0).sum() > 15
     assert worst < 2e-6
 
 
