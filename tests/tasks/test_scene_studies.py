@@ -30,13 +30,13 @@ from sweep.tasks.summary import scene_summary, status
 @pytest.fixture(autouse=True)
 def small_eyepoint_blocks(monkeypatch):
     """Several blocks of eyepoints a scanner, where the study itself is small."""
-    monkeypatch.setattr(eyepoint_study, "BLOCK_SHOTS", 48)
+    monkeypatch.setattr(eyepoint_study, "BLOCK_SHOTS", 96)
 
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(eyepoint_study, "BLOCK_SHOTS", 48)
+        patch.setattr(eyepoint_study, "BLOCK_SHOTS", 96)
         outcome = quiet(small_scene(), tmp_path_factory.mktemp("undisturbed") / "scene.zarr")
     assert outcome.complete
     return outcome
@@ -175,12 +175,12 @@ class StopUnder(StopAfter):
 def test_lost_chunks_of_either_store_are_computed_again(undisturbed, tmp_path):
     shutil.copytree(undisturbed.store.parent, tmp_path / "copy")
     path = tmp_path / "copy" / "scene.zarr"
-    (path / "three" / "flags" / "c" / "1" / "2" / "0" / "0").unlink()
+    (path / "three" / "flags" / "c" / "1" / "1" / "0" / "0").unlink()
     eyepoints = eyepoints_path(path, small_scene().geometry_id("three"))
     (eyepoints / "offset" / "c" / "1" / "0").unlink()
     outcome = resume(path, progress=False, scheduler="none")
     assert outcome.complete and outcome.blocks_computed == 1
-    assert outcome.rays == {"three": 48 * 7 + 16, "line": 0}
+    assert outcome.rays == {"three": 96 * 7 + 32, "line": 0}
     assert tree(tmp_path / "copy") == tree(undisturbed.store.parent)
 
 
@@ -259,8 +259,8 @@ def test_the_summary_of_an_incomplete_flight_counts_committed_blocks_only(undist
             chunk.unlink()
     rows = {row.part: row for row in scene_summary(store)}
     weak, strong = rows["three, power 0.01 W"], rows["three, power 1 W"]
-    assert (weak.shots, weak.cycles) == (60 * 2, 20 * 2)
-    status = opened(undisturbed.store)["three"].velocity_status.values[0, :20, :2]
+    assert (weak.shots, weak.cycles) == (120 * 3, 40 * 3)
+    status = opened(undisturbed.store)["three"].velocity_status.values[0, :40, :3]
     assert weak.solved == (status <= 1).sum()
     assert strong.shots == strong.cycles == strong.solved == rows["line, power 1 W"].shots == 0
 
