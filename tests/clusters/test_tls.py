@@ -73,6 +73,7 @@ def test_the_command_prints_a_section_and_never_overwrites(tmp_path):
     assert "is there already" in again.output
 
 
+@pytest.mark.slow
 def test_all_parts_talk_tls_and_a_client_without_certificates_is_refused(
     security, undisturbed, tmp_path, monkeypatch
 ):

@@ -30,7 +30,13 @@ def endless(block, log):
     return evaluate
 
 
-@pytest.mark.parametrize("place", [{"scheduler": "none"}, {"workers": 2, "processes": False}])
+@pytest.mark.parametrize(
+    "place",
+    [
+        pytest.param({"scheduler": "none"}, marks=pytest.mark.slow),
+        {"workers": 2, "processes": False},
+    ],
+)
 def test_a_block_that_takes_longer_than_it_may_is_given_up(undisturbed, tmp_path, place):
     path, log = tmp_path / "small.zarr", tmp_path / "log"
     study = small()
