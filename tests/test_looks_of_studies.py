@@ -60,13 +60,27 @@ def results(spec, path):
     return sweep.open(path).load()
 
 
-@pytest.mark.parametrize("kind", [grid, flight])
+KINDS = [
+    {"number": 1}, {"number": 8}, {"number": 8, "speckle": "independent"},
+    {"number": 6, "combine": "binary", "votes": 3}, {"number": 8, "combine": "coherent"},
+]  # fmt: skip
+OF_FLIGHTS = KINDS[2:4]
+"""Those that are drawn in other ways than one look; `make test-all` flies all."""
+
+
 @pytest.mark.parametrize(
-    "looks",
-    [{"number": 1}, {"number": 8}, {"number": 8, "speckle": "independent"},
-     {"number": 6, "combine": "binary", "votes": 3}, {"number": 8, "combine": "coherent"}],
-    ids=lambda looks: " ".join(map(str, looks.values())),
-)  # fmt: skip
+    "kind, looks",
+    [
+        pytest.param(
+            kind,
+            looks,
+            id=f"{kind.__name__} {' '.join(map(str, looks.values()))}",
+            marks=[pytest.mark.slow] * (kind is flight and looks not in OF_FLIGHTS),
+        )
+        for kind in (grid, flight)
+        for looks in KINDS
+    ],
+)
 def test_looks_reach_grids_and_flights(kind, looks, tmp_path):
     """Each shot's pd follows from its own SNR, and its draws from that."""
     steady = looks.get("combine") == "binary" and kind is flight
