@@ -21,7 +21,7 @@ from sweep.spec.reading import read_document
 EXPERIMENTS = sorted((Path(__file__).parents[1] / "experiments").glob("*.yaml"))
 SCENES = [path for path in EXPERIMENTS if "scene" in read_document(path).value]
 GRIDS = [path for path in EXPERIMENTS if path not in SCENES]
-OF_EACH_KIND = ("quickstart", "single_shot_45deg", "speckled_target", "cfar", "forest_scan")
+OF_EACH_KIND = ("quickstart", "single_shot_45deg", "speckled_target", "cfar", "morpheus_three_beam")
 """Run each time; `make test-all` has all."""
 
 KEPT = 4

@@ -53,7 +53,7 @@ def test_memory_does_not_grow_with_the_store(tmp_path, monkeypatch):
         assert found["error"] < 1e-6  # [m]: pd is straight in its normal deviate
 
     # Dask's list of pieces alone: with one chunk a piece it takes twice as much as these stores.
-    sizes = stores(tmp_path, (0.001, 0.006), 500)
+    sizes = stores(tmp_path, (0.001, 0.004), 500)
     assert growth(reduce, sizes, monkeypatch) < 0.3
 
 

@@ -31,6 +31,7 @@ print(outcome.complete)
 """
 
 
+@pytest.mark.slow
 def test_a_script_without_a_guard_runs_and_workers_import_nothing_from_where_it_is_run(
     undisturbed, tmp_path
 ):

@@ -223,6 +223,7 @@ def test_points_are_timed_as_many_together_as_a_block_has(monkeypatch):
         assert len(together) == 1 + points * (block > 1)
 
 
+@pytest.mark.slow
 def test_beamlets_are_tried_against_the_finest(tmp_path, monkeypatch):
     monkeypatch.setattr(rungs, "NUMBERS", (1, 37))
     monkeypatch.setattr(rungs, "NODES", (33,))

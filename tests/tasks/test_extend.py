@@ -83,7 +83,7 @@ MORE = {
 APPENDED, NEW_AXIS = ({**AXES, POWER: ["1 W", "3 W", "5 W"]}, {**AXES, REFLECTANCE: [0.01, 0.02]})
 
 
-@pytest.mark.parametrize("name", every(2, MORE))
+@pytest.mark.parametrize("name", every(3, MORE))
 def test_more_values_and_axes_end_as_the_larger_study_run_at_once(
     undisturbed, tmp_path, computed, name
 ):
@@ -463,7 +463,7 @@ MOMENTS = (
     [
         (MOMENTS[0], "extend", "extend"),
         pytest.param(MOMENTS[1], "extend", "resume", marks=pytest.mark.slow),
-        (MOMENTS[2], "overwrite", "resume"),
+        pytest.param(MOMENTS[2], "overwrite", "resume", marks=pytest.mark.slow),
         pytest.param(MOMENTS[3], "extend", "extend", marks=pytest.mark.slow),
     ],
 )

@@ -96,6 +96,7 @@ def test_workers_make_the_same_bytes_as_a_plain_loop(undisturbed, tmp_path, monk
         assert tree(here) == tree(there)
 
 
+@pytest.mark.slow
 def test_bits_do_not_depend_on_the_number_of_threads_of_the_libraries(undisturbed, tmp_path):
     script = (
         "from small_flights import small_scene; from sweep.tasks.driver import run;"
@@ -196,7 +197,11 @@ def test_eyepoints_under_a_wrong_name_or_of_other_software_are_refused(undisturb
         resume(one, progress=False, scheduler="none")
 
 
-@pytest.mark.parametrize("whole", [False, True], ids=["in part", "to their end"])
+@pytest.mark.parametrize(
+    "whole",
+    [False, pytest.param(True, marks=pytest.mark.slow)],
+    ids=["in part", "to their end"],
+)
 def test_rays_that_another_run_casts_are_waited_for_and_used(undisturbed, tmp_path, whole):
     path = tmp_path / "scene.zarr"
     study = EyepointStudy(small_scene(), "three")
