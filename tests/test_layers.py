@@ -45,7 +45,7 @@ LARGEST_FUNCTION = 50
 @cache
 def _nodes(path: Path) -> list[ast.AST]:
     """All that a module is made of."""
-    return list(ast.walk(ast.parse(path.read_text())))
+    return list(ast.walk(house_size.parsed(path)))
 
 
 @cache
