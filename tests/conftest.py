@@ -1,5 +1,7 @@
 """What all tests share: the thesis's Table 4.1, and hypothesis without deadlines."""
 
+import os
+import shutil
 import sys
 from math import pi
 from pathlib import Path
@@ -9,6 +11,11 @@ from dask.system import CPU_COUNT
 from hypothesis import settings
 
 sys.path.insert(0, str(Path(__file__).parent / "tasks"))  # small studies, for other tests too
+
+# Stores are many small files, which memory makes and removes several times as fast as disks.
+MEMORY, ROOM = Path("/dev/shm"), 8 << 30
+if MEMORY.is_dir() and os.access(MEMORY, os.W_OK) and shutil.disk_usage(MEMORY).free > ROOM:
+    os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(MEMORY))
 
 # The first call of a compiled kernel may compile it, which no deadline should count.
 settings.register_profile("sweep", deadline=None, derandomize=True, max_examples=40)

@@ -1,6 +1,7 @@
 """Size of the house: lines, modules, and functions that numba compiles. `make size` prints it."""
 
 import ast
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -14,6 +15,12 @@ def modules(folder: str) -> list[Path]:
     return sorted((ROOT / folder).rglob("*.py"))
 
 
+@cache
+def parsed(path: Path) -> ast.Module:
+    """Syntax tree of a module."""
+    return ast.parse(path.read_text())
+
+
 def lines(folder: str) -> int:
     """Lines of all modules in a folder."""
     return sum(path.read_text().count("\n") for path in modules(folder))
@@ -21,7 +28,7 @@ def lines(folder: str) -> int:
 
 def compiled(folder: str) -> int:
     """Functions with a decorator of numba's, by whatever name the module knows it."""
-    return sum(compiled_in(ast.parse(path.read_text())) for path in modules(folder))
+    return sum(compiled_in(parsed(path)) for path in modules(folder))
 
 
 def compiled_in(tree: ast.Module) -> int:
@@ -31,7 +38,7 @@ def compiled_in(tree: ast.Module) -> int:
 
 def most_arguments(folder: str) -> int:
     """Most arguments that any of them has."""
-    functions = [f for path in modules(folder) for f in _compiled(ast.parse(path.read_text()))]
+    functions = [f for path in modules(folder) for f in _compiled(parsed(path))]
     return max(len(function.args.args) for function in functions)
 
 
@@ -41,6 +48,7 @@ def internals(folder: str) -> set[str]:
     return {name for name in INTERNALS if name in text}
 
 
+@cache
 def _compiled(tree: ast.Module) -> list[ast.FunctionDef]:
     names: set[str] = set()
     for node in tree.body:

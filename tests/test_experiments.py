@@ -57,7 +57,7 @@ def _thinned(spec):
         written = {m.path: _written(m, _kept(axis)) for m in axis.members}
         axes |= {axis.name: {"zip": [written]}} if axis.zipped else written
     if isinstance(spec, Spec) and spec.draws.whole_spectra:
-        mapping["draws"] |= {"number": 20}
+        mapping["draws"] |= {"number": 5}
     return Spec.from_mapping(mapping | {"axes": axes})
 
 

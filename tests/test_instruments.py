@@ -26,19 +26,6 @@ DRAWS = 100
 """Shots at each of 64 places: some 300 are detected, and a deviation is known to 6 %."""
 
 
-@pytest.fixture(scope="module")
-def found():
-    """Numbers of each instrument, each computed once."""
-    kept = {}
-
-    def of(name):
-        if name not in kept:
-            kept[name] = page.simulated(name, DRAWS)
-        return kept[name]
-
-    return of
-
-
 def spec(instrument, **sections):
     target = {"range": "20 m", "grazing_angle": "60 deg", "reflectance": 0.1}
     return Spec.from_mapping({"title": "A study", "instrument": instrument, "target": target,
@@ -51,25 +38,24 @@ def refusal(instrument):
     return str(refused.value)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_an_instrument_has_its_published_numbers(name, found):
-    numbers = page.written(name)["numbers"]
-    assert set(found(name)) == set(numbers)
-    for key, number in numbers.items():
-        assert page.agrees(number, found(name)[key]), (key, number, found(name)[key])
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_the_page_has_what_is_simulated(name, found):
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.slow] * (name == "settembrini_2026")) for name in NAMES],
+)
+def test_an_instrument_has_its_published_numbers_and_the_page_has_those_that_are_simulated(name):
     """But for two deviations, which it draws of four times as many shots, and what rounds to 0."""
+    found, numbers = page.simulated(name, DRAWS), page.written(name)["numbers"]
+    assert set(found) == set(numbers)
+    for key, number in numbers.items():
+        assert page.agrees(number, found[key]), (key, number, found[key])
     text = (ROOT / "docs" / "instruments.md").read_text()
     part = text.split(f"\n## {name}\n")[1].split("\n## ")[0]
-    for key, number in page.written(name)["numbers"].items():
+    for key, number in numbers.items():
         row = next(line for line in part.splitlines() if line.startswith(f"| {number['about']} |"))
         cells = [cell.strip() for cell in row.strip("|").split("|")]
         assert cells[4] == "yes"
         if key not in ("sigma_range", "sigma_velocity", "pd_of_snr"):
-            assert cells[2].split()[0] == f"{found(name)[key]:.3g}"
+            assert cells[2].split()[0] == f"{found[key]:.3g}"
     for each in page.written(name)["assumed"]:
         assert f"- {each}" in part
 

@@ -58,7 +58,7 @@ MAPPING = {
     "footprint": {"beamlets": 19, "speckle": "none"},
     "draws": {"number": 3, "returns": 3},
     "navigation": {"ground_slope": 0.1, "test_level": 0},
-    "storage": {"block_shots": 64, "block_draws": 2},
+    "storage": {"block_shots": 128, "block_draws": 2},
     "axes": {"instrument.laser.power": ["0.3 mW", "1 W"]},
     "seed": 11,
 }

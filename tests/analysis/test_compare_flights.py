@@ -25,6 +25,7 @@ def slower(tmp_path_factory):
         axes={"instrument.laser.power": ["0.5 mW", "300 uW"]},
         scanners={"square": SQUARE | {"rate": "5 Hz"}},
         draws={"number": 20, "returns": 3},
+        storage={"block_draws": 64},
         seed=12,
     )
 

@@ -127,14 +127,14 @@ def test_a_group_for_each_scanner_holds_what_the_table_of_outputs_says(scene_sto
 
 def test_arrays_are_read_in_chunks_when_they_are_needed(scene_store):
     flags = open_scene(scene_store)["square"]["flags"]
-    assert flags.chunks is not None and flags.chunks[1][0] == 64
+    assert flags.chunks is not None and flags.chunks[1][0] == 128
 
 
 def test_a_finished_store_counts_all_shots_of_all_scanners_draws_and_places(scene_store, spec):
     attributes = open_scene(scene_store).attrs
     shots = sum(spec.cycles(name) * spec.shots_a_cycle(name) for name in spec.scanners)
     assert attributes["points"] == attributes["points_committed"] == shots * 3 * 2
-    assert attributes["blocks"] == attributes["blocks_committed"] == 2 * 2 * (5 + 5)
+    assert attributes["blocks"] == attributes["blocks_committed"] == 2 * 2 * (3 + 3)
     assert attributes["started"] <= attributes["finished"] != ""
 
 

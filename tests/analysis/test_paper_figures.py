@@ -22,11 +22,18 @@ def store(tmp_path_factory):
     return stored(tmp_path_factory.mktemp("paper"), SURFACE, figures=ASKED)
 
 
+@pytest.fixture(scope="module")
+def drawn(store, tmp_path_factory):
+    """Surface and slices as files by form."""
+    folder = tmp_path_factory.mktemp("drawn")
+    return {form: draw(store, folder, form) for form in canvas.FORMATS}
+
+
 @pytest.mark.parametrize("form", canvas.FORMATS)
 def test_the_same_store_gives_the_same_bytes_whatever_the_day_and_the_style(
-    form, store, tmp_path, monkeypatch
+    form, store, drawn, tmp_path, monkeypatch
 ):
-    first = draw(store, tmp_path / "first", form)
+    first = drawn[form]
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "86400")
     with matplotlib.rc_context({"font.size": 20, "lines.linewidth": 5, "svg.hashsalt": "other"}):
         again = draw(store, tmp_path / "again", form)
@@ -36,21 +43,20 @@ def test_the_same_store_gives_the_same_bytes_whatever_the_day_and_the_style(
         assert a.read_bytes().startswith(BEGINNINGS[form])
 
 
-def test_vector_files_hold_no_date_and_no_program(store, tmp_path):
-    pdf = draw(store, tmp_path, "pdf")[1].read_bytes()
-    svg = draw(store, tmp_path, "svg")[1].read_text()
+def test_vector_files_hold_no_date_and_no_program(drawn):
+    pdf, svg = drawn["pdf"][1].read_bytes(), drawn["svg"][1].read_text()
     assert not any(word in pdf for word in (b"CreationDate", b"Matplotlib", b"Producer"))
     assert "<dc:date>" not in svg and "Matplotlib v" not in svg
 
 
-def test_lines_stay_lines_and_surfaces_are_one_picture(store, tmp_path):
-    surface, slices = (file.read_text() for file in draw(store, tmp_path, "svg"))
+def test_lines_stay_lines_and_surfaces_are_one_picture(drawn):
+    surface, slices = (file.read_text() for file in drawn["svg"])
     assert "<image" not in slices
     assert 1 <= surface.count("<image") <= 3  # the panel, and the colour bar
 
 
-def test_pdf_holds_whole_fonts(store, tmp_path):
-    assert b"/Type3" not in draw(store, tmp_path, "pdf")[1].read_bytes()
+def test_pdf_holds_whole_fonts(drawn):
+    assert b"/Type3" not in drawn["pdf"][1].read_bytes()
 
 
 def test_another_suffix_is_refused(tmp_path):

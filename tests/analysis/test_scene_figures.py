@@ -27,7 +27,7 @@ def test_a_store_cut_short_is_drawn_as_far_as_it_is_and_says_how_far(
     short = cut_short(scene_store, tmp_path)
     log = short / ".sweep" / "receipts.jsonl"
     log.write_text("".join(log.read_text().splitlines(keepends=True)[:-8]))
-    assert SceneStudy.of(short).note.endswith("32 of 40 blocks computed")
+    assert SceneStudy.of(short).note.endswith("16 of 24 blocks computed")
     usual = figures.default_scene_figures
     monkeypatch.setattr(figures, "default_scene_figures", lambda tree: usual(tree)[4:5])
     assert [file.name for file in draw(short)] == ["velocity_all_navigation.png"]

@@ -71,7 +71,7 @@ def test_results_are_the_same_bits_every_time_and_the_same_numbers_in_other_chun
     assert np.array_equal(first.rmse, again.rmse, equal_nan=True)
     monkeypatch.setattr(navigation, "STRETCH", 1)  # a tally for each chunk
     square = {"square": MAPPING["scanners"]["square"]}
-    other = flown(tmp_path, scanners=square, storage={"block_shots": 80, "block_draws": 1})
+    other = flown(tmp_path, scanners=square, storage={"block_shots": 160, "block_draws": 1})
     (apart,) = curves(recordings(other, spec, "0.3 mW"), quantity="velocity", bins=5)
     assert np.array_equal(first.tally.count, apart.tally.count)
     np.testing.assert_allclose(apart.rmse, first.rmse, rtol=1e-12)

@@ -143,7 +143,7 @@ def test_a_job_lost_and_one_refused_are_made_up_for(played_pbs, undisturbed):
     from dask import config
 
     def evaluate(study, block):
-        time.sleep(0.4)
+        time.sleep(0.2)
         return study.evaluate(block)
 
     def kill_the_first() -> None:

@@ -31,6 +31,7 @@ print(outcome.complete)
 """
 
 
+@pytest.mark.slow
 def test_a_script_without_a_guard_runs_and_workers_import_nothing_from_where_it_is_run(
     undisturbed, tmp_path
 ):
@@ -51,7 +52,8 @@ def test_a_script_without_a_guard_runs_and_workers_import_nothing_from_where_it_
     assert not (tmp_path / "imported").exists()
 
 
-@pytest.mark.parametrize("workers", [pytest.param(1, marks=pytest.mark.slow), 2])
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [1, 2])
 def test_a_frozen_worker_holds_up_neither_a_run_nor_its_end(
     undisturbed, tmp_path, monkeypatch, workers
 ):

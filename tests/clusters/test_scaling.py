@@ -15,6 +15,7 @@ from sweep.tasks.progress import ClusterError
 LOCAL = {"kind": "local", "scheduler": {"dashboard": "127.0.0.1:0"}}
 
 
+@pytest.mark.slow
 def test_a_cluster_between_bounds_grows_with_the_work(undisturbed, tmp_path):
     log = tmp_path / "pids"
 

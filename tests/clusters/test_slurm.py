@@ -1,4 +1,4 @@
-"""A study on SLURM itself: a job killed, the driver killed, the same bytes as in a plain loop."""
+"""Studies on SLURM itself: the same bytes as in a plain loop, also of killed jobs and drivers."""
 
 import os
 import signal
@@ -83,6 +83,19 @@ def workers(store) -> set[bytes]:
     return read_receipts(store, BLOCKS, since=0.0).workers
 
 
+def test_a_study_in_a_job_ends_as_in_a_plain_loop(here, environment, undisturbed):
+    (here / "small.yaml").write_text(yaml.safe_dump(STUDY, sort_keys=False))
+    cluster = yaml.safe_load((here / "slurm.yaml").read_text())
+    (here / "slurm.yaml").write_text(yaml.safe_dump(cluster | {"workers": 1}))
+    asked = ("--store", "small.zarr", "--cluster", "slurm.yaml")
+    with sweep(environment, "run", "small.yaml", *asked) as child:
+        output, _ = child.communicate(timeout=WAIT)
+    assert child.returncode == 0, output
+    assert tree(here / "small.zarr") == tree(undisturbed)
+    assert jobs(environment) == []
+
+
+@pytest.mark.slow
 def test_jobs_and_driver_killed_the_study_ends_as_in_a_plain_loop(here, environment):
     store = here / "slow.zarr"
     asked = ("--store", "slow.zarr", "--cluster", "slurm.yaml")

@@ -73,6 +73,7 @@ def test_the_command_prints_a_section_and_never_overwrites(tmp_path):
     assert "is there already" in again.output
 
 
+@pytest.mark.slow
 def test_all_parts_talk_tls_and_a_client_without_certificates_is_refused(
     security, undisturbed, tmp_path, monkeypatch
 ):
@@ -111,6 +112,7 @@ def refuses(address: str, security) -> None:
     gc.collect()
 
 
+@pytest.mark.slow
 def test_a_client_that_could_not_connect_is_gone_before_another_is_made(monkeypatch):
     from distributed import Client
 

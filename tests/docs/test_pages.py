@@ -25,7 +25,7 @@ CHANGES = REPOSITORY / "CHANGELOG.md"
 
 PAGES = sorted([*REPOSITORY.glob("*.md"), *REPOSITORY.glob("*/*.md"), *DOCS.glob("howto/*.md")])
 PAGES.remove(CHANGES)
-IN_SECONDS = ("README.md", "docs/howto/read_results.md", "docs/howto/search_a_band.md")
+IN_SECONDS = ("README.md", "docs/howto/read_results.md")
 """Pages that the fast suite runs."""
 
 NEEDED = {"keep_stores_in_a_bucket": "moto.server", "variables": "pint_xarray"}
@@ -237,6 +237,7 @@ def test_every_module_that_the_architecture_names_is_there():
     assert len(re.findall(r"^\d+\. `sweep/", page, re.M)) == 10
 
 
+@pytest.mark.slow
 def test_the_site_builds_without_a_warning(tmp_path):
     pytest.importorskip("furo")
     pytest.importorskip("myst_parser")

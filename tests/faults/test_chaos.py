@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kills, kinds",
-    [pytest.param("10", "", marks=pytest.mark.slow), ("1", "scheduler|power, run")],
+    [("10", ""), ("1", "scheduler|power, run")],
     ids=["of all kinds", "of kinds that no other test has"],
 )
 def test_killed_studies_end_as_if_nobody_had_disturbed_them(kills, kinds):

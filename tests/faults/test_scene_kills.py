@@ -38,7 +38,8 @@ def plain(tmp_path_factory):
     return tree(store.parent)
 
 
-@pytest.mark.parametrize("stage", [pytest.param("casting", marks=pytest.mark.slow), "looking"])
+@pytest.mark.slow
+@pytest.mark.parametrize("stage", ["casting", "looking"])
 def test_a_scenes_client_killed_with_kill_9(tmp_path, monkeypatch, plain, stage):
     store = tmp_path / "killed" / "scene.zarr"
     store.parent.mkdir()

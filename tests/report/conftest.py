@@ -3,8 +3,10 @@
 import shutil
 
 import pytest
+from click.testing import CliRunner
 from reported import EXPERIMENTS, GRID, SCENE
 
+from sweep.cli import main
 from sweep.report.writing import write
 from sweep.spec import SceneSpec, Spec
 from sweep.tasks import driver
@@ -35,7 +37,11 @@ def scene_store(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def grid_page(grid_store):
-    return write(grid_store, grid_store.with_name("grid.html"))
+    """The grid's page, which the command writes beside the store."""
+    ran = CliRunner().invoke(main, ["report", str(grid_store)], catch_exceptions=False)
+    page = grid_store.with_name("grid-report.html")
+    assert ran.exit_code == 0 and ran.stdout.startswith(f"{page}: ")
+    return page
 
 
 @pytest.fixture(scope="session")

@@ -169,7 +169,13 @@ def test_a_scene_s_cloud_is_drawn_coloured_and_turned(opened, scene_page):
     assert "flight path" in dim
 
 
-@pytest.mark.parametrize(("file", "scheme"), [("grid_page", "dark"), ("scene_page", "light")])
+@pytest.mark.parametrize(
+    ("file", "scheme"),
+    [
+        ("grid_page", "dark"),
+        pytest.param("scene_page", "light", marks=pytest.mark.slow),
+    ],
+)
 def test_pages_fit_a_phone_in_both_schemes(opened, request, file, scheme):
     page = opened(request.getfixturevalue(file), width=390, scheme=scheme)
     assert page.evaluate("document.documentElement.scrollWidth") == 390

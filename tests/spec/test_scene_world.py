@@ -242,10 +242,10 @@ def test_boulders_lie_in_their_square_only():
 
 def test_a_power_law_strews_as_many_boulders_as_it_says():
     law = {"kind": "power", "density": "0.02 m^-2", "exponent": 3}
-    _, world = built(with_object(BOULDERS, law=law, smallest="1 m", largest="5 m", within="2 km",
+    _, world = built(with_object(BOULDERS, law=law, smallest="1 m", largest="5 m", within="1 km",
                                  subdivisions=0))  # fmt: skip
     faces = (world.caster.meshes[0].surface == 1).sum()
-    expected = 0.02 * (1 - 5**-3) * 2000**2
+    expected = 0.02 * (1 - 5**-3) * 1000**2
     assert faces / 12 == pytest.approx(expected, abs=5 * math.sqrt(expected))
 
 

@@ -179,7 +179,11 @@ def test_arrays_of_an_axis_are_read_only():
 
 
 @pytest.mark.parametrize(
-    "values", [{"step": ["1 mm", "10 km", "1 mm"]}, {"log": ["1 m", "10 km"], "number": 10**7}]
+    "values",
+    [
+        {"step": ["1 mm", "10 km", "1 mm"]},
+        pytest.param({"log": ["1 m", "10 km"], "number": 10**7}, marks=pytest.mark.slow),
+    ],
 )
 def test_ten_million_values_take_seconds(values):
     start = time.perf_counter()

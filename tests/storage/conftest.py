@@ -4,6 +4,7 @@ import subprocess
 import sys
 import time
 import urllib.request
+from datetime import timedelta
 
 import pytest
 from faulty import Faulty
@@ -13,6 +14,11 @@ from small import quiet
 from sweep.storage import locations
 
 BUCKET = "bucket"
+SOON = {
+    "init_backoff": timedelta(milliseconds=5),
+    "max_backoff": timedelta(milliseconds=50),
+    "base": 2,
+}
 
 
 @pytest.fixture(scope="session")
@@ -58,6 +64,8 @@ def faults(server, monkeypatch):
         monkeypatch.setenv("AWS_ACCESS_KEY_ID", "key")
         monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "secret")
         monkeypatch.setenv("AWS_REGION", "us-east-1")
+        for name in ("RETRIES", "FIRST_RETRIES"):  # as often as ever, without the long waits
+            monkeypatch.setattr(locations, name, {**getattr(locations, name), "backoff": SOON})
         locations._clients.clear()
         yield faulty
         locations._clients.clear()

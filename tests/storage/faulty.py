@@ -49,7 +49,7 @@ def _handler(faulty, port):
             if fate == DENY:
                 return self._reply(403, {}, DENIED)
             if fate == SLOW:
-                time.sleep(0.3)
+                time.sleep(0.05)
             other = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
             other.request(self.command, self.path, body, dict(self.headers))
             answer = other.getresponse()

@@ -100,6 +100,7 @@ def test_a_store_is_extended_into_another_place(memory, tmp_path):
     assert remote_tree(there) == tree(here) == expected
 
 
+@pytest.mark.slow
 def test_a_killed_driver_is_resumed_to_the_same_bytes(faults, place, undisturbed, tmp_path):
     script = tmp_path / "client.py"
     script.write_text(

@@ -160,7 +160,9 @@ ODD = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(
+    "seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 10))]
+)
 def test_random_changes_of_metadata_end_in_words_or_change_nothing(theirs, seed):
     chance, text = random.Random(seed), (theirs / "zarr.json").read_text()
     whole = json.loads(text)

@@ -40,7 +40,7 @@ SCENE = {
     "footprint": {"beamlets": 7, "speckle": "none"},
     "draws": {"number": 5, "returns": 3},
     "seed": 3,
-    "storage": {"block_shots": 60, "block_draws": 2},
+    "storage": {"block_shots": 120, "block_draws": 3},
     "axes": {"instrument.laser.power": ["0.01 W", "1 W"]},
 }
 

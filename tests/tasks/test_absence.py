@@ -181,15 +181,21 @@ def another_store(path, opened):
     return store.Arrays(f"{path}-copy", opened.study)
 
 
+UNFIT = [
+    (versions_differ, "was begun with other versions than worker on here has"),
+    (disk_is_read_only, "Read-only file system"),
+    (another_store, "does the worker see the same file system?"),
+]
+
+
 @pytest.mark.parametrize(
-    ("fault", "said"),
+    ("fault", "said", "all_unfit"),
     [
-        (versions_differ, "was begun with other versions than worker on here has"),
-        (disk_is_read_only, "Read-only file system"),
-        (another_store, "does the worker see the same file system?"),
+        *((*each, False) for each in UNFIT),
+        *(pytest.param(*each, True, marks=pytest.mark.slow) for each in UNFIT[:2]),
+        (*UNFIT[2], True),
     ],
 )
-@pytest.mark.parametrize("all_unfit", [False, True])
 def test_an_unfit_worker_is_left_out_by_name_and_host_and_the_run_ends_where_none_is_left(
     undisturbed, tmp_path, two_workers, monkeypatch, fault, said, all_unfit
 ):

@@ -223,6 +223,7 @@ def test_points_are_timed_as_many_together_as_a_block_has(monkeypatch):
         assert len(together) == 1 + points * (block > 1)
 
 
+@pytest.mark.slow
 def test_beamlets_are_tried_against_the_finest(tmp_path, monkeypatch):
     monkeypatch.setattr(rungs, "NUMBERS", (1, 37))
     monkeypatch.setattr(rungs, "NODES", (33,))
@@ -371,7 +372,7 @@ def test_magnitudes_are_off_by_so_much_of_themselves_or_of_sigma(true, found, er
     [
         (small(storage={"block_points": 24}), "pd_shot"),
         (small(draws={"number": 20, "batch": 8}, axes={}), "n_detected_shot"),
-        (small_scene(storage={"block_shots": 30}), "three/pd_shot"),
+        (small_scene(), "line/pd_shot"),
     ],
     ids=["blocks", "one point", "flight"],
 )
@@ -407,7 +408,9 @@ class Broken(progress.Progress):
         self.stopping = self.left <= 0
 
 
-@pytest.mark.parametrize("trials, kept", [(1, 0), (1.5, 4), (2.5, 8)])
+@pytest.mark.parametrize(
+    "trials, kept", [(1, 0), (1.5, 4), pytest.param(2.5, 8, marks=pytest.mark.slow)]
+)
 def test_whole_parts_are_kept_where_it_is_broken_off(trials, kept):
     """A ladder of trials a part, two parts a round."""
     bench = GridBench(small(footprint=COHERENT), 8)

@@ -114,7 +114,14 @@ def left(store):
     return sorted(file.name for file in (store / ".sweep").glob("begun*"))
 
 
-@pytest.mark.parametrize("kind, place", [*((k, PLACES[0]) for k in KINDS), ("fixed", PLACES[1])])
+@pytest.mark.parametrize(
+    "kind, place",
+    [
+        *((kind, PLACES[0]) for kind in KINDS if kind != "spectra"),
+        pytest.param("spectra", PLACES[0], marks=pytest.mark.slow),
+        ("fixed", PLACES[1]),
+    ],
+)
 def test_pieces_of_a_block_come_to_the_same_bytes_and_are_told(kind, place, whole, saved, tmp_path):
     told, store = Told(), tmp_path / "pieces.zarr"
     assert run(drawn(kind), store=store, progress=told, **place).complete
@@ -173,7 +180,8 @@ quiet(drawn(sys.argv[2]), Path(sys.argv[1]))
 """
 
 
-@pytest.mark.parametrize("kind", ["fixed", pytest.param("spectra", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["fixed", "spectra"])
 def test_what_is_saved_outlives_a_kill_and_is_not_drawn_again(
     kind, whole, saved, tmp_path, monkeypatch
 ):

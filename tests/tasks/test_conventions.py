@@ -21,10 +21,10 @@ STUDIES = {
 }
 
 
-@pytest.fixture(params=STUDIES)
-def datasets(request, tmp_path):
-    """Datasets of a store without results."""
-    spec, path = STUDIES[request.param](), tmp_path / "a.zarr"
+@pytest.fixture(scope="module", params=STUDIES)
+def datasets(request, tmp_path_factory):
+    """Datasets of a store without results; not to be changed."""
+    spec, path = STUDIES[request.param](), tmp_path_factory.mktemp("conventions") / "a.zarr"
     store.create(path, study_of(spec, path))
     if request.param == "flight":
         return [node.to_dataset() for node in sweep.open_scene(path).subtree]

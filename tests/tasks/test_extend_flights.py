@@ -122,7 +122,7 @@ MORE = {
         pytest.param(
             *case,
             id=name,
-            marks=[pytest.mark.slow] * (name in ("an axis before", "draws", "large blocks")),
+            marks=[pytest.mark.slow] * (name != "draws and values in other blocks"),
         )
         for name, case in MORE.items()
     ],
@@ -219,7 +219,13 @@ def chunk(store, name, part, scanner="three"):
 
 @pytest.mark.parametrize(
     "name, stretch, lost",
-    [("flags", 1, 1), ("effects", 0, 3), pytest.param("pd_shot", 0, 3, marks=pytest.mark.slow)],
+    [
+        ("effects", 0, 3),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in (("flags", 1, 1), ("pd_shot", 0, 3))
+        ),
+    ],
 )
 def test_a_damaged_block_is_computed_anew(here, computed, drawn_more, name, stretch, lost):
     """In place of its own a block has another's chunk, which any reader takes for sound.

@@ -198,7 +198,7 @@ def test_rays_by_hand_are_no_tighter_tolerance(flown):
 
 
 def test_it_is_the_same_however_it_is_cut(flown, tmp_path):
-    cut = facets(1e-2, storage={"block_shots": 7, "block_draws": 1})
+    cut = facets(1e-2, storage={"block_shots": 21, "block_draws": 1})
     found = shots(quiet(cut, tmp_path / "cut.zarr").store)
     np.testing.assert_array_equal(found.beamlets_error, shots(flown["coarse"]).beamlets_error)
 

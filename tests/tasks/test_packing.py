@@ -112,7 +112,7 @@ def test_a_scene_is_packed_with_all_that_is_told_of_it(flight, tmp_path):
     told = CliRunner().invoke(main, ["finalize", str(made)])
     assert told.exit_code == 0, told.output
     copy = tmp_path / "scene_final.zarr"
-    assert len(files_below(copy)) < len(files_below(made)) / 3
+    assert len(files_below(copy)) < len(files_below(made)) / 2
     assert scene_summary(copy)[0].shots > 0
     for one, other in zip(scene_summary(made), scene_summary(copy), strict=True):
         assert (one.shots, one.true, one.false) == (other.shots, other.true, other.false)

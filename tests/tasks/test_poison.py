@@ -30,17 +30,23 @@ def endless(block, log):
     return evaluate
 
 
-@pytest.mark.parametrize("place", [{"scheduler": "none"}, {"workers": 2, "processes": False}])
+@pytest.mark.parametrize(
+    "place",
+    [
+        pytest.param({"scheduler": "none"}, marks=pytest.mark.slow),
+        {"workers": 2, "processes": False},
+    ],
+)
 def test_a_block_that_takes_longer_than_it_may_is_given_up(undisturbed, tmp_path, place):
     path, log = tmp_path / "small.zarr", tmp_path / "log"
     study = small()
     outcome = run(
-        study, store=path, progress=False, block_timeout=3.0, evaluate=endless(4, log), **place
+        study, store=path, progress=False, block_timeout=2.0, evaluate=endless(4, log), **place
     )
     assert outcome.blocks_done == 11
     (failure,) = outcome.failures
     assert failure.block == 4
-    assert failure.error == "Overtime: took longer than the 3 s that a block may take"
+    assert failure.error == "Overtime: took longer than the 2 s that a block may take"
     assert "time.sleep(0.01)" in failure.traceback  # where it was
     assert evaluated(log).count(4) == 2
     assert resume(path, progress=False, scheduler="none").left_out == 1

@@ -109,7 +109,7 @@ def test_an_extension_that_is_refused_leaves_nothing(undisturbed, tmp_path, monk
     assert list(tmp_path.iterdir()) == [store]
 
 
-@pytest.mark.parametrize("how", ["extend", "overwrite"])
+@pytest.mark.parametrize("how", [pytest.param("extend", marks=pytest.mark.slow), "overwrite"])
 def test_links_to_stores_stay_and_lead_to_the_new_one(undisturbed, tmp_path, how):
     (tmp_path / "disk").mkdir()
     store, link = copied(undisturbed, tmp_path / "disk"), tmp_path / "link.zarr"

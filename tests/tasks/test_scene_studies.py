@@ -29,13 +29,13 @@ from sweep.tasks.summary import scene_summary, status
 @pytest.fixture(autouse=True)
 def small_eyepoint_blocks(monkeypatch):
     """Several blocks of eyepoints a scanner, where the study itself is small."""
-    monkeypatch.setattr(eyepoint_study, "BLOCK_SHOTS", 48)
+    monkeypatch.setattr(eyepoint_study, "BLOCK_SHOTS", 96)
 
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(eyepoint_study, "BLOCK_SHOTS", 48)
+        patch.setattr(eyepoint_study, "BLOCK_SHOTS", 96)
         outcome = quiet(small_scene(), tmp_path_factory.mktemp("undisturbed") / "scene.zarr")
     assert outcome.complete
     return outcome
@@ -95,6 +95,7 @@ def test_workers_make_the_same_bytes_as_a_plain_loop(undisturbed, tmp_path, monk
         assert tree(here) == tree(there)
 
 
+@pytest.mark.slow
 def test_bits_do_not_depend_on_the_number_of_threads_of_the_libraries(undisturbed, tmp_path):
     script = (
         "from small_flights import small_scene; from sweep.tasks.driver import run;"
@@ -174,12 +175,12 @@ class StopUnder(StopAfter):
 def test_lost_chunks_of_either_store_are_computed_again(undisturbed, tmp_path):
     shutil.copytree(undisturbed.store.parent, tmp_path / "copy")
     path = tmp_path / "copy" / "scene.zarr"
-    (path / "three" / "flags" / "c" / "1" / "2" / "0" / "0").unlink()
+    (path / "three" / "flags" / "c" / "1" / "1" / "0" / "0").unlink()
     eyepoints = eyepoints_path(path, small_scene().geometry_id("three"))
     (eyepoints / "offset" / "c" / "1" / "0").unlink()
     outcome = resume(path, progress=False, scheduler="none")
     assert outcome.complete and outcome.blocks_computed == 1
-    assert outcome.rays == {"three": 48 * 7 + 16, "line": 0}
+    assert outcome.rays == {"three": 96 * 7 + 32, "line": 0}
     assert tree(tmp_path / "copy") == tree(undisturbed.store.parent)
 
 
@@ -195,7 +196,11 @@ def test_eyepoints_under_a_wrong_name_or_of_other_software_are_refused(undisturb
         resume(one, progress=False, scheduler="none")
 
 
-@pytest.mark.parametrize("whole", [False, True], ids=["in part", "to their end"])
+@pytest.mark.parametrize(
+    "whole",
+    [False, pytest.param(True, marks=pytest.mark.slow)],
+    ids=["in part", "to their end"],
+)
 def test_rays_that_another_run_casts_are_waited_for_and_used(undisturbed, tmp_path, whole):
     path = tmp_path / "scene.zarr"
     study = EyepointStudy(small_scene(), "three")
@@ -258,8 +263,8 @@ def test_the_summary_of_an_incomplete_flight_counts_committed_blocks_only(undist
             chunk.unlink()
     rows = {row.part: row for row in scene_summary(store)}
     weak, strong = rows["three, power 0.01 W"], rows["three, power 1 W"]
-    assert (weak.shots, weak.cycles) == (60 * 2, 20 * 2)
-    status = opened(undisturbed.store)["three"].velocity_status.values[0, :20, :2]
+    assert (weak.shots, weak.cycles) == (120 * 3, 40 * 3)
+    status = opened(undisturbed.store)["three"].velocity_status.values[0, :40, :3]
     assert weak.solved == (status <= 1).sum()
     assert strong.shots == strong.cycles == strong.solved == rows["line, power 1 W"].shots == 0
 

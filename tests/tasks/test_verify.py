@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import yaml
 from click.testing import CliRunner
+from engine import every
 from small import STUDY, copied, evaluated, everything, failing, logged, quiet, small, tree
 from small_flights import small_scene
 
@@ -96,10 +97,13 @@ def place_of(content: bytes, step: int) -> int:
     return len(content) % min(step, len(content))
 
 
-def test_bytes_cut_off_or_added_anywhere_are_found(tiny, tmp_path, monkeypatch):
+@pytest.mark.parametrize("step", [pytest.param(1, marks=pytest.mark.slow), 7])
+def test_bytes_cut_off_or_added_anywhere_are_found(tiny, tmp_path, monkeypatch, step):
+    """Of all files, or of the root's, the journal's and some arrays'."""
     store = copied(tiny, tmp_path)
     look_only(store, monkeypatch)
-    for file in files(store):
+    arrays = [file for file in files(store) if ".sweep" not in file.parts and file.parent != store]
+    for file in set(files(store)) - set(arrays) | set(arrays[::step]):
         content = file.read_bytes()
         half = content[: len(content) // 2 + 1].rstrip(b"\n")  # a log of whole lines is a log
         for wrong in (content[:-1], content[1:], half, content + b"\0"):
@@ -206,10 +210,13 @@ def test_a_receipt_that_is_damaged_costs_its_block_and_no_other(undisturbed, tmp
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["zarr.json", "pd_shot/zarr.json", "range/zarr.json", "range/c/0", ".sweep/template.jsonl"],
+    "name, damage",
+    every(
+        2,
+        ["zarr.json", "pd_shot/zarr.json", "range/zarr.json", "range/c/0", ".sweep/template.jsonl"],
+        ["flipped", "missing", "a directory"],
+    ),
 )
-@pytest.mark.parametrize("damage", ["flipped", "missing", "a directory"])
 def test_a_template_is_put_back_as_it_was_made(undisturbed, tmp_path, name, damage):
     store = copied(undisturbed, tmp_path)
     before = everything(store)
@@ -263,7 +270,9 @@ def test_a_store_that_no_longer_says_what_it_holds_is_mended_with_the_spec(
     assert everything(store) == before
 
 
-@pytest.mark.parametrize("how", ["no JSON", "JSON", "gone"])
+@pytest.mark.parametrize(
+    "how", ["JSON", *(pytest.param(how, marks=pytest.mark.slow) for how in ("no JSON", "gone"))]
+)
 def test_a_damaged_store_is_known_for_ours_and_written_over(undisturbed, tmp_path, how):
     store = copied(undisturbed, tmp_path)
     lose_what_it_holds(store, how)
