@@ -72,10 +72,10 @@ class Ground:
         if any(high <= low for low, high in cuts):
             return None
         step = max(high - low for low, high in cuts) / (most - 1)
-        x, y = (np.linspace(low, high, max(2, round((high - low) / step) + 1))
-                for low, high in cuts)  # fmt: skip
-        height = xr.DataArray(self.height, [("y", self.y), ("x", self.x)]).interp(x=x, y=y)
-        return Ground(x, y, height.values)
+        across, up = (np.linspace(low, high, max(2, round((high - low) / step) + 1))
+                      for low, high in cuts)  # fmt: skip
+        height = xr.DataArray(self.height, [("y", self.y), ("x", self.x)]).interp(x=across, y=up)
+        return Ground(across, up, height.values)
 
     def without_walls(self) -> Ground:
         """Return the ground without what is too steep to be drawn as a surface."""
@@ -125,7 +125,7 @@ class Solid:
             self.size[0] + left + right, self.size[1] + below + above, title=title, note=note
         )
         # The square that the library draws in may reach beyond the sheet: the box within does not.
-        self.axes = self.stage.axes(
+        self.axes: Any = self.stage.axes(
             left - scale * low[0], below - scale * low[1], scale, scale, projection="3d",
             computed_zorder=False,
         )  # fmt: skip
@@ -278,7 +278,8 @@ class Flat:
 
 def _draw(picture: Flat | Solid, colour: np.ndarray) -> None:
     """Points, false ones as crosses; dropouts and path."""
-    cloud, axes, columns = picture.cloud, picture.axes, picture.columns
+    axes: Any = picture.axes
+    cloud, columns = picture.cloud, picture.columns
     places = np.array([cloud.points[axis] for axis in AXES])
     size = colours.mark_size(picture.on_paper(places), *picture.size)
     is_true = cloud.true[picture.order]
