@@ -34,7 +34,7 @@ NOT_IN_THE_MODEL = {
 """Pure physics: arrays in, arrays out."""
 
 LARGEST_HOUSE = {
-    "lines": 48_308, "modules": 169, "lines of the model": 18_854, "modules of the model": 77,
+    "lines": 48_309, "modules": 169, "lines of the model": 18_854, "modules of the model": 77,
     "compiled functions": 132, "arguments of a compiled function": 10,
 }  # fmt: skip
 """Upper limits on the size of sweep/."""

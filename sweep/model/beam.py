@@ -19,8 +19,8 @@ two equal beams counts by its square, and the footprint is narrower by sqrt(2).
 
 Two laws (``instrument.telescope.coupling``): ``single_mode`` is this one; ``aperture`` is that of
 [T 4.4], where all light in the aperture mixes, as it always does in direct detection. A ray stands
-for the light of a place, and for a direction, which near the telescope and near a focus spread
-unlike: ranges follow places, w(R) / R; Doppler shifts follow directions, which spread at every
+for the light of a place, and for a direction. Near the telescope and near a focus the two spread
+unlike. Ranges follow places, w(R) / R. Doppler shifts follow directions, which spread at every
 range as they do far away.
 """
 

@@ -139,13 +139,13 @@ def plane_footprint(
 
     A plane's footprint scales with range, so one row serves every range. A beamlet y off the axis
     towards the plane's near side, and x across, sees the velocity (v_r + v_t y) / |d| with
-    |d|^2 = 1 + x^2 + y^2. Angles are the axis's to the plane, 0 < . <= pi/2, and full 1/e^2 ones of
-    the beam, with ``directions`` for those that velocities are seen along [rad]; v_r is positive
-    closing, v_t towards the near side [m/s].
+    |d|^2 = 1 + x^2 + y^2. The grazing angle is the axis's to the plane, above 0 to pi/2 [rad].
+    Angles of the beam are full ones at 1/e^2, ``directions`` those along which velocities are seen
+    [rad]. v_r is positive closing, v_t towards the near side [m/s].
 
-    Returns (R_b - R_0) / R_0, formed without subtracting the two ranges; cosine of the incidence
-    angle; power fractions, 0, with offset 0, for a beamlet that passes over the horizon; and
-    closing speed less that of the beam's axis [m/s].
+    Returns four arrays: (R_b - R_0) / R_0, formed without subtracting the two ranges; the cosine of
+    the incidence angle; power fractions; and closing speed less that of the beam's axis [m/s].
+    A beamlet that passes over the horizon has fraction 0 and offset 0.
     """
     (across, along), share = beamlets(number, pattern)
     sigma = np.asarray(beam_divergence, float)[:, None] / 4

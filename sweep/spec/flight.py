@@ -102,7 +102,7 @@ class Turn(Part):
     )
 
     def turn(self) -> np.ndarray:
-        """Return the unit quaternion (4,); a ValueError for one of length 0, or beside angles."""
+        """Return the unit quaternion (4,); length 0, or angles given too, is a ValueError."""
         if self.quaternion is None:
             return quaternion.from_heading(heading=self.heading, pitch=self.pitch, roll=self.roll)
         if any((self.heading, self.pitch, self.roll)):

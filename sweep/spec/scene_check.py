@@ -57,7 +57,7 @@ def _readable(section: Mapping[str, Any], kind: Any) -> dict[str, Any]:
 def scene_findings(written: Mapping[str, Any], base: Path | None) -> list[Finding]:
     """Mistakes in scene, platform and scanners beyond their single fields.
 
-    What cannot be read is passed over; files are left alone without a base.
+    Sections that cannot be read are passed over; files are left alone without a base.
     """
     objects = _readable(_section(written, *OBJECTS), AnyObject)
     scanners = _readable(_section(written, "scanners"), AnyScanner)

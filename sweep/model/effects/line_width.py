@@ -204,15 +204,15 @@ def seen_line(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Line and pedestal in the line's bin as |X| sees them, but for the phase of all the record.
 
-    Returns, (n,) each: the share of the power |C W(0)|^2 in the line, more than
-    :func:`coherent_share`; and the mean square of what is in phase with it, over |C|^2 of the line:
-    as noise, half of this is the pedestal's share. If looks are added in amplitude the phase of a
-    record counts too: each has its own.
+    Returns two values, (n,) each. The first is the share of the power |C W(0)|^2 in the line, more
+    than :func:`coherent_share`. The second is the mean square of what is in phase with it, over
+    |C|^2 of the line. As noise, half of this is the pedestal's share. If looks are added in
+    amplitude the phase of a record counts too: each has its own.
 
-    With C(t, s) the covariance of phi and E_t = exp(-C(t, t) / 2), both less the mean under the
-    window w, the line is m = sum w E, and its fellow sum w E w E cosh C - m^2. As
-    C(t, s) = c(t - s) - q(t) - q(s), c the triangle Gamma (tau - |t|), each exponential is one of a
-    lag times one of t and one of s: autocorrelations of w and of w exp(2 q), on 256 places.
+    C(t, s) is the covariance of phi and E_t = exp(-C(t, t) / 2), both less the mean under the
+    window w. The line is m = sum w E, and its fellow sum w E w E cosh C - m^2. C(t, s) is
+    c(t - s) - q(t) - q(s), with the triangle c of Gamma (tau - |t|). So each exponential is one of
+    a lag times one of t and one of s: autocorrelations of w and of w exp(2 q), on 256 places.
     """
     power = power_under_line(line_width=line_width, delay=delay, duration=duration, window=window)
     gamma = np.broadcast_to(2 * np.pi * np.asarray(line_width) * duration, power.shape)
