@@ -337,26 +337,21 @@ def test_sentences_are_folded_to_a_terminal_and_commands_in_them_stay_whole(monk
 
 
 @pytest.mark.parametrize(
-    "command, processing, alarms, warned",
+    "processing, alarms, warned",
     [
-        ("run", "tnr: 7", "in either chirp with probability 0.359, in both chirps 0.0397", "0.359"),
-        (
-            "plan",
-            "tnr: 9",
-            "in either chirp with probability 0.000462, in both chirps 5.35e-08",
-            "",
-        ),
-        ("plan", "bins_counted: all, tnr: 7", "probability 0.589, in both chirps 0.129", "0.589"),
+        ("tnr: 7", "in either chirp with probability 0.359, in both chirps 0.0397", "0.359"),
+        ("tnr: 9", "in either chirp with probability 0.000462, in both chirps 5.35e-08", ""),
+        ("bins_counted: all, tnr: 7", "probability 0.589, in both chirps 0.129", "0.589"),
     ],
 )
-def test_a_plan_and_a_run_tell_how_often_noise_raises_an_alarm(
-    here, command, processing, alarms, warned
-):
+def test_a_plan_and_a_run_tell_how_often_noise_raises_an_alarm(here, processing, alarms, warned):
     (here / "small.yaml").write_text(STUDY.replace("tnr: 8", processing))
-    result = sweep(command, "small.yaml", *(["--scheduler", "none"] if command == "run" else []))
-    assert alarms in result.stdout
-    warning = f"warning: noise alone raises a false alarm in either chirp with probability {warned}"
-    assert (warning in result.stderr) == bool(warned)
+    for result in (sweep("plan", "small.yaml"), sweep("run", "small.yaml", "--scheduler", "none")):
+        assert alarms in result.stdout
+        warning = (
+            f"warning: noise alone raises a false alarm in either chirp with probability {warned}"
+        )
+        assert (warning in result.stderr) == bool(warned)
 
 
 def test_alarms_of_an_axis_of_thresholds_and_of_cfar_are_by_design(here):
@@ -488,10 +483,10 @@ def test_shot_prints_its_report_and_draws_the_shot_that_was_asked_for(here):
     refused(sweep("shot", "small.yaml", "--at", "rnge=2km"), "rnge: is no parameter")
 
 
-def test_figures_go_beside_the_store_or_wran_asked(ran):
+def test_figures_go_beside_the_store_or_where_asked(ran):
     beside = sweep("figures", "results/small.zarr").stdout.split()
     assert beside and all(name.startswith("results/small-figures/") for name in beside)
-    asked = sweep("figures", "results/small.zarr", "--output", "elsewran").stdout.split()
+    asked = sweep("figures", "results/small.zarr", "--output", "elsewhere").stdout.split()
     assert [Path(name).name for name in asked] == [Path(name).name for name in beside]
     assert all(shows(ran / name) for name in beside)
     assert [(ran / name).read_bytes() for name in asked] == [

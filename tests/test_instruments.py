@@ -38,10 +38,7 @@ def refusal(instrument):
     return str(refused.value)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=[pytest.mark.slow] * (name == "settembrini_2026")) for name in NAMES],
-)
+@pytest.mark.parametrize("name", NAMES)
 def test_an_instrument_has_its_published_numbers_and_the_page_has_those_that_are_simulated(name):
     """But for two deviations, which it draws of four times as many shots, and what rounds to 0."""
     found, numbers = page.simulated(name, DRAWS), page.written(name)["numbers"]

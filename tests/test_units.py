@@ -92,6 +92,18 @@ def test_a_unit_has_one_spelling_which_reads_back_the_same(written, si_unit, tex
     assert read_quantity(f"1 {text}", si_unit=si_unit, example="7 of them") == (1, unit)
 
 
+@given(st.integers(-(10**9), 10**9))
+def test_all_spellings_of_a_length_are_one_float(micrometres):
+    value = float(Fraction(micrometres, 10**6))
+    digits = f"{abs(micrometres):07d}"
+    sign = "-" if micrometres < 0 else ""
+    assert si(f"{micrometres} um", "m") == value
+    assert si(f"{micrometres}e-3 mm", "m") == value
+    assert si(f"{micrometres}E-4cm", "m") == value
+    assert si(f"{micrometres}e-9 km", "m") == value
+    assert si(f"{sign}{digits[:-6]}.{digits[-6:]} m", "m") == value
+
+
 @pytest.mark.parametrize(
     ("written", "si_unit", "words"),
     [

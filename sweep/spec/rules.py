@@ -332,9 +332,9 @@ class Several(Rule):
     noun: str = "values"
     """Name of all values together."""
     rising: bool = False
-    """Whether each must exceed the one before."""
+    """Each must exceed the one before."""
     distinct: bool = False
-    """Whether none may be there twice."""
+    """None may be there twice."""
 
     @property
     def units(self) -> str:

@@ -1,10 +1,12 @@
 """Tallies of navigation errors: dropouts, and cells in which nothing is."""
 
 import math
+from itertools import pairwise
 
 import numpy as np
+import pytest
 
-from sweep.analysis.scenes.navigation import Tally, tally
+from sweep.analysis.scenes.navigation import Tally, merge, tally
 from sweep.model.geometry.scanner import corners
 from sweep.model.navigation import velocity
 
@@ -23,6 +25,68 @@ def _of_all(error, variance, available):
     """Tally of all solutions in one cell."""
     found = tally(error, variance, available, np.zeros(len(error), np.int64), 1)
     return Tally(*(getattr(found, name)[0] for name in FIELDS))
+
+
+def _units(sizes):
+    """Tallies of stretches of the same draws, and the draws."""
+    error, variance, available = _draws(sum(sizes))
+    ends = np.cumsum([0, *sizes])
+    parts = [_of_all(error[a:b], variance[a:b], available[a:b]) for a, b in pairwise(ends)]
+    return parts, (error, variance, available)
+
+
+def _same_bits(one, other):
+    return all(getattr(one, f).tobytes() == getattr(other, f).tobytes() for f in FIELDS)
+
+
+def test_a_tally_says_what_numpy_says_of_all_draws():
+    error, variance, available = _draws(5000)
+    result = _of_all(error, variance, available)
+    held = error[available]
+    assert result.count == available.sum() and result.attempts == 5000
+    assert result.availability == available.mean()
+    np.testing.assert_allclose(result.bias, held.mean(axis=0), rtol=1e-12)
+    np.testing.assert_allclose(result.variance, held.var(axis=0, ddof=1), rtol=1e-12)
+    np.testing.assert_allclose(result.rmse, np.sqrt((held**2).mean(axis=0)), rtol=1e-12)
+    np.testing.assert_allclose(result.stated, variance[available].mean(axis=0), rtol=1e-12)
+
+
+@pytest.mark.parametrize("sizes", [[2000, 3000], [1, 0, 999, 17, 2500, 1483], [500] * 10])
+def test_merged_tallies_equal_one_pass(sizes):
+    parts, (error, variance, available) = _units(sizes)
+    whole, merged = _of_all(error, variance, available), merge(parts)
+    assert merged.attempts == whole.attempts and merged.count == whole.count
+    for name in FIELDS[2:]:
+        np.testing.assert_allclose(getattr(merged, name), getattr(whole, name), rtol=1e-12)
+
+
+def test_tallies_are_merged_in_a_fixed_tree():
+    parts, _ = _units([311, 7, 1200, 44, 901, 3, 650])
+    a, b, c, d, e, f, g = parts
+    assert _same_bits(merge(parts), ((a + b) + (c + d)) + ((e + f) + g))
+    arrived = {i: parts[i] for i in (4, 0, 6, 2, 5, 1, 3)}
+    assert _same_bits(merge([arrived[i] for i in sorted(arrived)]), merge(parts))
+    # another order is the same sum up to rounding only, which is why the order is fixed
+    other = merge(parts[::-1])
+    assert other.count == merge(parts).count
+    np.testing.assert_allclose(other.deviation, merge(parts).deviation, rtol=1e-12)
+    assert not _same_bits(other, merge(parts))
+
+
+def test_cells_of_altitude_hold_their_own_draws():
+    error, variance, available = _draws(3000)
+    altitude = np.random.default_rng(2).uniform(0, 700, 3000)
+    edges = np.array([100.0, 200.0, 400.0, 500.0])
+    result = tally(error, variance, available, np.digitize(altitude, edges) - 1, 3)
+    assert result.attempts.shape == (3,) and result.variance.shape == (3, 3)
+    for i in range(3):
+        here = (altitude >= edges[i]) & (altitude < edges[i + 1])
+        alone = _of_all(error[here], variance[here], available[here])
+        for name in FIELDS:
+            np.testing.assert_allclose(
+                getattr(result, name)[i], getattr(alone, name), rtol=1e-12, err_msg=name
+            )
+    assert result.attempts.sum() == ((altitude >= 100) & (altitude < 500)).sum() < 3000
 
 
 def test_what_is_not_there_is_nan_and_never_a_warning():
@@ -59,3 +123,8 @@ def test_dropouts_give_the_availability_of_three_of_four_and_the_stated_variance
     np.testing.assert_allclose(
         result.rmse**2, result.variance + result.bias**2, rtol=2 / result.count
     )
+
+
+def test_no_tallies_can_not_be_merged():
+    with pytest.raises(ValueError, match="no tally"):
+        merge([])

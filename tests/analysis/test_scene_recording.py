@@ -126,6 +126,13 @@ def test_thinning_keeps_every_2nd_or_4th_row_however_the_rows_come(cuts):
     assert thinned.rows()["n"].tolist() == list(range(0, 1000, 8))
 
 
+def test_few_rows_are_not_thinned_and_none_are_none():
+    thinned = Thinned(10)
+    assert thinned.rows() == {}
+    thinned.add({"n": np.arange(10)})
+    assert thinned.every == 1 and thinned.rows()["n"].size == 10
+
+
 def test_flags_say_one_kind_each_and_ratios_are_shown_in_decibels():
     flags = np.array([0, TRUE, FLAGS["sidelobe"] | FLAGS["unconfirmed"], FLAGS["false_alarm"]])
     names = list(KINDS)

@@ -52,8 +52,7 @@ def test_a_script_without_a_guard_runs_and_workers_import_nothing_from_where_it_
     assert not (tmp_path / "imported").exists()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("workers", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_a_frozen_worker_holds_up_neither_a_run_nor_its_end(
     undisturbed, tmp_path, monkeypatch, workers
 ):

@@ -237,7 +237,6 @@ def test_every_module_that_the_architecture_names_is_there():
     assert len(re.findall(r"^\d+\. `sweep/", page, re.M)) == 10
 
 
-@pytest.mark.slow
 def test_the_site_builds_without_a_warning(tmp_path):
     pytest.importorskip("furo")
     pytest.importorskip("myst_parser")

@@ -42,6 +42,27 @@ def test_the_ratio_before_the_fft_follows_from_that_after_it():
     assert found == pytest.approx((tone**2).mean() / 0.5**2, rel=1e-9)
 
 
+@pytest.mark.parametrize("name", ["rectangular", "hamming", "hann"])
+def test_the_largest_value_of_a_windowed_spectrum_is_as_far_off_as_it_says(name):
+    """Newton steps to the maximum of |X(f)| of 4000 noisy records; 5 sigma are 5 / sqrt(8000)."""
+    generator, draws, n = np.random.default_rng(5), 4000, np.arange(LENGTH)
+    w, cnr = samples(name, LENGTH), 30.0
+    noise = generator.normal(0, np.sqrt(1 / (2 * cnr)), (draws, LENGTH))
+    record = (np.cos(2 * np.pi * 40.3 * n / LENGTH) + noise) * w
+    f = np.full(draws, 40.3)
+    for _ in range(8):
+        turning = record * np.exp(-2j * np.pi * np.outer(f, n) / LENGTH)
+        x = [(turning * (-2j * np.pi * n / LENGTH) ** k).sum(axis=1) for k in range(3)]
+        slope = 2 * (x[1] * x[0].conj()).real
+        f -= slope / (2 * (abs(x[1]) ** 2 + (x[2] * x[0].conj()).real))
+    expected = estimators.windowed_deviation(
+        cnr=cnr, window=window(name, LENGTH), sample_rate=float(LENGTH)
+    )
+    bound = estimators.beat_deviation(cnr=cnr, samples=LENGTH, sample_rate=float(LENGTH))
+    assert np.std(f) == pytest.approx(expected, rel=5 / np.sqrt(2 * draws) + 0.02)
+    assert expected == pytest.approx(bound, rel=1e-9) if name == "rectangular" else expected > bound
+
+
 @pytest.mark.parametrize("doppler", [2e3, np.inf])
 def test_the_bound_of_range_and_velocity_is_that_of_beats_differentiated(doppler):
     """Least squares weighted by the beats' errors, their slopes by differences of the beats."""

@@ -8,7 +8,13 @@ import pytest
 from engine import difference, every, run_of_bins, shape_of
 
 from sweep.model import truth
-from sweep.model.crossings import any_crossing, silence
+from sweep.model.crossings import (
+    MOST_TERMS,
+    added_crossings,
+    any_crossing,
+    crossing_series,
+    silence,
+)
 from sweep.model.ground import Cast, Footprints
 from sweep.model.groups import groups
 from sweep.model.lines import IM, LEAST_WIDTH, PLACE, RE
@@ -249,6 +255,34 @@ def test_groups_are_those_of_every_bin(table_4_1, apart):
         np.testing.assert_allclose(fast.neighbours, slow.neighbours, rtol=1e-7)
         found += (slow.bin >= 0).sum(axis=-1).max()
     assert found >= 5 * (2 if apart > 1 else 1)
+
+
+@pytest.mark.parametrize("beta", [0.3, 2.0, 4.5, 6.55, 10.0, 25.0, 29.9])
+def test_added_crossings_have_their_digits(beta):
+    """(Q_1(a, b) - Q_1(0, b)) / (1 - Q_1(0, b)) against 40 digits, up to the threshold."""
+    y = beta**2 / 2
+    x = y * np.array([1e-30, 1e-12, 1e-6, 1e-3, 0.03, 0.1, 0.2, 0.35, 0.45])
+    series, out = np.zeros(MOST_TERMS), np.empty(32)
+    crossing_series(beta, series)
+    room = np.zeros(32)
+    room[: x.size] = x
+    added_crossings(room, x.size, beta, series, out)
+    with mpmath.workdps(40):
+        for value, got in zip(x, out, strict=False):
+            xm, ym = mpmath.mpf(value), mpmath.mpf(y)
+            term, below, total, n = mpmath.e ** (-xm), mpmath.e ** (-ym), mpmath.mpf(0), 0
+            power = below
+            poisson = below  # sum_{j<=n} e^-y y^j / j!
+            while n < 4000:
+                n += 1
+                term *= xm / n
+                power *= ym / n
+                poisson += power
+                total += term * (poisson - below)
+                if n > 20 and term < total * mpmath.mpf(10) ** -38:
+                    break
+            exact = total / (1 - below)
+            assert abs(got / float(exact) - 1) < 2e-14 + 3e-16 * y  # e^-y itself is good to y eps
 
 
 def test_many_small_chances_keep_their_digits():

@@ -52,6 +52,21 @@ def test_standard_errors_go_as_1_over_sine_across_and_1_over_cosine_along(number
     np.testing.assert_allclose(found.covariance, expected, rtol=1e-11, atol=1e-11 * across)
 
 
+@PATTERNS
+def test_mean_and_covariance_of_drawn_velocities_are_those_propagated(beams):
+    error = 0.01 * (1 + np.arange(len(beams)) % 3)  # unequal: the weights matter
+    noise = np.random.default_rng(1).standard_normal((DRAWS, len(beams))) * error
+    found = velocity(direction=beams, radial_velocity=beams @ MOVING + noise, standard_error=error)
+    off, stated = found.value - MOVING, found.covariance[0]
+    variance = np.diag(stated)
+    assert (np.abs(off.mean(axis=0)) <= 5 * np.sqrt(variance / DRAWS)).all()
+    # of a sample covariance of normal numbers: (C_ii C_jj + C_ij^2) / (n - 1)
+    spread = np.sqrt((np.outer(variance, variance) + stated**2) / (DRAWS - 1))
+    assert (np.abs(np.cov(off.T) - stated) <= 5 * spread).all()
+    degrees = len(beams) - 3
+    assert abs(found.chi_square.mean() - degrees) <= 5 * np.sqrt(2 * degrees / DRAWS) + 1e-9
+
+
 def test_a_turned_frame_turns_the_solution():
     noise = np.random.default_rng(2).standard_normal(16) * 0.05
     error = np.linspace(0.01, 0.1, 16)
@@ -207,6 +222,23 @@ def test_the_altitudes_variance_is_its_response_to_each_range(beams, slope):
     expected = np.sum((response * error) ** 2) + from_slopes
     # steps of 1e-5 relative leave that much, squared or not, of curvature
     assert found.covariance == pytest.approx(expected, rel=2e-5)
+
+
+@PATTERNS
+def test_mean_and_variance_of_drawn_altitudes_are_those_propagated(beams):
+    rng = np.random.default_rng(13)
+    error = 0.05 * (1 + np.arange(len(beams)) % 3)
+    down = -(beams @ NORMAL) / NORMAL[2]
+    heights = rng.normal(0, 0.3, (DRAWS, len(beams)))  # relief lifts a point, the range shrinks
+    ranges = (500.0 - heights) / down + rng.normal(0, 1, heights.shape) * error
+    found = altitude(direction=beams, range=ranges, standard_error=error, relief=0.3)
+    off, variance = found.value - 500.0, found.covariance.mean()
+    # the curvature of the problem is of order variance / altitude, far below 5 sigma / sqrt(n)
+    assert variance / 500 < 0.2 * np.sqrt(variance / DRAWS)
+    assert abs(off.mean()) <= 5 * np.sqrt(variance / DRAWS)
+    assert abs(off.var(ddof=1) / variance - 1) <= 5 * np.sqrt(2 / DRAWS)
+    degrees = len(beams) - 3
+    assert abs(found.chi_square.mean() - degrees) <= 5 * np.sqrt(2 * degrees / DRAWS) + 1e-6
 
 
 def test_on_a_steep_slope_errors_count_by_how_the_beams_meet_it():

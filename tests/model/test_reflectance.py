@@ -38,3 +38,9 @@ def test_lommel_seeliger_agrees_with_lambert_along_the_normal_and_does_not_darke
     flat, lambert = (backscatter(law, COSINES) for law in ("lommel_seeliger", "lambert"))
     assert flat[-1] == lambert[-1]
     np.testing.assert_allclose(lambert / flat, COSINES, rtol=1e-15)
+
+
+def test_the_thesis_law_is_half_of_lommel_seeligers():
+    np.testing.assert_array_equal(
+        2 * backscatter("thesis", COSINES), backscatter("lommel_seeliger", COSINES)
+    )

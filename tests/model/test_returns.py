@@ -7,7 +7,7 @@ import pytest
 from engine import DRAWS, keys, prepared, within_5_sigma
 from scipy import ndimage, stats
 
-from sweep.model import truth
+from sweep.model import truth, waveform
 from sweep.model.draws import Seen
 from sweep.model.effects.catalogue import CORE
 from sweep.model.groups import groups
@@ -18,6 +18,7 @@ from sweep.model.returns import (
     WHOLE,
     How,
     Known,
+    beamlet_lines,
     draw_peaks,
     draw_returns,
     free_bin,
@@ -393,6 +394,21 @@ def test_reported_errors_hold_for_a_footprint_that_spreads(table_4_1, phases):
     assert 0.5 < np.sqrt(np.mean((error / stated) ** 2)) < high
     noise_alone = RANGE_BIN / np.sqrt(2 * np.median(got.snr[..., 0][good]))
     assert np.median(stated) > 2 * noise_alone / np.sqrt(2)
+
+
+def test_beamlets_appear_where_their_beats_fold_to(table_4_1):
+    shots = prepared(table_4_1(range=8000.0, radial_velocity=-170.0, beamlets=7, grazing_angle=0.3))
+    shots = dataclasses.replace(shots, doppler=np.linspace(-1e-9, 1e-9, 7)[None])
+    velocity = -170.0 + shots.doppler[0] * LIGHT / 2
+    lines = beamlet_lines(shots)[0]
+    for s, (sign, carrier) in enumerate(zip((1, 0, -1), shots.carriers, strict=True)):
+        beats = waveform.beat_frequency(
+            sign, carrier=carrier, chirp_rate=2e12, range=8000.0 * (1 + shots.offset[0]),
+            radial_velocity=velocity,
+        )  # fmt: skip
+        expected = waveform.fold(beats, np.array(600e6)) / 600e6 * 2**17
+        np.testing.assert_allclose(lines[s], expected, atol=1e-6)
+    assert np.ptp(lines[0]) > 0.1
 
 
 # Flags

@@ -178,6 +178,11 @@ def test_right_wrong_and_nothing_add_to_one(detection, speckle, record, table_4_
     assert {name for name in found if name not in crosses} == set(STRONGEST_OUTPUTS)
 
 
+def test_of_strong_echoes_no_peak_is_wrong(table_4_1):
+    found = evaluate(scene_of(table_4_1, tnr=1.0, power=10.0), CORE)
+    assert found["pd_shot"] == pytest.approx([1]) and found["p_wrong_range_shot"] < 1e-6
+
+
 @pytest.mark.parametrize("record", ["real", "complex"])
 def test_segments_of_their_own_speckle_are_independent(record, table_4_1):
     scene = scene_of(table_4_1, "developed", record, tnr=np.array([2.5, 4.0, 6.0]))

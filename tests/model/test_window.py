@@ -1,5 +1,6 @@
 """Windows: textbook figures, sums against samples, transforms against sums in many digits."""
 
+import mpmath
 import numpy as np
 import pytest
 from scipy import signal
@@ -66,6 +67,25 @@ def test_parameters_of_a_window_reach_scipy():
     assert np.array_equal(
         samples("general_gaussian(1.5,7)", 99), signal.get_window(("general_gaussian", 1.5, 7), 99)
     )
+
+
+def exact_transform(texts, length, y):
+    """W(y) of a cosine sum by adding its samples in 40 digits."""
+    with mpmath.workdps(40):
+        c = [mpmath.mpf(text) for text in texts]
+        step = 2 * mpmath.pi / length
+        return mpmath.fsum(
+            mpmath.fsum((-1) ** m * x * mpmath.cos(m * n * step) for m, x in enumerate(c))
+            * mpmath.expj(-step * n * mpmath.mpf(y))
+            for n in range(length)
+        )
+
+
+@pytest.mark.parametrize("name", ["rectangular", "hann", "hamming", "flattop"])
+def test_the_direct_sum_is_the_sum_in_many_digits(name):
+    y = np.array([0.0, 0.5, 1.0, 2.75, -30.5, 64.0])
+    exact = [complex(exact_transform(COSINE_SUMS[name], 128, float(x))) for x in y]
+    assert np.abs(transform(window(name, 128), y) - exact).max() < 1e-13 * 128
 
 
 # The transform

@@ -153,6 +153,34 @@ def test_no_further_effect_changes_more_than_its_size(table_4_1, kind, name):
     assert noticed > 10
 
 
+@pytest.mark.parametrize("kind", range(len(KINDS)))
+@pytest.mark.parametrize("tolerance", [1e-4, 1e-2, 0.3])
+def test_pd_of_what_is_kept_is_within_the_tolerance(table_4_1, kind, tolerance):
+    kept = dropped = 0
+    for seed in range(2):
+        parameters = scene(
+            table_4_1, POINTS, seed, fft_size=2**13, **{"beamlets": 19} | KINDS[kind]
+        )
+        made = planned(points_of(parameters), {}, tolerance, CHOICE)
+        inner = counted(parameters, seed)
+        truth = shot.evaluate(inner)
+        assert (made.error <= tolerance).all()
+        for column in np.unique(made.kept, axis=1).T:
+            names = [name for name, there in zip(made.names, column, strict=True) if there]
+            here = (made.kept == column[:, None]).all(axis=0)
+            of_kept = shot.evaluate(inner, names)
+            error = abs(of_kept["pd_shot"] - truth["pd_shot"])[here]
+            assert (error <= tolerance + ROUNDING).all(), names
+            whole, part = shots_of(inner, CORE), shots_of(inner, names)
+            moved = magnitudes_moved(find(whole), find(part), part.bin_deviation)
+            assert (moved[here] <= np.expm1(tolerance) + ROUNDING).all(), names
+            if "leakage" not in names:
+                extra = truth["p_leakage_up"] + truth["p_leakage_down"]
+                assert (extra[here] <= tolerance).all()
+        kept, dropped = kept + made.kept.sum(), dropped + (~made.kept).sum()
+    assert kept > 30 and dropped > 30
+
+
 def cast_scene(rng, shots, beamlets, beside_chance):
     """Footprints on steps: offsets, closing speeds and echoes as rays might find them."""
     surface = rng.random((shots, beamlets)) < beside_chance * rng.random((shots, 1))

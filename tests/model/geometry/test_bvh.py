@@ -65,6 +65,11 @@ def walk_alone(tree, origins, directions):
     return (found[:, 0] for found in walk(tree, origins, directions[:, None]))
 
 
+def fan(rng, towards, b, spread):
+    """Bundles of b directions (n, b, 3) around given ones."""
+    return unit(unit(towards)[:, None] + spread * rng.normal(size=(len(towards), b, 3)))
+
+
 @pytest.mark.parametrize("kind", ["plain", "needles", "coplanar", "sizes"])
 def test_walks_find_what_testing_every_triangle_finds(kind):
     rng = np.random.default_rng(7)
@@ -83,6 +88,23 @@ def test_walks_find_what_testing_every_triangle_finds(kind):
     hit = sure & np.isfinite(truth)
     assert (face[sure & ~hit] == -1).all()
     np.testing.assert_allclose(table[hit, face[hit]], truth[hit], rtol=1e-10)
+
+
+@pytest.mark.parametrize("spread", [0.0, 1e-6, 1e-3, 0.1, 1.0])
+@pytest.mark.parametrize("kind", ["plain", "needles", "sizes"])
+def test_a_bundle_finds_what_its_rays_find_alone_bit_for_bit(kind, spread):
+    """Narrow, wider than what one walk takes on, and about every axis at once."""
+    rng = np.random.default_rng(11)
+    vertices, faces = soup(rng, 3000, kind)
+    tree = build(vertices, faces)
+    origins = rng.uniform(-12, 12, (60, 3))
+    directions = fan(rng, inside_points(rng, vertices, faces, 60) - origins, 19, spread)
+    directions[0] = np.eye(3)[0]
+    together = walk(tree, origins, directions)
+    alone = walk_alone(tree, np.repeat(origins, 19, axis=0), directions.reshape(-1, 3))
+    assert (together[1] >= 0).mean() > 0.1
+    for bundle, ray in zip(together, alone, strict=True):
+        np.testing.assert_array_equal(bundle.ravel(), ray)
 
 
 def test_what_is_known_to_lie_nearer_stays():

@@ -152,6 +152,10 @@ angles = st.floats(-math.pi, math.pi)
 vectors = st.tuples(*[st.floats(-3, 3)] * 3).map(np.array)
 
 
+def unit(seed, number=20):
+    return Rotation.random(number, rng=np.random.default_rng(seed)).as_quat(scalar_first=True)
+
+
 def scipys(q):
     return Rotation.from_quat(q, scalar_first=True)
 
@@ -163,6 +167,15 @@ def same_rotation(p, q, atol=1e-12):
 def turned(law, t):
     motion = TURNING.motion(t)
     return law.turn(t, motion.velocity, motion.acceleration)
+
+
+def test_products_inverses_and_turned_vectors_agree_with_scipy():
+    p, q = unit(1), unit(2)
+    v = np.random.default_rng(3).normal(size=(20, 3))
+    same_rotation(quat.multiply(p, q), (scipys(p) * scipys(q)).as_quat(scalar_first=True))
+    same_rotation(quat.conjugate(p), scipys(p).inv().as_quat(scalar_first=True))
+    np.testing.assert_allclose(quat.rotate(p, v), scipys(p).apply(v), atol=1e-14)
+    np.testing.assert_allclose(quat.rotate(p[0], v), scipys(p[0]).apply(v), atol=1e-14)
 
 
 @given(vectors)
