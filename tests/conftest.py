@@ -17,6 +17,21 @@ MEMORY, ROOM = Path("/dev/shm"), 8 << 30
 if MEMORY.is_dir() and os.access(MEMORY, os.W_OK) and shutil.disk_usage(MEMORY).free > ROOM:
     os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(MEMORY))
 
+_approx = pytest.approx
+
+
+def approx(expected, rel=None, abs=None, nan_ok=False):
+    """Relative tolerance alone, unless an absolute one is stated: pytest's 1e-12 is no tolerance.
+
+    Densities, currents and chances of false alarms lie far below it.
+    """
+    if abs is None:
+        rel, abs = 1e-6 if rel is None else rel, 0.0
+    return _approx(expected, rel=rel, abs=abs, nan_ok=nan_ok)
+
+
+pytest.approx = approx
+
 # The first call of a compiled kernel may compile it, which no deadline should count.
 settings.register_profile("sweep", deadline=None, derandomize=True, max_examples=40)
 settings.register_profile("anew", deadline=None, print_blob=True)  # other draws: `make test-all`

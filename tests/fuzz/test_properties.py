@@ -124,16 +124,19 @@ def test_a_higher_threshold_detects_less_and_alarms_less(written):
 def test_without_movement_up_and_down_chirp_are_alike(written):
     """Their beats then are range beats of either sign. Phases differ by the carriers, so that it
     holds where these play no part: beamlets that add as powers, which those of direct detection
-    do not, and no images."""
+    do not, and no images. At DC there is no echo without its image: a bin off it at the least."""
     written = steady(written, *MOVING)
     written["effects"] = {"image": "off"}
     written["footprint"]["phases"] = "incoherent"
     assume(written["instrument"]["receiver"].get("architecture") != "direct")
+    given = spec_of(written).parameters()
+    assume(given["target.range"] * given["instrument.chirp.bandwidth"] >= 299792458 / 2)
     results = results_of(written)
     for name in ("snr", "pd", "miss", "p_leakage"):
         up, down = results[f"{name}_up"], results[f"{name}_down"]
-        # Bins just at the threshold may count in one and not in the other.
-        assert np.allclose(up, down, rtol=1e-6, atol=1e-12), name
+        # Bins at the threshold, or half way to another, may count in one and not in the other.
+        least = 1e-9 if name == "p_leakage" else 1e-12
+        assert np.allclose(up, down, rtol=1e-6, atol=least), name
     error = results["radial_velocity_error"]
     assert np.isnan(error) or abs(error) < 1e-9  # rounding, where three beats are fitted
 

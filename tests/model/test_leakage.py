@@ -293,4 +293,4 @@ def test_many_small_chances_keep_their_digits():
         few = 1 - mpmath.fprod(1 - mpmath.mpf(c) for c in chances[:4])
         assert any_crossing(chances, 0, 4) == pytest.approx(float(few), rel=1e-15)
         for c in [*chances, 9.9e-5, 1.01e-4]:
-            assert silence(c) == pytest.approx(float(-mpmath.log(1 - mpmath.mpf(c))), rel=1e-15)
+            assert silence(c) == pytest.approx(float(-mpmath.log1p(-mpmath.mpf(c))), rel=1e-15)

@@ -4,11 +4,13 @@ import itertools
 
 import numpy as np
 import pytest
+from engine import prepared
 from hypothesis import given
 from hypothesis import strategies as st
 
 from sweep.model import waveform
 from sweep.model.pairing import ASSUMED, TOLERANCE, confirm, pair_peaks
+from sweep.model.returns import How, _third
 
 N, FS = 2**17, 600e6
 WIDTH = FS / N
@@ -63,6 +65,24 @@ def _agrees(reported, target):
 
 
 # One triple
+
+
+@pytest.mark.parametrize("down_slope", [-1.0, 0.25, 3.0])
+@pytest.mark.parametrize("far", [0.02, 0.15, 0.24])
+def test_signed_beats_of_any_slope_confirm_each_other_at_any_range(table_4_1, down_slope, far):
+    """Beats f_d - slope f_r of complex records wrap; f_r is such a share of the sample rate."""
+    scene = table_4_1(fft_size=4096) | {
+        "instrument.receiver.record": "complex", "instrument.chirp.down_slope": down_slope,
+    }  # fmt: skip
+    shots = prepared(scene)
+    signed, third = How.of(shots, 0, False).signed, np.array(_third(shots), float)
+    f_r, f_d, size = far * 4096.0, 700.0, 4096.0
+    # carriers differ by 5e-6, and Doppler shifts with them by less than a hundredth of a bin
+    up, doppler, down = (
+        (beat + size / 2) % size - size / 2 for beat in (f_d - f_r, f_d, f_d - down_slope * f_r)
+    )
+    cost, peak, _ = confirm(up, np.array([doppler]), down, third, size, signed, TOLERANCE)
+    assert peak == 0 and cost < 0.05
 
 
 def test_a_tolerance_takes_the_cheapest_reading_among_those_within_it():

@@ -81,6 +81,14 @@ def test_the_beats_noise_is_that_of_simulated_records():
     quiet = given | {"instrument.laser.relative_intensity_noise": 0.0}
     parts = leak.excess(given, "homodyne", "gaussian"), leak.excess(quiet, "homodyne", "lorentzian")
     assert min(parts) > 0.2 * law  # both are seen
+    # All the light of a laser fluctuates together, by what a balanced receiver rejects.
+    rejecting = given | {
+        "instrument.receiver.common_mode_rejection": 50.0,
+        "instrument.receiver.mixing_efficiency": 0.0,
+    }
+    leaked = beat**2 / 4
+    more = rin * ((1.0 + leaked) ** 2 - 1.0) / 50.0
+    assert leak.excess(rejecting, "homodyne", "gaussian") == pytest.approx(more, rel=1e-12)
 
 
 def test_leaked_light_makes_shot_noise_and_the_beats_noise(leaking):
