@@ -53,7 +53,7 @@ from sweep.model.spectrum import (
 from sweep.model.window import Window
 
 POINTS = 256
-"""Points that are prepared together."""
+"""Points that are prepared together; 16 times as many where few line shapes serve them all."""
 
 ROOM_FOR_RUNS = 1 << 21
 """Bins of runs that are kept at a time, at least."""
@@ -232,6 +232,9 @@ def _together(shots: Shots, points: np.ndarray) -> Iterator[Together]:
     window, fft_size, power = shots.window, shots.fft_size, shots.incoherent
     simple = line_shape.has_modes(window, fft_size)
     segments = len(shots.waveform)
+    plainly = shots.gaussian_width is None and not np.any(shots.look_drift)
+    few = plainly and (shots.alike or not shots.phase_errors)
+    step = 16 * POINTS if few else POINTS
     if not shots.phase_errors:
         plain = line_shape.shapes if simple else _plain
         shapes = plain(window, fft_size, power, 0 if simple else segments)
@@ -239,14 +242,12 @@ def _together(shots: Shots, points: np.ndarray) -> Iterator[Together]:
         modes[:, :, 0] = 1.0
         number = np.ones((segments, 1), np.int64)
         centre = np.zeros((segments, 1))
-        plainly = shots.gaussian_width is None and not np.any(shots.look_drift)
-        step = max(points.size if plainly else POINTS, 1)
         for first in range(0, points.size, step):
             some = points[first : first + step]
             yield Together(some, 0 * some, shapes, centre, modes, number)
         return
-    for first in range(0, points.size, POINTS):
-        some = points[first : first + POINTS]
+    for first in range(0, points.size, step):
+        some = points[first : first + step]
         point, which = _different(shots, some)
         left = np.arange(point.size)
         for tier in range(len(line_shape.TIERS) if simple else 0):
