@@ -271,11 +271,11 @@ class GridBench(Bench):
         self.most_times = min(MOST_TIMES, self._block_points)
 
     def parts(self, points: int) -> list[np.ndarray]:
-        """Stretches of the sample, each spread as evenly."""
+        """Parts of the sample, each spread as evenly as all of it."""
         return np.array_split(np.arange(self.size), max(1, round(self.size / points)))
 
     def try_on(self, rung: Rung, part: np.ndarray, times: int) -> Trial:
-        """Compute the part by itself, and time stretches of blocks at some of its points."""
+        """Compute the part by itself; its time is that of more points of the same blocks."""
         numbers = self.numbers[part]
         trial = self._run(rung, numbers)
         if times == 1:
@@ -356,7 +356,7 @@ class FlightBench(Bench):
         return [part for turn in zip_longest(*found) for part in turn if part is not None]
 
     def try_on(self, rung: Rung, part: np.ndarray, times: int) -> Trial:
-        """Compute the part and so many shots in tiles beside it, timed with their rays."""
+        """Compute the part and neighbouring tiles of so many shots, timed with their rays."""
         numbers = self.around(part, times)
         trial = self._run(rung, numbers)
         own = np.searchsorted(numbers, part)
