@@ -55,10 +55,7 @@ LONG_RUN = 10
 DRAWN_TOLERANCES = (1e-1, 3e-2, 1e-2)
 """Tolerances until which points are drawn."""
 
-DRAWN = "draws.number"
-"""Field that holds the number of draws."""
-
-_TOLERANCE, _LIMIT = "accuracy.tolerance", "draws.limit"
+_TOLERANCE, _DRAWN, _LIMIT = "accuracy.tolerance", "draws.number", "draws.limit"
 _BEAMLETS, _PATTERN, _LINE = "footprint.beamlets", "footprint.pattern", "line"
 _EXACTLY = dict.fromkeys(
     ("accuracy.line_error", "accuracy.leakage_error", "accuracy.leakage_floor"), FINEST_TOLERANCE
@@ -213,23 +210,23 @@ def _drawn_ladder(spec: Spec) -> Ladder:
     longest = LONG_RUN * DRAW_NUMBERS[-1]
     notes = ["errors are differences from a long run with other draws, so they are random too"]
     own: dict[str, Any] = {}
-    for path, written in ((DRAWN, spec.draws.number), (_LIMIT, spec.draws.limit)):
+    for path, written in ((_DRAWN, spec.draws.number), (_LIMIT, spec.draws.limit)):
         if written > longest:
             own = {path: longest}
             notes.append(f"with {longest} of the {written} draws that are written")
     rungs = [Rung(name="as written", kind=WRITTEN, overrides=own)]
     for t in DRAWN_TOLERANCES:
-        until = {DRAWN: 0, _LIMIT: longest, _TOLERANCE: t}
+        until = {_DRAWN: 0, _LIMIT: longest, _TOLERANCE: t}
         rungs.append(Rung(name=f"auto at {t:g}", kind=ADAPTIVE, overrides=until))
     for number in DRAW_NUMBERS:
-        each = {DRAWN: number, _LIMIT: 0}
+        each = {_DRAWN: number, _LIMIT: 0}
         noise = each | {"draws.method": "noise"}
         rungs += [
             Rung(name=f"{number} draws, mean", kind=MEANS, overrides=each),
             Rung(name=f"{number} draws, counts", kind=COUNTED, overrides=each),
             Rung(name=f"{number} draws, noise", kind=IN_NOISE, overrides=noise),
         ]
-    other = {DRAWN: longest, "seed": int(spec.seed) ^ 1, _LIMIT: 0}
+    other = {_DRAWN: longest, "seed": int(spec.seed) ^ 1, _LIMIT: 0}
     rungs.append(Rung(name="reference", kind=REFERENCE, overrides=_every_effect(spec) | other))
     return Ladder(tuple(rungs), f"{longest} other draws, all effects on", tuple(notes))
 
@@ -239,11 +236,11 @@ def _every_effect(spec: Declared) -> dict[str, Any]:
 
     Random ones where probabilities are means over draws: of a flight they are not.
     """
-    random, law = isinstance(spec, Spec) and spec.draws.any, SEGMENT_MOTION.name
-    kept = law if spec.modes()[law] == OFF else ""
-    return {
-        f"effects.{e.name}": "on" for e in EFFECTS if (random or not e.is_random) and e.name != kept
-    }
+    law, is_drawn = SEGMENT_MOTION.name, isinstance(spec, Spec) and spec.draws.any
+    every = {f"effects.{e.name}": "on" for e in EFFECTS if is_drawn or not e.is_random}
+    if spec.modes()[law] == OFF:
+        del every[f"effects.{law}"]
+    return every
 
 
 def _on_axis(spec: Declared, path: str) -> bool:
