@@ -19,9 +19,8 @@ from shared import DOCS, EXPERIMENTS, table
 
 from sweep.model.accuracy import Accuracy
 from sweep.spec import SceneSpec, Spec, SpecError, load
-from sweep.tasks.accuracy.bench import Bench, GridBench, Trial
-from sweep.tasks.accuracy.flight_bench import FlightBench
-from sweep.tasks.accuracy.measure import PROMISED, apart, completed, together, tolerance_of
+from sweep.tasks.accuracy.bench import Bench, FlightBench, GridBench, Trial, together
+from sweep.tasks.accuracy.measure import PROMISED, apart, completed, tolerance_of
 from sweep.tasks.accuracy.rungs import (
     ADAPTIVE,
     ALL_ON,
@@ -154,7 +153,7 @@ def tried(bench: Bench, rungs: Sequence[Rung], rounds: int) -> list[Trial]:
                 best[k] = min(best.get(k, trial), trial, key=lambda trial: trial.seconds)
         found.append([best[k] for k in sorted(best)])
         bench.forget()
-    return together(parts, found)
+    return [together(trials) for trials in zip(*found, strict=True)]
 
 
 class Found(NamedTuple):

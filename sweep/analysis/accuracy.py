@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -93,28 +94,23 @@ class Setting:
 
 def settings_in(dataset: xr.Dataset) -> list[Setting]:
     """Return the settings of a store that `sweep accuracy` made, in its order."""
-    found = []
-    likely = LIKELY if np.isfinite(dataset.standard_error.values).any() else 1.0
-    for i in range(dataset.sizes["rung"]):
-        rung = dataset.isel(rung=i)
-        rounds = rung.seconds.values
-        largest = {
-            name: float(np.fmax.reduce(rung[name].values))
-            for name in ("log10_pfa_error", "magnitude_error", "leakage_error")
-        }
-        found.append(
-            Setting(
-                name=str(rung.rung.values),
-                kind=str(rung.kind.values),
-                tolerance=float(rung.tolerance),
-                rounds=rounds,
-                planning=float(rung.planning.values[np.argmin(rounds)]),
-                pd_error=rung.pd_error.values,
-                likely=likely,
-                **largest,
-            )
+    values = {name: array.values for name, array in dataset.variables.items()}
+    likely = LIKELY if np.isfinite(values["standard_error"]).any() else 1.0
+    return [
+        Setting(
+            name=str(name),
+            kind=str(values["kind"][i]),
+            tolerance=float(values["tolerance"][i]),
+            rounds=values["seconds"][i],
+            planning=float(values["planning"][i, np.argmin(values["seconds"][i])]),
+            pd_error=values["pd_error"][i],
+            log10_pfa_error=float(np.fmax.reduce(values["log10_pfa_error"][i])),
+            magnitude_error=float(np.fmax.reduce(values["magnitude_error"][i])),
+            leakage_error=float(np.fmax.reduce(values["leakage_error"][i])),
+            likely=likely,
         )
-    return found
+        for i, name in enumerate(values["rung"])
+    ]
 
 
 def of_kinds(settings: Iterable[Setting], *kinds: str) -> list[Setting]:
@@ -143,21 +139,18 @@ def cheapest(settings: Sequence[Setting], error: float) -> Setting | None:
     return min(fitting, key=lambda s: s.seconds, default=None)
 
 
-@dataclass(frozen=True)
-class Duel:
+class Duel(NamedTuple):
     """An adaptive setting against another, both with no more than an error; None where none is."""
 
     adaptive: Setting
     other: Setting | None
 
-    @property
-    def times_faster(self) -> float:
-        """Time of the other over that of the adaptive one; inf against nothing."""
-        return self.with_besides(0.0)
+    def times_faster(self, besides: float = 0.0) -> float:
+        """Time of the other over that of the adaptive one; inf against nothing.
 
-    def with_besides(self, seconds: float) -> float:
-        """Compare both with a time added to each [s], a point."""
-        return self.adaptive.times_faster(self.other, seconds) if self.other else float("inf")
+        Both with what a point takes besides [s].
+        """
+        return self.adaptive.times_faster(self.other, besides) if self.other else math.inf
 
 
 def against_fixed(settings: Sequence[Setting]) -> list[Duel]:
@@ -268,13 +261,15 @@ def _fixed(duels: Sequence[Duel], attributes: dict) -> list[str]:
     """Statement on adaptive against fixed settings."""
     if not duels:
         return []
-    worst = min(duels, key=lambda duel: duel.times_faster)
+    worst = min(duels, key=Duel.times_faster)
     if worst.other is None:
         return ["No fixed setting is as accurate as any adaptive one."]
-    met = "met" if worst.times_faster >= AS_FAST else _lost(worst, duels, attributes)
-    several = [duel.times_faster for duel in duels if duel.other]
+    met = "met" if worst.times_faster() >= AS_FAST else _lost(worst, duels, attributes)
+    several = [f"{duel.times_faster():.2g}" for duel in duels if duel.other]
+    low, high = min(several, key=float), max(several, key=float)
+    span = low if low == high else f"{low} to {high}"
     return [
-        f"At equal error, adaptive settings are {_span(several)} times as fast as the best single "
+        f"At equal error, adaptive settings are {span} times as fast as the best single "
         f"fixed setting. Least speed-up: {worst.adaptive.name} over {worst.other.name}. "
         f"Requirement, never slower by more than 10 %: {met}."
     ]
@@ -283,22 +278,22 @@ def _fixed(duels: Sequence[Duel], attributes: dict) -> list[str]:
 def _lost(worst: Duel, duels: Sequence[Duel], attributes: dict) -> str:
     """By how much an adaptive setting is slower, and what that is of all that the study takes."""
     points = attributes["study_points"]
-    slower = worst.adaptive.seconds * (1 - worst.times_faster)
+    slower = worst.adaptive.seconds * (1 - worst.times_faster())
     lost, planning = (_time(points * each) for each in (slower, worst.adaptive.planning))
     told = f"NOT met, by {lost} in all; planning takes {planning}"
     if (stored := attributes.get(STORING)) is None:
         return told
-    whole = min(duel.with_besides(stored / points) for duel in duels)
+    whole = min(duel.times_faster(stored / points) for duel in duels)
     return f"{told}; with the study's store it is {whole:.2g} times as fast"
 
 
 def _thesis(settings: Sequence[Setting], beamlets: int) -> list[str]:
-    """Statement on adaptive settings against the thesis's way, as described and improved."""
+    """Statements on adaptive settings against the thesis's way, as described and improved."""
     duels = against_thesis(settings)
     if not duels:
         return []
     met = " and ".join(
-        f"{'met' if duel.times_faster >= TIMES_FASTER else 'NOT met'} over {duel.other.name}"
+        f"{'met' if duel.times_faster() >= TIMES_FASTER else 'NOT met'} over {duel.other.name}"
         for duel in duels
         if duel.other
     )
@@ -317,7 +312,7 @@ def _speed_ups(duels: Sequence[Duel]) -> str:
     for duel in duels:
         if duel.other:
             of = f"{duel.adaptive.name}, error {error(duel.other.error)}"
-            groups.setdefault(of, []).append(f"{duel.times_faster:.2g} over {duel.other.name}")
+            groups.setdefault(of, []).append(f"{duel.times_faster():.2g} over {duel.other.name}")
     return " ".join(f"Speed-up of {of}: {'; '.join(each)}." for of, each in groups.items())
 
 
@@ -350,11 +345,6 @@ def _reference(attributes: dict) -> str:
         f"domain by {error(attributes['truth_pd_difference'])} in pd and by "
         f"{error(attributes['truth_magnitude_difference'])} in magnitude."
     )
-
-
-def _span(values: Sequence[float]) -> str:
-    low, high = min(values), max(values)
-    return f"{low:.2g}" if f"{low:.2g}" == f"{high:.2g}" else f"{low:.2g} to {high:.2g}"
 
 
 def _time(seconds: float) -> str:

@@ -11,11 +11,10 @@ from small_flights import SCENE, small_scene
 
 from sweep.model.effects.catalogue import NAMES
 from sweep.tasks import eyepoint_study, flight_study, progress, store
-from sweep.tasks.accuracy import flight_bench, measure, rungs
-from sweep.tasks.accuracy.bench import GridBench, Seen, spread
-from sweep.tasks.accuracy.flight_bench import FlightBench, Tiles
+from sweep.tasks.accuracy import bench as benches
+from sweep.tasks.accuracy import measure, rungs
+from sweep.tasks.accuracy.bench import FlightBench, GridBench, Seen, spread, whole_tiles
 from sweep.tasks.accuracy.measure import measure as measured
-from sweep.tasks.flight_study import Part
 from sweep.tasks.studies import study_of
 
 COHERENT = {"beamlets": 9, "phases": "coherent"}
@@ -99,7 +98,7 @@ def test_beamlets_that_are_part_of_the_scene_are_left_alone_and_it_is_said():
 
 def test_fixed_effects_are_those_called_for_and_the_same_set_is_tried_once():
     sets = {0.1: frozenset({"doppler"}), 1e-3: frozenset({"doppler"}), 1e-6: frozenset(NAMES[:2])}
-    ladder = rungs.ladder(small()).with_fixed(sets)
+    ladder = rungs.with_fixed(rungs.ladder(small()), small(), sets)
     fixed = [rung for rung in ladder.rungs if rung.kind == rungs.FIXED]
     assert [rung.name for rung in fixed] == [
         f"{what}, to {tolerance:g}"
@@ -189,9 +188,9 @@ def test_a_rung_is_what_a_run_of_its_spec_gives(coherent):
 def test_what_is_timed_is_what_the_points_own_block_computes_after_it():
     bench = GridBench(small(footprint=COHERENT, storage={"block_points": 24}), 8)
     rung = rungs.Rung(name="as written", kind=rungs.WRITTEN)
-    grid = bench._selection_of(rung).tiles.grid
+    grid = bench.study(rung).grid
     assert grid.block_shape == (2, 4, 3) and grid.dims == ("power", "range", "grazing_angle")
-    for number in bench._numbers:
+    for number in bench.numbers:
         beside = bench._beside(rung, number, 30)
         places = np.array(np.unravel_index(beside, grid.shape))
         blocks = places // np.array(grid.block_shape)[:, None]
@@ -221,6 +220,16 @@ def test_points_are_timed_as_many_together_as_a_block_has(monkeypatch):
         bench.try_on(rung, np.arange(points), block)
         assert together[0] == points and set(together[1:]) <= {block}
         assert len(together) == 1 + points * (block > 1)
+
+
+def test_a_tolerance_on_an_axis_stands_beside_that_of_the_settings(tmp_path):
+    spec = small(footprint=COHERENT, axes={"accuracy.tolerance": [0.1, 0.01]})
+    assert measured(spec, store_path=tmp_path / "a.zarr", points=2, progress=False)
+    dataset = xr.open_zarr(tmp_path / "a.zarr")
+    assert dataset.tolerance.dims == ("rung",) and np.isnan(dataset.tolerance).all()
+    assert set(dataset.accuracy_tolerance.values) == {0.1, 0.01}
+    assert "accuracy_tolerance" in dataset.coords and "tolerance" not in dataset.coords
+    assert "is on an axis" in dataset.attrs["notes"][0]
 
 
 @pytest.mark.slow
@@ -277,18 +286,15 @@ def test_shots_of_a_flight_are_tried_with_their_rays(tmp_path, monkeypatch):
 
 def test_parts_of_a_flight_are_whole_tiles_from_all_scanners_in_turn(monkeypatch):
     """Shots computed beside a part take part in its time, and change nothing that it sees."""
-    for module in (flight_bench, flight_study, eyepoint_study):
+    for module in (benches, flight_study, eyepoint_study):
         monkeypatch.setattr(module, "TILE_SHOTS", 32)
     bench = FlightBench(small_scene(footprint={"beamlets": 7, "speckle": "none"}), 400)
     parts = bench.parts(64)
     assert np.array_equal(np.sort(np.concatenate(parts)), np.arange(bench.size))
-    stretches = [next(t for t in bench._tiles[::-1] if t.start <= part[0]) for part in parts]
-    first = [stretch.start for stretch in stretches[: bench.least_parts]]
-    assert len(set(first)) == bench.least_parts == 4 and len(parts) > 4
-    tiles = [
-        {(s.part, t) for t in s.tile[part - s.start]}
-        for s, part in zip(stretches, parts, strict=True)
-    ]
+    shots = [bench.shots(part) for part in parts]
+    assert len({place for place, _ in shots[:4]}) == len(bench.parts(bench.size)) == 4
+    assert len(parts) > 4
+    tiles = [{(place, tile) for tile in (own // 32).tolist()} for place, own in shots]
     assert sum(map(len, tiles)) == len(set().union(*tiles)) and max(map(len, tiles)) == 2
     rung = rungs.Rung(name="as written", kind=rungs.WRITTEN)
     for part in (parts[0], parts[-1]):
@@ -299,11 +305,11 @@ def test_parts_of_a_flight_are_whole_tiles_from_all_scanners_in_turn(monkeypatch
 
 
 def test_shots_are_timed_with_so_many_that_follow_round_the_end():
-    stretch = Tiles(Part("three", (), range(1), range(1)), np.arange(256 * 4 + 100), 1000)
-    rows = stretch.around(np.arange(768, 1024), 600)
-    assert np.array_equal(np.unique(stretch.tile[rows]), [0, 3, 4]) and len(rows) == 612
-    assert np.array_equal(stretch.around(np.arange(300, 400), 1), np.arange(256, 512))
-    assert len(stretch.around(np.arange(1), 10_000)) == len(stretch.index)
+    tile = np.arange(256 * 4 + 100) // 256
+    rows = whole_tiles(tile, np.arange(768, 1024), 600)
+    assert np.array_equal(np.unique(tile[rows]), [0, 3, 4]) and len(rows) == 612
+    assert np.array_equal(whole_tiles(tile, np.arange(300, 400), 1), np.arange(256, 512))
+    assert len(whole_tiles(tile, np.arange(1), 10_000)) == len(tile)
 
 
 @pytest.mark.parametrize("rays", [7, "auto"])
@@ -318,16 +324,16 @@ def test_what_a_flight_is_measured_with_is_what_its_run_gives(rays):
     rung = rungs.Rung(name="as written", kind=rungs.WRITTEN)
     part = bench.parts(1)[0]
     seen = bench.try_on(rung, part, 1).seen
-    tiles, _ = bench._around(part, 1)
-    study = bench._study(rung)
-    caster = next(e for e in study.eyepoint_studies() if e.scanner == tiles.part.scanner)
+    place, numbers = bench.shots(bench.around(part, 1))
+    study = bench.study(rung)
+    caster = next(e for e in study.eyepoint_studies() if e.scanner == place.scanner)
     from sweep.scenes.eyepoint_arrays import from_arrays
 
-    shots = caster.see(tiles.index)
+    shots = caster.see(numbers)
     eyepoints = from_arrays(shots, caster.weight)
-    called = study.select(tiles.part, eyepoints, np.arange(len(tiles.index)))
-    assert len(tiles.index) <= TILE_SHOTS
-    found = study.look(tiles.part, shots, eyepoints, called, tiles.index)
+    called = study.select(place, eyepoints, np.arange(len(numbers)))
+    assert len(numbers) <= TILE_SHOTS
+    found = study.look(place, shots, eyepoints, called, numbers)
     assert np.array_equal(found["pd_up"], seen.pd[:, 0], equal_nan=True)
     assert np.array_equal(found["pd_shot"], seen.pd[:, 3], equal_nan=True)
     there = np.isfinite(seen.beamlets)
@@ -424,7 +430,8 @@ def test_whole_parts_are_kept_where_it_is_broken_off(trials, kept):
     found = tried.run()
     assert len(found.done) == kept and bool(found.truth) == (kept == 8)
     assert found.stopped == ("interrupted" if kept < 8 else "")
-    assert found.seconds.shape == (len(found.ladder.rungs), 1)
+    (seconds,) = (array for array in found.arrays() if array.name == "seconds")
+    assert seconds.shape == (len(found.ladder.rungs), 1)
 
 
 @pytest.mark.parametrize("law", ["off", "auto"])

@@ -1,5 +1,8 @@
 """A sample of points that rungs are tried on, by the machinery of a run, or the thesis's way.
 
+Of a grid these are points spread over all axes, of a flight whole tiles of shots, as effects are
+planned in them.
+
 [T 3.3.1] convolves the spectra with the window's transform "with much higher sampling rate in the
 frequency domain than the FFT bin spacing", by an FFT "typically of size 2^11 or 2^12". The grid has
 16 cells a bin around the beam's centre, and each beamlet's line goes into the nearest cell. One FFT
@@ -12,9 +15,10 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from functools import lru_cache, partial
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from functools import cache, cached_property, lru_cache, partial
+from itertools import product, zip_longest
+from pathlib import Path
 from time import thread_time
 from typing import Any, NamedTuple
 
@@ -25,31 +29,55 @@ from scipy.stats import qmc
 
 from sweep.model import shot, truth
 from sweep.model import window as windows
+from sweep.model.accuracy import Accuracy
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection import detect_rows
-from sweep.model.effects.catalogue import EFFECTS, flags_of, names_of
-from sweep.model.lines import BLOCK, IM, PLACE, RE, place_lines
+from sweep.model.effects.catalogue import EFFECTS, NAMES, flags_of, names_of
+from sweep.model.eyepoints import Eyepoints, seen_ground
+from sweep.model.lines import BLOCK, IM, PLACE, RE, add_images, fold_lines, place_lines
 from sweep.model.preparation import Shots
-from sweep.spec import Axis, Spec
+from sweep.model.ray_error import ray_error
+from sweep.model.waveform import SEGMENTS
+from sweep.scenes.eyepoint_arrays import from_arrays
+from sweep.spec import Axis, SceneSpec, Spec
 from sweep.tasks.accuracy.rungs import WRITTEN, Declared, Rung
-from sweep.tasks.grid_study import EffectSelection, Selected, evaluate_points
-from sweep.tasks.study import Grid
+from sweep.tasks.eyepoint_study import world_of
+from sweep.tasks.flight_study import FlightStudy, Part
+from sweep.tasks.grid_study import GridStudy, Selected, evaluate_points
+from sweep.tasks.study import TILE_SHOTS, Grid, Results
 
 Look = Callable[[Shots], np.ndarray]
+"""A way to the largest bins of each segment's spectrum, as :func:`sweep.model.shot.find`."""
 
-SEGMENTS = ("up", "doppler", "down")
+Coordinates = dict[str, tuple[np.ndarray, dict[str, Any]]]
+"""Values of points and their attributes, by name."""
 
-NOT_IN_TRUTH = frozenset({
-    "acceleration", "chirp_nonlinearity", "circulator_leak", "line_width", "leakage"
-})  # fmt: skip
-"""Effects that the time-domain records know nothing of."""
 
-AFTER_THE_LINES = frozenset({"record", "detection", "draws"})
-"""Stages of effects that the thesis's way leaves out."""
+def _flags(names: Collection[str]) -> np.uint32:
+    """Return the flags of some effects."""
+    return np.uint32(sum(1 << NAMES.index(name) for name in names))
+
+
+OF_LINES = _flags(
+    [effect.name for effect in EFFECTS if effect.stage not in ("record", "detection", "draws")]
+)
+"""Flags of the effects that the thesis's way can have."""
+
+IN_TRUTH = ~_flags(
+    ["acceleration", "chirp_nonlinearity", "circulator_leak", "line_width", "leakage"]
+    + [effect.name for effect in EFFECTS if effect.is_random]
+)
+"""Flags of the effects that the time-domain records know of."""
 
 PLACES, MOST_TIMES = 12, 8192
 """Places of a part of a grid's sample at which stretches of a block are timed, and their length at
 the most."""
+
+FLIGHT_PLACES = 2
+"""Places along the axes at which each scanner of a flight is looked at."""
+
+TAKEN = ("number", "kind", "tolerance")
+"""Names of parameters that the store has for itself: on an axis they go by their whole path."""
 
 AS_WRITTEN = Rung(name="as written", kind=WRITTEN)
 
@@ -67,108 +95,27 @@ class Seen(NamedTuple):
     """(n,): of each point; of a flight all rays that are cast, whatever is made of them."""
 
 
-@dataclass(frozen=True)
-class Trial:
-    """A rung tried on a part of the sample."""
-
-    seen: Seen
-    seconds: float
-    """Processor time of a point, planning included: what others use of the machine is no part."""
-    planning: float  # a point
-
-
-class Bench(ABC):
-    """A sample of a study's points."""
-
-    unit = "points"
-    spec: Declared
-    size: int  # points of the sample
-    whole: int  # points of the study, each computed once: draws of a flight are none of their own
-    least_parts: int  # parts of a sample, at the least: whole ones are kept where it is broken off
-    most_times: int  # points of the longest stretch that may be timed
-
-    def __init__(self) -> None:
-        self._names: dict[str, frozenset[str]] = {}
-
-    def effects(self, rung: Rung) -> frozenset[str]:
-        """Effects that a rung simulates anywhere in the sample."""
-        if rung.name not in self._names:
-            flags = np.unique(self._flags(rung)).tolist()
-            self._names[rung.name] = frozenset(name for flag in flags for name in names_of(flag))
-        return self._names[rung.name]
-
-    def of_lines(self) -> tuple[str, ...]:
-        """Effects of the study that the thesis's way can have."""
-        own = self.effects(AS_WRITTEN)
-        return tuple(e.name for e in EFFECTS if e.name in own and e.stage not in AFTER_THE_LINES)
-
-    @abstractmethod
-    def _flags(self, rung: Rung) -> np.ndarray:
-        """Effects that a rung calls for at each point of the sample."""
-
-    def forget(self) -> None:  # noqa: B027
-        """Drop what trials of one part share; its time counts for each of them."""
-
-
-def spread(shape: tuple[int, ...], number: int) -> np.ndarray:
-    """Numbers of points of a grid, in C order, spread evenly along every axis by Halton's sequence.
-
-    Any first part of them is spread as well, so that a part of the sample stands for all.
-    """
-    total = math.prod(shape)
-    if not shape or total <= 1:
-        return np.zeros(min(total, number), np.int64)
-    sequence = qmc.Halton(len(shape), scramble=False)
-    sequence.fast_forward(1)  # the first point is the grid's corner
-    found: dict[int, None] = {}
-    for _ in range(64):
-        index = np.floor(sequence.random(2 * number) * shape).astype(np.int64)
-        found |= dict.fromkeys(np.ravel_multi_index(tuple(index.T), shape).tolist())
-        if len(found) >= min(number, total):
-            break
-    else:  # some points of small grids are never met
-        found |= dict.fromkeys(range(min(total, 2 * number)))
-    return np.fromiter(found, np.int64)[:number]
-
-
-def look_of(rung: Rung) -> Look:
-    """Finder of a rung's peaks in the spectra."""
-    return partial(find_on_grid, **rung.thesis) if rung.thesis else shot.find
-
-
-def along_axes(
-    axes: tuple[Axis, ...], index: tuple[np.ndarray, ...]
-) -> dict[str, tuple[np.ndarray, dict[str, Any]]]:
-    """Coordinates of points, by their places along each axis."""
-    return {
-        member.name: (
-            np.asarray(member.display)[along],
-            {"units": member.units, "path": member.path},
-        )
-        for axis, along in zip(axes, index, strict=True)
-        for member in axis.members
-    }
-
-
-def seen_in(outputs: Mapping[str, np.ndarray], counted: int = 0) -> Seen:
+def seen_in(outputs: Results, counted: int = 0) -> Seen:
     """Results in the outputs of points; ``counted``: in so many draws, 0 for means of them."""
-    names = [f"pd_{name}" for name in (*SEGMENTS, "shot")]
+    every = (*SEGMENTS, "shot")
+
+    def of_each(form: str, names: Iterable[str] = SEGMENTS) -> np.ndarray:
+        return np.stack([outputs[form.format(name)] for name in names], axis=1)
+
     if counted:
-        counts = [outputs[f"n_detected_{name}"].sum(axis=1) for name in (*SEGMENTS, "shot")]
+        counts = [outputs[f"n_detected_{name}"].sum(axis=1) for name in every]
         pd = np.stack(counts, axis=1) / counted
         error = np.sqrt(np.maximum(pd * (1 - pd), 0.0) / counted)
         return nothing(len(pd))._replace(pd=pd, standard_error=error.max(axis=1))
-    pd = np.stack([outputs[name] for name in names], axis=1)
-    alarms = [outputs[f"log10_pfa_{name}"] for name in ("segment", "shot")]
-    magnitude = [np.sqrt(outputs[f"snr_{n}"] * outputs["noise_variance"]) for n in SEGMENTS]
-    errors = [outputs[f"{name}_error"] for name in names if f"{name}_error" in outputs]
+    pd, variance = of_each("pd_{}", every), outputs["noise_variance"]
+    errors = [outputs[f"pd_{name}_error"] for name in every if f"pd_{name}_error" in outputs]
     return Seen(
         pd,
-        np.stack(alarms, axis=1),
-        np.stack([outputs[f"p_leakage_{name}"] for name in ("up", "down")], axis=1),
-        np.stack(magnitude, axis=1),
+        of_each("log10_pfa_{}", ("segment", "shot")),
+        of_each("p_leakage_{}", ("up", "down")),
+        np.sqrt(of_each("snr_{}") * np.reshape(variance, (-1, 1))),
         np.fmax.reduce(errors) if errors else np.full(len(pd), np.nan),
-        np.sqrt(outputs["noise_variance"] / 2),
+        np.sqrt(variance / 2),
         outputs["beamlets"],
     )
 
@@ -179,115 +126,351 @@ def nothing(points: int) -> Seen:
     return Seen(*(np.full(size, np.nan) for size in sizes))
 
 
-class GridBench(Bench):
-    """A sample of the points of a grid, spread evenly, or of these numbers."""
+class Trial(NamedTuple):
+    """A rung tried on some points."""
 
-    least_parts = 2
+    seen: Seen
+    seconds: float
+    """Processor time of a point, planning included: what others use of the machine is no part."""
+    planning: float  # a point
 
-    def __init__(self, spec: Spec, points: int, numbers: np.ndarray | None = None) -> None:
-        super().__init__()
-        self.spec = spec
-        self._grid = Grid(spec)
-        self._numbers = spread(self._grid.shape, points) if numbers is None else numbers
-        self._calling: dict[str, EffectSelection] = {}
-        self._block_points = math.prod(self._grid.block_shape)
-        self.size, self.whole = len(self._numbers), self._grid.points
-        self.most_times = min(MOST_TIMES, self._block_points)
 
+def together(trials: Sequence[Trial]) -> Trial:
+    """Trials of a rung on several parts of a sample as one."""
+    share = np.array([trial.seen.sigma.size for trial in trials], float)
+    share /= share.sum()
+    return Trial(
+        Seen(*map(np.concatenate, zip(*(trial.seen for trial in trials), strict=True))),
+        float(share @ [trial.seconds for trial in trials]),
+        float(share @ [trial.planning for trial in trials]),
+    )
+
+
+class Bench(ABC):
+    """A sample of a study's points."""
+
+    unit = "points"
+    spec: Declared
+    study: Callable[[Rung], Any]  # the study with a rung's settings
+    numbers: np.ndarray  # (size,): of the sample's points, by which they are computed
+    whole: int  # points of the study, each computed once: draws of a flight are none of their own
+    most_times: int  # points of the longest stretch that may be timed
+
+    @property
+    def size(self) -> int:
+        """Points of the sample."""
+        return self.numbers.size
+
+    @abstractmethod
     def parts(self, points: int) -> list[np.ndarray]:
         """Return the sample in parts of about so many points."""
-        return np.array_split(np.arange(self.size), max(1, round(self.size / points)))
 
+    @abstractmethod
     def try_on(self, rung: Rung, part: np.ndarray, times: int) -> Trial:
-        """Compute a rung on a part of the sample, timed on so many points or on the part.
+        """Compute a rung on a part of the sample, timed on so many points or on the part."""
 
-        Points are timed with those that the block computes next, which share intermediate
-        results.
-        """
-        numbers = self._numbers[part]
-        outputs, spent, planning = self._run(rung, numbers)
-        timed = len(part)
-        if times > 1:
-            some = numbers[:: -(-len(part) // PLACES)].tolist()
-            stretches = np.concatenate([self._beside(rung, number, times) for number in some])
-            # As many points together as a block has: what a call costs is shared by these alone.
-            together = np.array_split(stretches, -(-stretches.size // self._block_points))
-            runs = [self._run(rung, each)[1:] for each in together]
-            spent, planning = (sum(each) for each in zip(*runs, strict=True))
-            timed, planning = stretches.size, planning / len(runs)
-        planning = planning if rung.plans else 0.0
-        draws = int(self._selection_of(rung).tiles.grid.spec.draws.number)
-        seen = seen_in(outputs, draws if rung.counts else 0)
-        return Trial(seen, spent / timed + planning, planning)
+    @abstractmethod
+    def coordinates(self) -> Coordinates:
+        """Return what tells the points of the sample apart."""
+
+    def effects(self, rung: Rung) -> frozenset[str]:
+        """Effects that a rung simulates anywhere in the sample."""
+        parts = (self.numbers[part] for part in self.parts(self.size))
+        flags = [np.bitwise_or.reduce(self._planned(rung, numbers)[0]) for numbers in parts]
+        return frozenset(names_of(int(np.bitwise_or.reduce(flags))))
 
     def truth(self, rung: Rung, place: int) -> tuple[Seen, Seen]:
         """Compute a point in the time domain, and with the rung's effects that the truth has."""
-        lacking = NOT_IN_TRUTH | {effect.name for effect in EFFECTS if effect.is_random}
-        number = self._numbers[[place]]
-        flags, _ = self._planned(rung, number)
-        effects = [n for n in names_of(int(flags[0])) if n not in lacking]
-        parameters = self._selection_of(rung).tiles.grid.parameters_at(number)
+        number = self.numbers[[place]]
+        flags = self._planned(rung, number)[0] & IN_TRUTH
         # Records walk by themselves, whatever effects are named.
-        in_time = shot.evaluate(parameters, effects, look=truth.find)
-        return seen_in(in_time), seen_in(shot.evaluate(parameters, effects))
+        in_time, ordinary = (
+            self._seen(rung, 1, self._computed(rung, number, flags, look))
+            for look in (truth.find, shot.find)
+        )
+        return in_time, ordinary
 
-    def coordinates(self) -> dict[str, tuple[np.ndarray, dict[str, Any]]]:
-        """Return the number of each point in C order, and its place along each axis."""
-        found = {"number": (self._numbers, {"long_name": "number of the point of the study"})}
-        index = np.unravel_index(self._numbers, self._grid.shape) if self._grid.shape else ()
-        return found | along_axes(self.spec.axes, index)
+    def forget(self) -> None:  # noqa: B027
+        """Drop what trials of one part share; its time counts for each of them."""
 
-    def _flags(self, rung: Rung) -> np.ndarray:
-        return self._planned(rung, self._numbers)[0]
+    @abstractmethod
+    def _planned(self, rung: Rung, numbers: np.ndarray) -> tuple[np.ndarray, float]:
+        """Return flags of points (n,), and the time that planning takes one, its share."""
 
-    def _selection_of(self, rung: Rung) -> EffectSelection:
-        if rung.name not in self._calling:
-            spec = rung.of(self.spec)
-            self._calling[rung.name] = EffectSelection(spec, Grid(spec))  # type: ignore[arg-type]
-        return self._calling[rung.name]
+    @abstractmethod
+    def _computed(
+        self, rung: Rung, numbers: np.ndarray, flags: np.ndarray, look: Look | None
+    ) -> Iterator[tuple[np.ndarray, Results]]:
+        """Places of some of the points, and their outputs; a ``look`` finds peaks in its way."""
 
-    def _run(self, rung: Rung, numbers: np.ndarray) -> tuple[dict[str, np.ndarray], float, float]:
-        """Compute points: outputs, the time of all, and that of planning one of them."""
-        grid = self._selection_of(rung).tiles.grid
+    @cached_property
+    def _of_lines(self) -> np.uint32:
+        """Flags of the study's effects that the thesis's way can have."""
+        return _flags(self.effects(AS_WRITTEN)) & OF_LINES
+
+    def _run(self, rung: Rung, numbers: np.ndarray) -> Trial:
+        """Plan and compute points."""
         flags, planning = self._planned(rung, numbers)
-        selected = Selected(flags, np.zeros(flags.size)).groups()
-        outputs: dict[str, np.ndarray] = {}
-        spent = 0.0
-        for members, effects in (
-            [(np.arange(len(flags)), self.of_lines())] if rung.of_lines else selected
-        ):
-            parameters = grid.parameters_at(numbers[members])
-            begun = thread_time()
-            if rung.thesis:
-                found = shot.evaluate(parameters, effects, look=look_of(rung))
+        look = partial(find_on_grid, **rung.thesis) if rung.thesis else None
+        begun = thread_time()
+        found = list(self._computed(rung, numbers, flags, look))
+        spent = thread_time() - begun
+        seen = self._seen(rung, numbers.size, found)
+        return Trial(seen, spent / numbers.size + planning, planning)
+
+    def _seen(self, rung: Rung, size: int, found: Iterable[tuple[np.ndarray, Results]]) -> Seen:
+        """Results of points in their places."""
+        counted = int(self.study(rung).spec.draws.number) if rung.counts else 0
+        seen = nothing(size)
+        for places, outputs in found:
+            for values, some in zip(seen, seen_in(outputs, counted), strict=True):
+                values[places] = some
+        return seen
+
+
+def spread(shape: tuple[int, ...], number: int) -> np.ndarray:
+    """Numbers of points of a grid, in C order, spread evenly along every axis by Halton's sequence.
+
+    Any first part of them is spread as well, so that a part of the sample stands for all.
+    """
+    total = math.prod(shape)
+    if not shape or total <= 1:
+        return np.zeros(min(total, number), np.int64)
+    # The sequence's first point is the grid's corner.
+    points = qmc.Halton(len(shape), scramble=False).random(128 * number + 1)[1:]
+    index = np.floor(points * shape).astype(np.int64)
+    found = dict.fromkeys(np.ravel_multi_index(tuple(index.T), shape).tolist())
+    found |= dict.fromkeys(range(min(total, 2 * number)))  # some of small grids are never met
+    return np.fromiter(found, np.int64)[:number]
+
+
+def along_axes(axes: tuple[Axis, ...], index: tuple[np.ndarray, ...]) -> Coordinates:
+    """Coordinates of points, by their places along each axis."""
+    found: Coordinates = {}
+    for axis, along in zip(axes, index, strict=True):
+        for member in axis.members:
+            name = member.path.replace(".", "_") if member.name in TAKEN else member.name
+            about = {"units": member.units, "path": member.path}
+            found[name] = np.asarray(member.display)[along], about
+    return found
+
+
+class GridBench(Bench):
+    """A sample of the points of a grid, spread evenly, or of these numbers.
+
+    Points are timed with those that the block computes next, which share intermediate results.
+    """
+
+    def __init__(self, spec: Spec, points: int, numbers: np.ndarray | None = None) -> None:
+        self.spec = spec
+        self.study = cache(lambda rung: GridStudy(rung.of(spec)))
+        self._grid: Grid = self.study(AS_WRITTEN).grid
+        self.numbers = spread(self._grid.shape, points) if numbers is None else numbers
+        self.whole = self._grid.points
+        self._block_points = math.prod(self._grid.block_shape)
+        self.most_times = min(MOST_TIMES, self._block_points)
+
+    def parts(self, points: int) -> list[np.ndarray]:
+        """Parts of the sample, each spread as evenly as all of it."""
+        return np.array_split(np.arange(self.size), max(1, round(self.size / points)))
+
+    def try_on(self, rung: Rung, part: np.ndarray, times: int) -> Trial:
+        """Compute the part by itself; its time is that of more points of the same blocks."""
+        numbers = self.numbers[part]
+        trial = self._run(rung, numbers)
+        if times == 1:
+            return trial
+        some = numbers[:: -(-part.size // PLACES)].tolist()
+        stretches = np.concatenate([self._beside(rung, number, times) for number in some])
+        # As many points together as a block has: what a call costs is shared by these alone.
+        blocks = np.array_split(stretches, -(-stretches.size // self._block_points))
+        return together([self._run(rung, block) for block in blocks])._replace(seen=trial.seen)
+
+    def coordinates(self) -> Coordinates:
+        """Return the number of each point in C order, and its place along each axis."""
+        index = np.unravel_index(self.numbers, self._grid.shape) if self._grid.shape else ()
+        number = self.numbers, {"long_name": "number of the point of the study"}
+        return {"number": number} | along_axes(self.spec.axes, index)
+
+    def _planned(self, rung: Rung, numbers: np.ndarray) -> tuple[np.ndarray, float]:
+        if rung.of_lines:
+            return np.full(numbers.size, self._of_lines), 0.0
+        selection = self.study(rung).selection
+        met, where = np.unique(selection.tiles.locate(numbers)[0], return_inverse=True)
+        flags = np.empty(met.size, np.uint32)
+        begun = thread_time()
+        for chosen, plan in selection.plans(met):
+            flags[chosen] = flags_of(plan.kept)
+        spent = thread_time() - begun if rung.plans else 0.0
+        return flags[where], spent / sum(map(selection.tiles.block_size, met.tolist()))
+
+    def _computed(
+        self, rung: Rung, numbers: np.ndarray, flags: np.ndarray, look: Look | None
+    ) -> Iterator[tuple[np.ndarray, Results]]:
+        study = self.study(rung)
+        for places, effects in Selected(flags, np.zeros(flags.size)).groups():
+            parameters = study.grid.parameters_at(numbers[places])
+            if look is None:
+                yield places, evaluate_points(study.spec, parameters, places.size, effects)
             else:
-                found = evaluate_points(grid.spec, parameters, len(members), effects)
-            spent += thread_time() - begun
-            for name, values in found.items():
-                room = (len(numbers), *values.shape[1:])
-                outputs.setdefault(name, np.empty(room, values.dtype))[members] = values
-        return outputs, spent, planning
+                yield places, shot.evaluate(parameters, effects, look=look)
 
     def _beside(self, rung: Rung, number: int, times: int) -> np.ndarray:
         """Return a point and those that its block computes after it, round the block's end."""
-        grid = self._selection_of(rung).tiles.grid
+        grid = self.study(rung).grid
         (block,), (own,) = (each.tolist() for each in grid.locate(np.array([number])))
         order = grid.geometry_order(block)
         follows = np.flatnonzero(order == own) + np.arange(times)
         return grid.numbers(block, order.take(follows, mode="wrap"))
 
+
+class FlightBench(Bench):
+    """A sample of the shots of a flight: whole tiles, as effects are planned in them.
+
+    The time counts rays, plans, spectra and probabilities; draws, points and navigation cost
+    the same whatever the accuracy. Shots are computed by their places in the sample.
+    """
+
+    unit = "shots"
+
+    def __init__(self, spec: SceneSpec, points: int) -> None:
+        self.spec = spec
+        self.study = cache(self._study)
+        self._cast: dict[tuple[str, bytes], tuple[Eyepoints, float]] = {}
+        # What costs the same for any number of shots, as planning mostly does, a block shares.
+        self.most_times = max(int(spec.storage.block_shots), TILE_SHOTS)
+        self._parts, shots = zip(*self._sample(points), strict=True)
+        self._shots = np.concatenate(shots)
+        self._part = np.repeat(np.arange(len(shots)), [each.size for each in shots])
+        self.numbers = np.arange(self._shots.size)
+        self.whole = sum(each.points // each.draws for each in self.study(AS_WRITTEN).grids)
+
+    def parts(self, points: int) -> list[np.ndarray]:
+        """Whole tiles of one scanner at a place along the axes, from all of these in turn."""
+        number, found = max(1, round(points / TILE_SHOTS)), []
+        for own in (np.flatnonzero(self._part == k) for k in range(len(self._parts))):
+            tile = self._shots[own] // TILE_SHOTS
+            tiles = np.unique(tile)
+            cut = np.array_split(tiles, -(-tiles.size // number))
+            found.append([own[np.isin(tile, some)] for some in cut])
+        return [part for turn in zip_longest(*found) for part in turn if part is not None]
+
+    def try_on(self, rung: Rung, part: np.ndarray, times: int) -> Trial:
+        """Compute the part and neighbouring tiles of so many shots, timed with their rays."""
+        numbers = self.around(part, times)
+        trial = self._run(rung, numbers)
+        own = np.searchsorted(numbers, part)
+        _, casting = self._see(rung, *self.shots(numbers))
+        seen = Seen(*(values[own] for values in trial.seen))
+        return Trial(seen, trial.seconds + casting / numbers.size, trial.planning)
+
+    def coordinates(self) -> Coordinates:
+        """Scanner and number of each shot, and its place along the axes."""
+        index = np.reshape([part.axes for part in self._parts], (len(self._parts), -1))
+        scanners = np.array([part.scanner for part in self._parts], object)
+        return {
+            "scanner": (scanners[self._part], {"long_name": "scanner"}),
+            "shot": (self._shots, {"long_name": "number of the shot"}),
+        } | along_axes(self.spec.axes, tuple(index[self._part].T))
+
+    def forget(self) -> None:
+        """Drop the rays that rungs of the same geometry share."""
+        self._cast.clear()
+
+    def around(self, numbers: np.ndarray, times: int) -> np.ndarray:
+        """Whole tiles of some of the sample, and so many shots with those that follow."""
+        own = np.flatnonzero(self._part == self._part[numbers[0]])
+        return own[whole_tiles(self._shots[own] // TILE_SHOTS, numbers - own[0], times)]
+
+    def shots(self, numbers: np.ndarray) -> tuple[Part, np.ndarray]:
+        """Scanner and place along the axes of some of the sample, and their numbers there."""
+        return self._parts[self._part[numbers[0]]], self._shots[numbers]
+
     def _planned(self, rung: Rung, numbers: np.ndarray) -> tuple[np.ndarray, float]:
-        """Return flags of points (n,), and the time that planning takes one, its share."""
-        tiles = self._selection_of(rung).tiles
-        own, _ = tiles.locate(numbers)
-        met, where = np.unique(own, return_inverse=True)
-        flags = np.empty(len(met), np.uint32)
+        tiles = self.around(numbers, 1)
+        part, shots = self.shots(tiles)
+        eyepoints, _ = self._see(rung, part, shots)
         begun = thread_time()
-        for chosen, plan in self._selection_of(rung).plans(met):
-            flags[chosen] = flags_of(plan.kept)
-        spent = thread_time() - begun
-        served = sum(tiles.block_size(int(tile)) for tile in met)
-        return flags[where], spent / served
+        if rung.of_lines:
+            flags = np.where(eyepoints.seen, self._of_lines, 0)
+        else:
+            flags = self.study(rung).select(part, eyepoints, shots).flags
+        spent = thread_time() - begun if rung.plans else 0.0
+        return flags[np.searchsorted(tiles, numbers)], spent / tiles.size
+
+    def _computed(
+        self, rung: Rung, numbers: np.ndarray, flags: np.ndarray, look: Look | None
+    ) -> Iterator[tuple[np.ndarray, Results]]:
+        study, (part, shots) = self.study(rung), self.shots(numbers)
+        eyepoints, _ = self._see(rung, part, shots)
+        selected, rows = Selected(flags, np.zeros(flags.size)), np.flatnonzero(eyepoints.seen)
+        cloud = partial(_statistics, study, part, look or shot.find)
+        yield from study.clouds(part.scanner, eyepoints, selected, shots, rows, cloud)
+
+    def _sample(self, points: int) -> Iterator[tuple[Part, np.ndarray]]:
+        """Scanners at places along the axes, and shots of each, spread over the flight."""
+        study = self.study(AS_WRITTEN)
+        for scanner, blocks in study.scanners.items():
+            places = spread(blocks.axes, FLIGHT_PLACES)
+            wanted = math.ceil(points / TILE_SHOTS / len(study.scanners) / len(places))
+            shots = study.caster(scanner).spread(max(self.most_times // TILE_SHOTS, wanted))
+            for place in places:
+                axes = np.unravel_index(place, blocks.axes) if blocks.axes else ()
+                yield blocks.first_part(tuple(map(int, axes))), shots
+
+    def _study(self, rung: Rung) -> FlightStudy:
+        spec: Any = rung.of(self.spec)
+        # in a world that all share, as building one can take seconds
+        study = FlightStudy(spec, Path("nowhere.zarr"), world_of(self.spec))
+        if rung.rays_error:
+            study.rays_accuracy = Accuracy(rung.rays_error, least_rays_tolerance=0.0)
+        return study
+
+    def _see(self, rung: Rung, part: Part, shots: np.ndarray) -> tuple[Eyepoints, float]:
+        """Eyepoints of shots, cast once for rungs of a geometry, and the time that it took [s]."""
+        caster = self.study(rung).caster(part.scanner)
+        which_shots = caster.id, shots.tobytes()
+        if which_shots not in self._cast:
+            begun = thread_time()
+            eyepoints = from_arrays(caster.cast(shots), caster.weight)
+            self._cast[which_shots] = eyepoints, thread_time() - begun
+        return self._cast[which_shots]
+
+
+def whole_tiles(tile: np.ndarray, rows: np.ndarray, number: int) -> np.ndarray:
+    """Rows of the whole tiles of so many shots: those of some and what follows, round the end.
+
+    ``tile`` (n,) has the number of each row's tile, rising.
+    """
+    tiles, counts = np.unique(tile, return_counts=True)
+    own = np.unique(tile[rows])
+    order = np.roll(np.arange(tiles.size), -int(np.searchsorted(tiles, own[0])))
+    enough = int(np.searchsorted(np.cumsum(counts[order]), number)) + 1
+    return np.flatnonzero(np.isin(tile, [*own, *tiles[order[:enough]]]))
+
+
+def _statistics(
+    study: FlightStudy,
+    part: Part,
+    look: Look,
+    effects: tuple[str, ...],
+    eyepoints: Eyepoints,
+    numbers: np.ndarray,
+    flags: np.ndarray,
+) -> Results:
+    """Statistics of shots by a way to look at their spectra; nan of those that see nothing."""
+    there, rays = eyepoints.seen.nonzero()[0], eyepoints.weight.size
+    given, ground = seen_ground(eyepoints.some(there), study.parameters_at(part), study.surfaces)
+    shots = shot.prepare_cast(given, ground, effects, flags[there])
+    found = look(shots)
+    results = shot.statistics(shots, found) | {"beamlets": np.full(shots.size, rays)}
+    if study.rays_accuracy is not None:
+        bins = found[:, 3].T * (shots.fft_size / shots.sample_rate[:, None])
+        results["beamlets_error"] = ray_error(shots, ground.beamlets, bins, found[:, 2].T)
+    whole = {name: np.full(numbers.size, np.nan) for name in results}
+    for name, values in results.items():
+        whole[name][there] = values
+    return whole
 
 
 CELLS = 16
@@ -314,20 +497,18 @@ def find_on_grid(
     alone. There is no leakage.
     """
     found = np.full((3, 6, shots.size), np.nan)
-    table, sizes = shots.point_table(), grid_sizes(shots, size)
-    for cells in np.unique(sizes):
-        for segment in np.flatnonzero(shots.segments):
-            members = np.flatnonzero(sizes == cells)
-            for index in np.split(members, range(_ROWS, members.size, _ROWS)):
-                low, magnitude = magnitudes(
-                    shots, table, index, int(segment), int(cells), (degree, real, folded)
-                )
-                out = np.empty((6, index.size))
-                bins = shots.fft_size // 2, 1.0 / shots.fft_size
-                levels = table[13, index], table[11, index]
-                detect_rows(magnitude, low, bins, shots.echo_rule, *levels, out)
-                out[3] *= table[6, index]
-                found[segment][:, index] = out
+    table, sizes, how = shots.point_table(), grid_sizes(shots, size), (degree, real, folded)
+    bins = shots.fft_size // 2, 1.0 / shots.fft_size
+    segments = np.flatnonzero(shots.segments).tolist()
+    for cells, segment in product(np.unique(sizes).tolist(), segments):
+        members = np.flatnonzero(sizes == cells)
+        for index in np.split(members, range(_ROWS, members.size, _ROWS)):
+            low, magnitude = magnitudes(shots, table, index, segment, cells, how)
+            out = np.empty((6, index.size))
+            levels = table[13, index], table[11, index]
+            detect_rows(magnitude, low, bins, shots.echo_rule, *levels, out)
+            out[3] *= table[6, index]
+            found[segment][:, index] = out
     return found
 
 
@@ -359,39 +540,35 @@ def magnitudes(
     power, length = shots.incoherent, shots.window.length
     real = real and power
     grid = np.zeros((index.size, cells), float if real else complex)
-    origin = np.empty(index.size, np.int64)
+    origin, node = np.empty(index.size, np.int64), np.arange(degree + 1.0)
     _deposit(
         np.ascontiguousarray(table[:, index]), shots.row[index], shots.footprint, segment,
-        np.array([shots.fft_size, length, 0, 0, power, 0]), shots.image, _weights(degree), origin,
+        np.array([shots.fft_size, length, 0, 0, power, 0]), shots.image,
+        np.array([1 / np.prod(np.delete(own - node, j)) for j, own in enumerate(node)]), origin,
         grid.view(float).reshape(index.size, cells, -1),
     )  # fmt: skip
     kernel = _kernel(shots.window.name, length, shots.fft_size, cells, power, real)
-    convolved = (_real_bins if real else _complex_bins)(grid, kernel, folded)
+    convolved = _convolved(grid, kernel, real, folded)
     # Rounding takes a sum of squares that is all but nothing below it.
     magnitude = np.sqrt(np.maximum(convolved.real, 0.0)) if power else np.abs(convolved)
     return origin - cells // (2 * CELLS), magnitude
 
 
-def _complex_bins(grid: np.ndarray, kernel: np.ndarray, folded: bool) -> np.ndarray:
-    """Return the convolution of amplitudes at every sixteenth cell."""
-    transform = fft.fft(grid, axis=1, overwrite_x=True)
+def _convolved(grid: np.ndarray, kernel: np.ndarray, real: bool, folded: bool) -> np.ndarray:
+    """Return the convolution of powers or amplitudes, (rows, cells), at every sixteenth cell."""
+    bins = grid.shape[1] // CELLS
+    forth, back = (fft.rfft, fft.irfft) if real else (fft.fft, fft.ifft)
+    transform = forth(grid, axis=1, overwrite_x=True)
     transform *= kernel
     if not folded:
-        return np.asarray(fft.ifft(transform, axis=1, overwrite_x=True)[:, ::CELLS])
-    transform = transform.reshape(len(grid), CELLS, -1).sum(axis=1)
-    return np.asarray(fft.ifft(transform, axis=1, overwrite_x=True)) / CELLS
-
-
-def _real_bins(grid: np.ndarray, kernel: np.ndarray, folded: bool) -> np.ndarray:
-    """Convolve powers, by half of their transforms."""
-    half = fft.rfft(grid, axis=1)
-    half *= kernel
-    if not folded:
-        return np.asarray(fft.irfft(half, grid.shape[1], axis=1, overwrite_x=True)[:, ::CELLS])
-    rows, bins = len(grid), grid.shape[1] // CELLS
-    above = half[:, :-1].reshape(rows, CELLS // 2, bins)[:, :, : bins // 2 + 1].sum(axis=1)
-    below = half[:, 1:].reshape(rows, CELLS // 2, bins)[:, :, : bins // 2 - 2 : -1].sum(axis=1)
-    return np.asarray(fft.irfft(above + below.conj(), bins, axis=1)) / CELLS
+        return np.asarray(back(transform, grid.shape[1], axis=1, overwrite_x=True)[:, ::CELLS])
+    if real:  # the upper half is the lower one's conjugate
+        above = transform[:, :-1].reshape(-1, CELLS // 2, bins)[:, :, : bins // 2 + 1]
+        below = transform[:, 1:].reshape(-1, CELLS // 2, bins)[:, :, : bins // 2 - 2 : -1]
+        transform = above.sum(axis=1) + below.sum(axis=1).conj()
+    else:
+        transform = transform.reshape(-1, CELLS, bins).sum(axis=1)
+    return np.asarray(back(transform, bins, axis=1, overwrite_x=True)) / CELLS
 
 
 @lru_cache(maxsize=32)
@@ -407,71 +584,45 @@ def _kernel(
     return np.asarray(fft.rfft(transform) if real else fft.fft(transform))
 
 
-def _weights(degree: int) -> np.ndarray:
-    """Barycentric weights of degree + 1 cells in a row."""
-    node = np.arange(degree + 1.0)
-    return np.array([1 / np.prod(np.delete(node[j] - node, j)) for j in range(node.size)])
-
-
-@njit(cache=True, error_model="numpy")
-def _lines(i, p, row, footprint, segment, sizes, room):
-    """Lines of one point's segment where they are seen, at 0 .. N/2; their origin."""
-    origin = place_lines(p[:, i].copy(), segment, footprint, row[i], sizes, room)
-    if origin < 0:
-        for b in range(footprint.shape[2]):
-            room[PLACE, b], room[IM, b] = -room[PLACE, b], -room[IM, b]
-    return abs(origin)
-
-
-@njit(cache=True, error_model="numpy")
-def _image(origin, delta, re, im, sizes, centre):
-    """Cell and weight of a line's image about DC or Nyquist, whichever is nearer."""
-    place, sign = -2.0 * origin - delta, 1.0
-    if 4 * origin > sizes[0]:
-        place += sizes[0]
-        sign = -1.0 if sizes[1] & 1 else 1.0
-    return centre + CELLS * place, sign * re, -sign * im
-
-
 @njit(cache=True, error_model="numpy")
 def _deposit(p, row, footprint, segment, sizes, image, weights, origin, grid):
-    """Lines of m points, each shared out among as many cells of its grid, (m, cells, 2 or 1)."""
-    n, cells, power = footprint.shape[2], grid.shape[1], sizes[4] != 0
-    room = np.empty((BLOCK + 1, n))
-    delta, re, im = room[PLACE], room[RE], room[IM]
-    centre, share = cells // 2, np.empty(weights.size)
+    """Lines of m points, each shared out among as many cells of its grid, (m, cells, 2 or 1).
+
+    They are seen at 0 .. N/2, and their images about DC or Nyquist, whichever is nearer.
+    """
+    n, cells = footprint.shape[2], grid.shape[1]
+    count = 2 * n if image else n
+    room, share = np.empty((BLOCK + 1, count)), np.empty(weights.size)
     low, high = (-0.5, cells - 1.0) if weights.size == 1 else (5.0, cells - 6.0)
     for i in range(row.size):
-        origin[i] = _lines(i, p, row, footprint, segment, sizes, room)
+        first = place_lines(p[:, i].copy(), segment, footprint, row[i], sizes, room)
+        origin[i] = abs(first)
+        if first < 0:
+            for b in range(n):
+                room[PLACE, b], room[IM, b] = -room[PLACE, b], -room[IM, b]
+        if image:
+            add_images(room, n, origin[i], 1.0, sizes[4] != 0)
+            fold_lines(room[:, n:], n, sizes)
         for b in range(n):
-            _share_out(grid, i, centre + CELLS * delta[b], re[b], im[b], weights, share)
-            if image:
-                at, a, c = _image(origin[i], delta[b], re[b], im[b], sizes, centre)
+            for k in range(b, count, n):
+                at = cells // 2 + CELLS * room[PLACE, k]
                 if low < at < high:
-                    _share_out(grid, i, at, abs(a) if power else a, c, weights, share)
+                    _share_out(grid[i], at, room[RE, k], room[IM, k], weights, share)
 
 
 @njit(cache=True, error_model="numpy")
-def _share_out(grid, i, at, re, im, weights, share):
+def _share_out(cells, at, re, im, weights, share):
     """Add a line to the nearest cell, or to ten cells by Lagrange's polynomial."""
-    if weights.size == 1:
-        _add(grid, i, int(np.rint(at)), re, im)
-        return
-    first = int(np.floor(at)) - 4
-    t = at - first
-    total = 0.0
+    first = int(np.rint(at)) if weights.size == 1 else int(np.floor(at)) - 4
+    t, total = at - first, 0.0
     for j in range(weights.size):
-        if t == j:
-            _add(grid, i, first + j, re, im)
-            return
+        if t == j or weights.size == 1:
+            share[:] = 0.0
+            share[j] = total = 1.0
+            break
         share[j] = weights[j] / (t - j)
         total += share[j]
     for j in range(weights.size):
-        _add(grid, i, first + j, re * share[j] / total, im * share[j] / total)
-
-
-@njit(inline="always")
-def _add(grid, i, cell, re, im):
-    grid[i, cell, 0] += re
-    if grid.shape[2] > 1:
-        grid[i, cell, 1] += im
+        cells[first + j, 0] += re * share[j] / total
+        if cells.shape[1] > 1:
+            cells[first + j, 1] += im * share[j] / total

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 import time
-from collections.abc import Callable, Iterable
+import timeit
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from time import process_time
 from typing import Any
@@ -16,24 +19,20 @@ from sweep.spec import SceneSpec, Spec
 from sweep.storage import opening
 from sweep.storage.locations import Location, real
 from sweep.tasks import store
-from sweep.tasks.accuracy.bench import GridBench, Seen, Trial, spread
-from sweep.tasks.accuracy.flight_bench import FlightBench
+from sweep.tasks.accuracy.bench import Bench, FlightBench, GridBench, Seen, Trial, spread, together
 from sweep.tasks.accuracy.rungs import (
     ADAPTIVE,
     ALL_ON,
-    DRAWN,
     REFERENCE,
     THESIS,
-    Declared,
     Ladder,
     Rung,
     ladder,
+    with_fixed,
 )
 from sweep.tasks.progress import Interrupts, Progress, StoreError, TaskError, chosen, working
 from sweep.tasks.studies import ACCURACY, study_of
 from sweep.tasks.study import ArrayLayout, Study, described
-
-AnyBench = GridBench | FlightBench
 
 POINTS, TIME_LIMIT = 200, 60.0
 """Points of a sample; time that trying may take [s]."""
@@ -53,11 +52,8 @@ FIRST_TRIED = 8
 FIRST_ROUND, UNTIL_TRUTH = 0.6, 0.8
 """Shares of the time limit by which the first round, and then the truth, ends."""
 
-LEAST_IN_TRUTH = 3
-"""Points in the time domain, however long they take."""
-
-TRUTH_POINTS = 500
-"""Points in the time domain, at the most."""
+LEAST_IN_TRUTH, TRUTH_POINTS = 3, 500
+"""Points in the time domain, however long they take, and at the most."""
 
 TRUTH_BEAMLETS = 109
 """Beamlets in the time domain where accuracy decides on their number: each is a record."""
@@ -68,17 +64,8 @@ LONG = 1.0
 FIXED_AS_AT = (1e-1, 1e-3, 1e-6)
 """Tolerances whose effects are tried at every point alike."""
 
-
 TRIALS = 3
 """Of each part of storing; the first may import and open what the others find."""
-
-_ABOUT = {
-    "pd_error": "largest error of a probability of detection, of segments and shot",
-    "log10_pfa_error": "error of log10 of a probability of false alarm",
-    "leakage_error": "error of a probability of leakage, of the two chirps",
-    "magnitude_error": "error of the magnitude of the peak bins, over it or sigma if larger",
-    "standard_error": "standard error that the setting itself tells, where it draws",
-}
 
 
 def measure(
@@ -99,7 +86,7 @@ def measure(
     StoreError where a store is in the way or can't be written, TaskError where the study draws
     whole spectra, SceneError where a file of a scene is missing, changed or unfit.
     """
-    if getattr(spec.draws, "whole_spectra", False):
+    if spec.draws.whole_spectra:
         raise TaskError(
             "this study draws whole spectra, which have no settings to try: "
             "leave out draws.method, detector and estimator"
@@ -120,9 +107,9 @@ def measure(
             ).run()
         except Nothing:
             return False
-    stored = storing(study_of(spec, store_path))
+    measured.stored = storing(study_of(spec, store_path))
     _refuse_in_the_way(store_path, overwrite)  # it may hold something else by now
-    store.create(store_path, Content(spec, bench, measured, stored), replace=overwrite)
+    store.create(store_path, measured, replace=overwrite)
     return True
 
 
@@ -143,6 +130,7 @@ def storing(study: Study) -> float:
         name: np.zeros([s.stop - s.start for s in region], study.layouts[name].dtype)
         for name, region in study.regions(block).items()
     }
+    trials = partial(timeit.repeat, timer=process_time, repeat=TRIALS, number=1)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "study.zarr"
 
@@ -151,35 +139,9 @@ def storing(study: Study) -> float:
                 store.remove(path)
             store.create(path, study)
 
-        made = _least(make)
+        made = min(trials(make))
         arrays = store.Arrays(path, study)
-        return made + study.n_blocks * _least(lambda: arrays.write(block, results))
-
-
-def _least(work: Callable[[], object]) -> float:
-    """Least processor time of a work in some trials [s]."""
-    spent = []
-    for _ in range(TRIALS):
-        begun = process_time()
-        work()
-        spent.append(process_time() - begun)
-    return min(spent)
-
-
-@dataclass
-class Measured:
-    """Results of the trials, by rung and point of the sample."""
-
-    ladder: Ladder
-    seen: list[Seen]  # one a rung, (points, ...) each
-    done: np.ndarray  # places in the sample of the points that every rung was tried on
-    seconds: np.ndarray  # (rungs, rounds): a point, planning included
-    planning: np.ndarray  # (rungs, rounds): a point
-    times: np.ndarray  # (rungs,): points of a stretch that is timed
-    truth: dict[int, tuple[Seen, Seen]]
-    """By place in the sample: in the time domain, and as the reference has it."""
-    truth_beamlets: int  # of both, where their number is not the reference's; else 0
-    stopped: str  # Why the sample is not whole; empty where it is
+        return made + study.n_blocks * min(trials(partial(arrays.write, block, results)))
 
 
 class Nothing(Exception):
@@ -194,11 +156,10 @@ class Measurement:
     """
 
     def __init__(
-        self, bench: AnyBench, *, time_limit: float, told: Progress, interrupts: Interrupts
+        self, bench: Bench, *, time_limit: float, told: Progress, interrupts: Interrupts
     ) -> None:
         self._bench, self._limit = bench, time_limit
         self._told, self._interrupts = told, interrupts
-        self._begun = time.monotonic()
         self._ladder = completed(ladder(bench.spec), bench)
         self._rungs = self._ladder.rungs
         self._times = np.ones(len(self._rungs), np.int64)
@@ -207,61 +168,46 @@ class Measurement:
 
     def run(self) -> Measured:
         """All rounds that the time allows; Nothing where no point was through before the end."""
-        self._told.say(
-            f"trying {len(self._rungs)} settings on {self._bench.size:,} {self._bench.unit}"
-        )
+        number = len(self._rungs)
+        self._told.say(f"trying {number} settings on {self._bench.size:,} {self._bench.unit}")
         with working("looking how long settings take", self._told):
-            self._compile()
             parts = self._bench.parts(self._part_points())
             rounds = self._planned_rounds(parts)
-        self._told.begin(points=len(self._rungs) * len(parts) * rounds, done=0, unit="trials")
+        self._told.begin(points=number * len(parts) * rounds, done=0, unit="trials")
         try:
             return self._rounds(parts, rounds)
         finally:
             self._told.end()
 
     def _rounds(self, parts: list[np.ndarray], rounds: int) -> Measured:
-        first = self._round(parts, until=FIRST_ROUND)
+        first, stopped = self._round(parts, until=FIRST_ROUND), ""
         if not first:
             raise Nothing
-        stopped = "interrupted" if self._interrupts.stopping else "time limit"
-        stopped = stopped if len(first) < len(parts) else ""
+        if len(first) < len(parts):
+            stopped = "interrupted" if self._interrupts.stopping else "time limit"
         parts = parts[: len(first)]
         places = np.concatenate(parts)
         truth, beamlets = self._truth(places)
-        done = [together(parts, first)]
-        for _ in range(rounds - 1):
-            again = self._round(parts, until=1.0, first=first)
-            if len(again) < len(parts):
-                break
-            done.append(together(parts, again))
-        seconds, planning = (
-            np.array([[getattr(trial, name) for trial in trials] for trials in done]).T
-            for name in ("seconds", "planning")
-        )
+        found = [first]
+        while len(found) < rounds and len(found[-1]) == len(parts):
+            found.append(self._round(parts, until=1.0, first=first))
+        whole = [each for each in found if len(each) == len(parts)]
+        trials = [[together(each) for each in zip(*parts, strict=True)] for parts in whole]
         return Measured(
-            ladder=self._ladder, seen=[trial.seen for trial in done[0]], done=places,
-            seconds=seconds, planning=planning, times=self._times, truth=truth,
-            truth_beamlets=beamlets, stopped=stopped,
-        )  # fmt: skip
+            self._bench, self._ladder, places, trials, self._times, truth, beamlets, stopped
+        )
 
     def _part_points(self) -> int:
         """Points of a part: a few parts, and more where a point takes its time."""
-        first, least = self._bench.parts(1)[0], self._bench.least_parts
-        spent = sum(self._timed(i, first) for i in range(len(self._rungs)))
-        left = FIRST_ROUND * self._limit - (time.monotonic() - self._begun)
-        fitting = left * len(first) / spent
-        # One part more, on which all are tried before the first round.
-        return max(1, min(self._bench.size // least, int(fitting / (least + 1))))
-
-    def _compile(self) -> None:
-        """Compile what rungs compile, on those that are not long runs; it is not counted."""
-        first, numbers = self._bench.parts(1)[0], [r.overrides.get(DRAWN) for r in self._rungs]
-        few = min((number for number in numbers if number is not None), default=None)
-        for i, number in enumerate(numbers):
-            if number == few:
-                self._timed(i, first)
+        every, first = range(len(self._rungs)), self._bench.parts(1)[0]
+        for rung in every:  # compiles what it compiles, which is not counted
+            self._timed(rung, first)
         self._begun = time.monotonic()
+        spent = sum(self._timed(rung, first) for rung in every)
+        fitting = (FIRST_ROUND * self._limit - self._elapsed) * len(first) / spent
+        # Whole parts are kept where it is broken off. On one more all are tried before.
+        least = max(2, len(self._bench.parts(self._bench.size)))
+        return max(1, min(self._bench.size // least, int(fitting / (least + 1))))
 
     def _planned_rounds(self, parts: list[np.ndarray]) -> int:
         """Return the rounds that fit in; set the points of a stretch that times each rung well."""
@@ -273,15 +219,18 @@ class Measurement:
         self._times[:] = shorter
         took = np.array([self._timed(i, parts[0]) for i in range(len(self._rungs))])
         fitting = TOO_LONG * enough * shorter / took
-        cut = np.exp2(np.floor(np.log2(fitting))).clip(1, times)
-        self._times[:] = cut
-        spent = took * cut / shorter
+        self._times[:] = np.exp2(np.floor(np.log2(fitting))).clip(1, times)
+        spent = took * self._times / shorter
         self._once = spent > LONG
-        left = 0.75 * (self._limit - (time.monotonic() - self._begun)) / len(parts)
+        left = 0.75 * (self._limit - self._elapsed) / len(parts)
         after_truth = (1 - UNTIL_TRUTH) * self._limit / len(parts)
         again = max(float(spent[~self._once].sum()), 1e-9)
         further = max(left - float(spent.sum()), after_truth) / again
         return 1 + max(0, min(MOST_ROUNDS - 1, int(further)))
+
+    @property
+    def _elapsed(self) -> float:
+        return time.monotonic() - self._begun
 
     def _timed(self, rung: int, part: np.ndarray) -> float:
         begun = time.monotonic()
@@ -300,7 +249,7 @@ class Measurement:
         """Every rung on every part that there is time for; long ones only in the first round."""
         done: list[list[Trial]] = []
         for part in parts:
-            if done and time.monotonic() - self._begun > until * self._limit:
+            if done and self._elapsed > until * self._limit:
                 break
             trials = {}
             for rung in self._orders.permutation(len(self._rungs)).tolist():
@@ -315,57 +264,49 @@ class Measurement:
             done.append([trials[rung] for rung in range(len(self._rungs))])
         return done
 
-    def _truth(self, places: np.ndarray) -> tuple[dict[int, tuple[Seen, Seen]], int]:
-        """Compute some of these points in the time domain, as time allows; their beamlets."""
+    def _truth(self, places: np.ndarray) -> tuple[dict[int, np.ndarray], int]:
+        """Hold the reference at some points against the time domain, as time allows.
+
+        Their differences, as of :func:`apart`, and the beamlets of both.
+        """
         rung, number = self._ladder.reference, "footprint.beamlets"
-        found: dict[int, tuple[Seen, Seen]] = {}
+        found: dict[int, np.ndarray] = {}
         beamlets = TRUTH_BEAMLETS if number in rung.overrides else 0
         if beamlets:
             overrides = {**rung.overrides, number: beamlets}
             rung = replace(rung, name="in time", overrides=overrides, rays_error=0.0)
         for place in places[spread(places.shape, TRUTH_POINTS)].tolist():
-            late = time.monotonic() - self._begun > UNTIL_TRUTH * self._limit
+            late = self._elapsed > UNTIL_TRUTH * self._limit
             if self._interrupts.stopping or (late and len(found) >= LEAST_IN_TRUTH):
                 break
             in_time, reference = self._bench.truth(rung, place)
             if np.isfinite(in_time.pd).any():
-                found[place] = in_time, reference
+                found[place] = np.concatenate(apart(in_time, reference))
         self._bench.forget()
         return found, beamlets
 
 
-def completed(rungs: Ladder, bench: AnyBench, tolerances: Iterable[float] = ()) -> Ladder:
+def completed(rungs: Ladder, bench: Bench, tolerances: Iterable[float] = ()) -> Ladder:
     """Return the ladder, with the effects of each tolerance fixed at every point."""
     if not any(rung.kind == ALL_ON for rung in rungs.rungs):
         return rungs  # of draws
     at = {tolerance_of(rung): rung for rung in rungs.rungs if rung.kind == ADAPTIVE}
     sets = {t: bench.effects(at[t]) for t in FIXED_AS_AT if t in at}
     bench.forget()
-    return rungs.with_fixed(sets, tolerances)
+    return with_fixed(rungs, bench.spec, sets, tolerances)
 
 
-def together(parts: list[np.ndarray], trials: list[list[Trial]]) -> list[Trial]:
-    """Trials of rungs on the parts of a sample, each as one."""
-    share = np.array([len(part) for part in parts]) / sum(map(len, parts))
-    return [
-        Trial(
-            Seen(*map(np.concatenate, zip(*(t.seen for t in each), strict=True))),
-            float(share @ [t.seconds for t in each]),
-            float(share @ [t.planning for t in each]),
-        )
-        for each in zip(*trials, strict=True)
-    ]
+ERRORS = {
+    "pd_error": "largest error of a probability of detection, of segments and shot",
+    "log10_pfa_error": "error of log10 of a probability of false alarm",
+    "magnitude_error": "error of the magnitude of the peak bins, over it or sigma if larger",
+    "leakage_error": "error of a probability of leakage, of the two chirps",
+    "standard_error": "standard error that the setting itself tells, where it draws",
+}
+"""Arrays by rung and point, and what they are; the first four are in the order of :func:`apart`."""
 
-
-ERRORS = ("pd_error", "log10_pfa_error", "magnitude_error", "leakage_error")
 PROMISED = 3
 """The first of these, which a tolerance promises to bound."""
-
-
-def differences(measured: Measured) -> dict[str, np.ndarray]:
-    """Errors of all rungs against the reference, (rungs, points) each, by name."""
-    found = [apart(seen, measured.seen[-1]) for seen in measured.seen]
-    return {name: np.array(v) for name, v in zip(ERRORS, zip(*found, strict=True), strict=True)}
 
 
 def apart(seen: Seen, other: Seen) -> tuple[np.ndarray, ...]:
@@ -389,56 +330,56 @@ def _chances_apart(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     return np.where(either, np.abs(np.nan_to_num(one) - np.nan_to_num(other)), np.nan)
 
 
-class Content:
+@dataclass
+class Measured:
     """Content of the store: errors by rung and point, seconds by rung and round."""
 
-    def __init__(self, spec: Declared, bench: AnyBench, measured: Measured, stored: float) -> None:
-        self._spec, self._bench, self._measured, self._stored = spec, bench, measured, stored
+    bench: Bench
+    ladder: Ladder
+    done: np.ndarray  # places in the sample of the points that every rung was tried on
+    rounds: list[list[Trial]]  # of all these points, by rung
+    times: np.ndarray  # (rungs,): points of a stretch that is timed
+    truth: dict[int, np.ndarray]
+    """By place in the sample: differences of the reference from the time domain."""
+    truth_beamlets: int  # of both, where their number is not the reference's; else 0
+    stopped: str  # why the sample is not whole; empty where it is
+    stored: float = math.nan  # time that storing takes [s]
 
     @property
     def id(self) -> str:
         """The spec of the study."""
-        return self._spec.id
+        return self.bench.spec.id
 
     def attributes(self) -> dict[str, Any]:
         """Return the spec, the reference of the errors, and the machine."""
-        measured = self._measured
-        return {
+        spec, trials = self.bench.spec, zip(self.ladder.rungs, self.rounds[0], strict=True)
+        beamlets = [trial.seen.beamlets for rung, trial in trials if rung.kind == THESIS]
+        found: dict[str, Any] = {
             "kind": ACCURACY,
-            "title": self._spec.title,
+            "title": spec.title,
             "question": "What does accuracy cost in time?",
-            "spec": self._spec.to_json(),
-            "reference": measured.ladder.about,
+            "spec": spec.to_json(),
+            "reference": self.ladder.about,
             "environment": {"processor": store.processor(), **store.software()},
-            "unit": self._bench.unit,
-            "points": len(measured.done),
-            "study_points": self._bench.whole,
-            "storing_seconds": self._stored,
-            "notes": list(measured.ladder.notes),
-            "thesis_beamlets": self._thesis_beamlets(),
-            "stopped": measured.stopped,
-            "coordinates": " ".join(["kind", *self._bench.coordinates()]),
-            **self._truth(),
+            "unit": self.bench.unit,
+            "points": len(self.done),
+            "study_points": self.bench.whole,
+            "storing_seconds": self.stored,
+            "notes": list(self.ladder.notes),
+            # 0 where the thesis's way was not tried, or nothing is seen
+            "thesis_beamlets": int(np.nan_to_num(np.fmax.reduce(beamlets, axis=None, initial=0))),
+            "stopped": self.stopped,
+            "coordinates": " ".join(["kind", *self.bench.coordinates()]),
+            "truth_points": len(self.truth),
         }
-
-    def _truth(self) -> dict[str, Any]:
-        """Largest difference between reference and time domain, and the number of points."""
-        found = [apart(*pair) for pair in self._measured.truth.values()]
-        if not found:
-            return {"truth_points": 0}
-        pd, _, _, magnitude = np.fmax.reduce(np.array(found), axis=(0, 2))
-        return {
-            "truth_points": len(found),
-            "truth_beamlets": self._measured.truth_beamlets,
+        if not self.truth:
+            return found
+        pd, _, _, magnitude = np.fmax.reduce(list(self.truth.values()))
+        return found | {
+            "truth_beamlets": self.truth_beamlets,
             "truth_pd_difference": float(pd),
             "truth_magnitude_difference": float(magnitude),
         }
-
-    def _thesis_beamlets(self) -> int:
-        """Beamlets of a point in the thesis's way; 0 where it was not tried, or nothing is seen."""
-        tried = zip(self._measured.ladder.rungs, self._measured.seen, strict=True)
-        numbers = [seen.beamlets for rung, seen in tried if rung.kind == THESIS]
-        return int(np.nan_to_num(np.fmax.reduce(numbers, axis=None))) if numbers else 0
 
     def groups(self) -> dict[str, dict[str, Any]]:
         """None."""
@@ -446,40 +387,34 @@ class Content:
 
     def arrays(self) -> list[ArrayLayout]:
         """Coordinates, errors, seconds."""
-        measured, rungs = self._measured, self._measured.ladder.rungs
-        truth = np.full(len(measured.done), np.nan)
-        for place, (in_time, reference) in measured.truth.items():
-            truth[np.flatnonzero(measured.done == place)] = apart(in_time, reference)[0]
-        errors = differences(measured)
-        errors["standard_error"] = np.array([seen.standard_error for seen in measured.seen])
-        by_rung, by_round, by_point = ("rung",), ("rung", "round"), ("rung", "point")
-        told = {
-            "tolerance": (by_rung, np.array([tolerance_of(rung) for rung in rungs]), "1",
-                          "tolerance of an adaptive setting"),
-            "times": (by_rung, measured.times, "1", "points of each stretch that is timed"),
-            "seconds": (by_round, measured.seconds, "s",
-                        "time a point on one core, planning included"),
-            "planning": (by_round, measured.planning, "s", "planning's share of it"),
-            **{name: (by_point, values, "1", _ABOUT[name]) for name, values in errors.items()},
-            "truth_pd_difference": (
-                ("point",), truth, "1",
-                "difference of a probability of detection from the time domain's",
-            ),
-        }  # fmt: skip
-        names, kinds = ([getattr(rung, each) for rung in rungs] for each in ("name", "kind"))
-        known = ArrayLayout.known
+        rungs, seen = self.ladder.rungs, [trial.seen for trial in self.rounds[0]]
+        errors = [*zip(*(apart(each, seen[-1]) for each in seen), strict=True)]
+        errors.append(tuple(each.standard_error for each in seen))
+        seconds = np.transpose([[trial.seconds for trial in each] for each in self.rounds])
+        planning = np.transpose([[trial.planning for trial in each] for each in self.rounds])
+        truth = [self.truth[k][0] if k in self.truth else np.nan for k in self.done.tolist()]
+
+        def of(
+            name: str, dims: tuple[str, ...], values: Any, about: str, units: str = "1"
+        ) -> ArrayLayout:
+            return ArrayLayout.known(name, dims, np.asarray(values), described(units, about))
+
         return [
-            known("rung", by_rung, np.array(names, object), {}),
-            known("kind", by_rung, np.array(kinds, object), {}),
-            *(
-                known(name, dims, values, described(units, about))
-                for name, (dims, values, units, about) in told.items()
-            ),
-            *(
-                known(name, ("point",), np.asarray(values)[measured.done], attributes)
-                for name, (values, attributes) in self._bench.coordinates().items()
-            ),
-        ]
+            ArrayLayout.known("rung", ("rung",), np.array([r.name for r in rungs], object), {}),
+            ArrayLayout.known("kind", ("rung",), np.array([r.kind for r in rungs], object), {}),
+            of("tolerance", ("rung",), [tolerance_of(r) for r in rungs],
+               "tolerance of an adaptive setting"),
+            of("times", ("rung",), self.times, "points of each stretch that is timed"),
+            of("seconds", ("rung", "round"), seconds,
+               "time a point on one core, planning included", "s"),
+            of("planning", ("rung", "round"), planning, "planning's share of it", "s"),
+            *(of(name, ("rung", "point"), values, about)
+              for (name, about), values in zip(ERRORS.items(), errors, strict=True)),
+            of("truth_pd_difference", ("point",), truth,
+               "difference of a probability of detection from the time domain's"),
+            *(ArrayLayout.known(name, ("point",), np.asarray(values)[self.done], attributes)
+              for name, (values, attributes) in self.bench.coordinates().items()),
+        ]  # fmt: skip
 
 
 def tolerance_of(rung: Rung) -> float:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any
 
 from sweep.model.effects.catalogue import EFFECTS, NAMES
 from sweep.model.effects.segment_motion import SEGMENT_MOTION
 from sweep.model.ground import powers_add
-from sweep.spec import SceneSpec
+from sweep.spec import SceneSpec, Spec
 from sweep.spec.parts import OFF
 from sweep.tasks.studies import Declared, changed
 
@@ -56,17 +55,14 @@ LONG_RUN = 10
 DRAWN_TOLERANCES = (1e-1, 3e-2, 1e-2)
 """Tolerances until which points are drawn."""
 
-DRAWN = "draws.number"
-"""Field that holds the number of draws."""
-
-_TOLERANCE, _LIMIT = "accuracy.tolerance", "draws.limit"
+_TOLERANCE, _DRAWN, _LIMIT = "accuracy.tolerance", "draws.number", "draws.limit"
 _BEAMLETS, _PATTERN, _LINE = "footprint.beamlets", "footprint.pattern", "line"
 _EXACTLY = dict.fromkeys(
     ("accuracy.line_error", "accuracy.leakage_error", "accuracy.leakage_floor"), FINEST_TOLERANCE
 )
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Rung:
     """A setting of a study: values of fields of its spec by dotted path, as one would write them.
 
@@ -108,46 +104,16 @@ class Ladder:
     rungs: tuple[Rung, ...]
     about: str  # what the reference is
     notes: tuple[str, ...] = ()
-    fixed: Callable[[float], dict[str, Any]] = lambda tolerance: {}
-    """Overrides that are fixed too where effects are, to a tolerance."""
 
     @property
     def reference(self) -> Rung:
         """The rung that the errors of all others are taken against."""
         return self.rungs[-1]
 
-    def with_fixed(
-        self, sets: Mapping[float, frozenset[str]], tolerances: Iterable[float] = ()
-    ) -> Ladder:
-        """Add rungs that simulate everywhere the effects that a tolerance needs anywhere.
-
-        ``tolerances``: for lines and leakage, tried with each set; by default those of the
-        sets.
-        """
-        as_at: dict[frozenset[str], float] = {}
-        for tolerance, names in sets.items():
-            as_at.setdefault(names, tolerance)
-        further = [
-            Rung(
-                name=f"{len(names)} effects as at {first:g}, to {tolerance:g}",
-                kind=FIXED,
-                overrides=_modes(names) | self.fixed(tolerance) | {_TOLERANCE: tolerance},
-            )
-            for names, first in as_at.items()
-            for tolerance in tolerances or sets
-        ]
-        place = next(i for i, rung in enumerate(self.rungs) if rung.kind == ALL_ON)
-        return replace(self, rungs=(*self.rungs[:place], *further, *self.rungs[place:]))
-
-
-def _modes(on: frozenset[str]) -> dict[str, str]:
-    """Return some effects forced on, all others off."""
-    return {f"effects.{name}": "on" if name in on else "off" for name in NAMES}
-
 
 def ladder(spec: Declared) -> Ladder:
     """Return the rungs of a study, without those whose effects are fixed."""
-    if _draws(spec):
+    if isinstance(spec, Spec) and spec.draws.any:
         return _drawn_ladder(spec)
     notes: list[str] = []
     rungs = [Rung(name="as written", kind=WRITTEN)]
@@ -174,12 +140,40 @@ def ladder(spec: Declared) -> Ladder:
     rungs += () if why else _numbers(isinstance(spec, SceneSpec))
     rungs += _thesis_rungs({} if why else {_BEAMLETS: OF_THESIS}, powers_add(spec.parameters()))
     rungs.append(Rung(name="reference", kind=REFERENCE, overrides=finest, rays_error=rays_error))
-    return Ladder(tuple(rungs), about, tuple(notes), partial(_fixed_beamlets, spec, bool(why)))
+    return Ladder(tuple(rungs), about, tuple(notes))
 
 
-def _fixed_beamlets(spec: Declared, given: bool, tolerance: float) -> dict[str, Any]:
+def with_fixed(
+    ladder: Ladder,
+    spec: Declared,
+    sets: Mapping[float, frozenset[str]],
+    tolerances: Iterable[float] = (),
+) -> Ladder:
+    """Add rungs that simulate everywhere the effects that a tolerance needs anywhere.
+
+    ``tolerances``: for lines and leakage, tried with each set; by default those of the sets.
+    """
+    as_at: dict[frozenset[str], float] = {}
+    for tolerance, names in sets.items():
+        as_at.setdefault(names, tolerance)
+    further = [
+        Rung(
+            name=f"{len(names)} effects as at {first:g}, to {tolerance:g}",
+            kind=FIXED,
+            overrides={f"effects.{name}": "on" if name in names else "off" for name in NAMES}
+            | _fixed_beamlets(spec, tolerance)
+            | {_TOLERANCE: tolerance},
+        )
+        for names, first in as_at.items()
+        for tolerance in tolerances or sets
+    ]
+    place = next(i for i, rung in enumerate(ladder.rungs) if rung.kind == ALL_ON)
+    return replace(ladder, rungs=(*ladder.rungs[:place], *further, *ladder.rungs[place:]))
+
+
+def _fixed_beamlets(spec: Declared, tolerance: float) -> dict[str, Any]:
     """Beamlets that a study whose effects are fixed might have, if their number is not given."""
-    if given:
+    if _beamlets_fixed(spec):
         return {}
     if not isinstance(spec, SceneSpec):
         return {_BEAMLETS: FIXED_NODES, _PATTERN: _LINE}
@@ -211,48 +205,42 @@ def _thesis_rungs(overrides: Mapping[str, Any], powers: bool) -> Iterator[Rung]:
         yield Rung(name=f"thesis 2^{power}{how}", kind=kind, overrides=overrides, thesis=thesis)
 
 
-def _drawn_ladder(spec: Declared) -> Ladder:
+def _drawn_ladder(spec: Spec) -> Ladder:
     """Numbers of draws and what is read off them, against a long run with other draws."""
     longest = LONG_RUN * DRAW_NUMBERS[-1]
     notes = ["errors are differences from a long run with other draws, so they are random too"]
     own: dict[str, Any] = {}
-    for path, written in ((DRAWN, spec.draws.number), (_LIMIT, getattr(spec.draws, "limit", 0))):
+    for path, written in ((_DRAWN, spec.draws.number), (_LIMIT, spec.draws.limit)):
         if written > longest:
             own = {path: longest}
             notes.append(f"with {longest} of the {written} draws that are written")
     rungs = [Rung(name="as written", kind=WRITTEN, overrides=own)]
-    may_stop = "limit" in type(spec.draws).model_fields  # draws until a tolerance is met
-    for t in DRAWN_TOLERANCES if may_stop else ():
-        until = {DRAWN: 0, _LIMIT: longest, _TOLERANCE: t}
+    for t in DRAWN_TOLERANCES:
+        until = {_DRAWN: 0, _LIMIT: longest, _TOLERANCE: t}
         rungs.append(Rung(name=f"auto at {t:g}", kind=ADAPTIVE, overrides=until))
-    to_the_end = {_LIMIT: 0} if may_stop else {}
     for number in DRAW_NUMBERS:
-        each = {DRAWN: number} | to_the_end
+        each = {_DRAWN: number, _LIMIT: 0}
         noise = each | {"draws.method": "noise"}
         rungs += [
             Rung(name=f"{number} draws, mean", kind=MEANS, overrides=each),
             Rung(name=f"{number} draws, counts", kind=COUNTED, overrides=each),
             Rung(name=f"{number} draws, noise", kind=IN_NOISE, overrides=noise),
         ]
-    other = {DRAWN: longest, "seed": int(spec.seed) ^ 1} | to_the_end
+    other = {_DRAWN: longest, "seed": int(spec.seed) ^ 1, _LIMIT: 0}
     rungs.append(Rung(name="reference", kind=REFERENCE, overrides=_every_effect(spec) | other))
     return Ladder(tuple(rungs), f"{longest} other draws, all effects on", tuple(notes))
 
 
 def _every_effect(spec: Declared) -> dict[str, Any]:
-    """All effects on; segments that all begin at one range are a law, which stays as written."""
-    random, law = _draws(spec), SEGMENT_MOTION.name
-    kept = law if spec.modes()[law] == OFF else ""
-    return {
-        f"effects.{e.name}": "on" for e in EFFECTS if (random or not e.is_random) and e.name != kept
-    }
+    """All effects on; segments that all begin at one range are a law, which stays as written.
 
-
-def _draws(spec: Declared) -> bool:
-    """Return true where probabilities are means over draws: of a flight they are not."""
-    return not isinstance(spec, SceneSpec) and (
-        spec.draws.number > 0 or getattr(spec.draws, "limit", 0) > 0
-    )
+    Random ones where probabilities are means over draws: of a flight they are not.
+    """
+    law, is_drawn = SEGMENT_MOTION.name, isinstance(spec, Spec) and spec.draws.any
+    every = {f"effects.{e.name}": "on" for e in EFFECTS if is_drawn or not e.is_random}
+    if spec.modes()[law] == OFF:
+        del every[f"effects.{law}"]
+    return every
 
 
 def _on_axis(spec: Declared, path: str) -> bool:
