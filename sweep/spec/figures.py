@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
-import sweep.spec.rules as of
+import sweep.spec.parts as of
 from sweep.model.outputs import (
     ACCURACY_OUTPUTS,
     DRAW_OUTPUTS,
@@ -25,9 +25,8 @@ from sweep.model.outputs import (
 )
 from sweep.spec.axes import Axis
 from sweep.spec.flight import AnyScanner, shots_a_cycle
-from sweep.spec.mistakes import Finding, Location, near_miss
 from sweep.spec.parts import Part, read_as
-from sweep.spec.rules import Choice, Special
+from sweep.spec.rules import Choice, Finding, Location, Special, near_miss
 from sweep.spec.scene import SceneDraws
 from sweep.spec.sections import SPECTRA, parameter_rules
 from sweep.units import QuantityError, read_number

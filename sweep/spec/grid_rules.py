@@ -29,8 +29,8 @@ from sweep.model.estimators import DEFAULTS, DETECTOR, ESTIMATOR
 from sweep.model.preparation import RECORD
 from sweep.model.waveform import ENDS, RANGES, VELOCITIES
 from sweep.spec.axes import Axis, place_on_grid
-from sweep.spec.mistakes import ABSENT, Finding
 from sweep.spec.parts import OFF, ON, rules_of
+from sweep.spec.rules import ABSENT, Finding
 from sweep.spec.sections import SPECTRA, Draws, Effects, default_of, parameter_rules
 from sweep.units import QuantityError
 

@@ -1,28 +1,31 @@
-"""Identity of a study: its content in SI values, and the hash of it."""
+"""What a flight sees of a scene as part of its identity, and how identities differ."""
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from functools import cache
 from types import MappingProxyType
 from typing import Any
 
-import numpy as np
 from pydantic import BaseModel
 
-from sweep.spec.axes import Axis, Member
 from sweep.spec.flight import AnyScanner, Platform, rule_of_beam
 from sweep.spec.grounds import OPTICAL
-from sweep.spec.parts import Models, all_parts, fields_of, models_at, rule_of, values_of
+from sweep.spec.parts import (
+    Models,
+    all_parts,
+    canonical,
+    fields_of,
+    models_at,
+    rule_of,
+    values_of,
+)
 from sweep.spec.rules import Rule
 from sweep.spec.scene import ErrorFloor, Navigation, Scene, SceneDraws, SceneStorage
 from sweep.spec.sections import SECTIONS
 from sweep.units import read_unit
 
-LISTED_VALUES = 64
 MOST_TOLD = 8
 """Values of an axis that are told one by one."""
 LONGEST_TOLD = 200
@@ -31,44 +34,6 @@ ROOTS: Models = (
     Scene, Platform, ErrorFloor, Navigation, SceneDraws, SceneStorage, *models_at(AnyScanner)
 )  # fmt: skip
 """Sections that studies of scenes alone have."""
-
-
-def axis_identity(axis: Axis) -> dict[str, Any]:
-    """Content of an axis: its values where they are few, else their number, ends and digest."""
-    return {"name": axis.name, "members": {m.path: _member_identity(m) for m in axis.members}}
-
-
-def _member_identity(member: Member) -> dict[str, Any]:
-    """Content of one parameter along an axis."""
-    number, words = len(member.values), isinstance(member.values, tuple)
-    if number <= LISTED_VALUES:
-        return {"values": list(member.values) if words else np.asarray(member.values).tolist()}
-    if words:
-        content = "\0".join(map(str, member.values)).encode()
-    else:
-        content = (np.asarray(member.values, dtype="<f8") + 0.0).tobytes()  # no -0.0
-    first, last = np.asarray(member.values)[[0, -1]].tolist()
-    digest = hashlib.blake2b(content, digest_size=16).hexdigest()
-    return {"number": number, "first": first, "last": last, "digest": digest}
-
-
-def canonical(value: Any) -> Any:
-    """Value in the one form that its equals share: whole floats as integers, keys in order."""
-    if isinstance(value, Mapping):
-        return {str(key): canonical(value[key]) for key in sorted(value)}
-    if isinstance(value, list | tuple):
-        return [canonical(item) for item in value]
-    if isinstance(value, float) and value.is_integer() and abs(value) < 2**53:
-        return int(value)
-    return value
-
-
-def digest(identity: Mapping[str, Any]) -> str:
-    """Hash of an identity: 128 bits of BLAKE2b over its canonical JSON, in hex."""
-    text = json.dumps(
-        canonical(identity), separators=(",", ":"), ensure_ascii=True, allow_nan=False
-    )
-    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
 
 def geometry_of(

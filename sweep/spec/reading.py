@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,18 +20,6 @@ from sweep.model.effects.phase_errors import ERROR_TABLE, NO_TABLE
 from sweep.model.threshold import PROCESSING, WAYS
 from sweep.scenes.files import SceneError, read_columns
 from sweep.spec.figures import Figure, SceneFigure
-from sweep.spec.mistakes import (
-    ABSENT,
-    Finding,
-    Location,
-    Mistake,
-    Rejected,
-    SpecError,
-    dotted,
-    near_miss,
-    rejected,
-    shown,
-)
 from sweep.spec.parts import (
     Models,
     Place,
@@ -42,7 +30,20 @@ from sweep.spec.parts import (
     rule_of,
     rules_of,
 )
-from sweep.spec.rules import BROKEN_RULE, Numeric
+from sweep.spec.rules import (
+    ABSENT,
+    BROKEN_RULE,
+    Finding,
+    Location,
+    Mistake,
+    Numeric,
+    Rejected,
+    SpecError,
+    dotted,
+    near_miss,
+    rejected,
+    shown,
+)
 from sweep.spec.sections import parameter_rules
 
 LARGEST_FILE = 1_000_000
@@ -245,22 +246,17 @@ def resolve_instrument(document: Document, base: Path) -> bool:
     elif not isinstance(written, str):
         return True
     try:
-        inside, read = _instrument_of(reference, location, base)
+        read = _instrument_of(reference, location, base)
     except Rejected as error:
         document.findings += error.findings
         return False
-    own = read.value["instrument"] if inside else read.value
+    own = read.value["instrument"]
     _read_error_table(document, own, Path(read.file).parent)
     document.value["instrument"] = merged(_without_threshold(own, overrides), overrides)
     kept = {place: at for place, at in document.places.items() if _is_leaf(document.value, place)}
-    within = {place: at for place, at in read.places.items() if len(place) > inside}
-    if inside:
-        within = {place[1:]: at for place, at in within.items() if place[0] == "instrument"}
-    places = {("instrument", *place): at for place, at in within.items()}
-    document.places = document.places | places | kept
-    document.findings += [
-        Finding(("instrument", *f.location), f.rule, f.suggestion, f.written) for f in read.findings
-    ]
+    within = {place: at for place, at in read.places.items() if place[:1] == _INSTRUMENT != place}
+    document.places = document.places | within | kept
+    document.findings += read.findings
     return True
 
 
@@ -284,23 +280,26 @@ def _read_error_table(document: Document, instrument: dict[str, Any], base: Path
     chirp[name] = [[f"{time!r} s", f"{error!r} Hz"] for time, error in rows]
 
 
-def _instrument_of(reference: object, location: Location, base: Path) -> tuple[int, Document]:
-    """Document that holds an instrument, and how many keys down it stands there."""
+def _instrument_of(reference: object, location: Location, base: Path) -> Document:
+    """Document of an instrument, where it stands as in a spec."""
     if not isinstance(reference, str):
         what = "name of an instrument, see sweep instruments" if "like" in location else ""
         raise rejected(location, f"must be the {what or 'path of a YAML file'}", "", reference)
     file, known = base / os.path.expanduser(reference), library()
     if "file" not in location and reference in known:
-        return 1, read_document(known[reference])
+        return read_document(known[reference])
     is_word = reference.isidentifier() and not os.path.exists(file)
     if "like" in location or (is_word and "file" not in location):
         remedy = near_miss(reference, known, otherwise=f"the library has {', '.join(known)}")
         raise rejected(location, "is no instrument of the library", remedy, reference)
     try:
-        return 0, read_document(file)
+        read = read_document(file)
     except SpecError as error:
         rule = f"names a file that {error.mistakes[0].rule}"
         raise rejected(location, rule, error.mistakes[0].suggestion, reference) from None
+    places = {(*_INSTRUMENT, *place): at for place, at in read.places.items()}
+    findings = [replace(f, location=(*_INSTRUMENT, *f.location)) for f in read.findings]
+    return Document({"instrument": read.value}, places, findings, read.file)
 
 
 def library() -> dict[str, Path]:

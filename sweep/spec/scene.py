@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-import sweep.spec.rules as of
+import sweep.spec.parts as of
 from sweep.scenes.files import SceneError
 from sweep.spec.flight import Motion, Span, Turn
 from sweep.spec.grounds import (
@@ -318,10 +318,7 @@ class ErrorFloor(Part):
     )  # fmt: skip
 
 
-def _end(about: str, *rule: str) -> Any:
-    """Field of an end of what a report can hold; none by default."""
-    whole = f"{about}; what lies beyond is clipped and reported as invalid"
-    return of.quantity(whole, *rule, default=None)
+_CLIPPED = "what lies beyond is clipped and reported as invalid"
 
 
 class Interface(Part):
@@ -337,14 +334,20 @@ class Interface(Part):
         "Step in which radial velocities are reported",
         "m/s", "1 mm/s", "1e-9 m/s", "1 km/s", default=None,
     )  # fmt: skip
-    min_range: float | None = _end("Least range that a report can hold", "m", "10 m", "0 m")
-    max_range: float | None = _end("Largest range that a report can hold", "m", "5 km", "0 m")
-    min_radial_velocity: float | None = _end(
-        "Least radial velocity that a report can hold, positive when closing", "m/s", "-60 m/s"
+    min_range: float | None = of.length(
+        f"Least range that a report can hold; {_CLIPPED}", "10 m", "0 m", default=None
     )
-    max_radial_velocity: float | None = _end(
-        "Largest radial velocity that a report can hold, positive when closing", "m/s", "220 m/s"
+    max_range: float | None = of.length(
+        f"Largest range that a report can hold; {_CLIPPED}", "5 km", "0 m", default=None
     )
+    min_radial_velocity: float | None = of.quantity(
+        f"Least radial velocity that a report can hold, positive when closing; {_CLIPPED}",
+        "m/s", "-60 m/s", default=None,
+    )  # fmt: skip
+    max_radial_velocity: float | None = of.quantity(
+        f"Largest radial velocity that a report can hold, positive when closing; {_CLIPPED}",
+        "m/s", "220 m/s", default=None,
+    )  # fmt: skip
     rate: float | None = of.quantity(
         "Reports of each beam per second; without it every shot is a report",
         "Hz", "20 Hz", "1e-6 Hz", "1e9 Hz", default=None,

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-import sweep.spec.rules as of
+import sweep.spec.parts as of
 from sweep.model import beam
 from sweep.model.ground import pattern as pattern_of
 from sweep.model.outputs import CYCLES, NAVIGATION, POINTS, SHOTS, STATISTICS
@@ -29,8 +29,8 @@ from sweep.spec.flight import (
 from sweep.spec.grid_rules import Grid
 from sweep.spec.grid_rules import at as written_at
 from sweep.spec.grounds import Craters, Ground, Jacksboro
-from sweep.spec.mistakes import Finding, Location, near_miss
 from sweep.spec.parts import Files, named_files, read_as
+from sweep.spec.rules import Finding, Location, near_miss
 from sweep.spec.scene import WORLD, AnyObject, Boulders, Box, MeshObject, Solid, Sphere, Trees
 from sweep.spec.sections import default_of
 from sweep.units import QuantityError, read_unit
@@ -285,13 +285,13 @@ def _pattern_findings(scanner: Any, location: Location, span: Span | None) -> It
 
 # Axes: what may vary while the light falls where it fell
 
-STORED = frozenset(
-    name
-    for table in (SHOTS, CYCLES, STATISTICS, POINTS, NAVIGATION)
-    for stored, output in table.items()
-    for name in (stored, *output.dims)
-)
-"""Names of a store's arrays and dimensions."""
+
+def stored_names() -> frozenset[str]:
+    """Names of a store's arrays and dimensions."""
+    tables = (SHOTS, CYCLES, STATISTICS, POINTS, NAVIGATION)
+    dims = (output.dims for table in tables for output in table.values())
+    return frozenset().union(*tables, *dims)
+
 
 _OTHER = "make another study of it"
 _BEAMS = (beam.DIVERGENCE, beam.WAIST, beam.QUALITY, beam.FOCUS, beam.RECEIVED_WAIST, beam.COUPLING)
@@ -346,6 +346,6 @@ def axis_findings(grid: Grid) -> Iterator[Finding]:
         for member in axis.members:
             at: Location = ("axes", axis.name if axis.zipped else member.path)
             yield from parameter_findings(p, member.path, member.values, at)
-        if axis.zipped and axis.name in STORED:
+        if axis.zipped and axis.name in stored_names():
             rule = "bears the name of something stored"
             yield Finding(("axes", axis.name), rule, "take a word such as 'cut'")

@@ -12,7 +12,7 @@ from typing import Any, Self
 
 from pydantic import BaseModel, model_validator
 
-import sweep.spec.rules as of
+import sweep.spec.parts as of
 from sweep.model import waveform
 from sweep.model.accuracy import AUTOMATIC, COUNTED
 from sweep.model.beam import COUPLINGS, SINGLE_MODE
@@ -21,9 +21,8 @@ from sweep.model.estimators import ESTIMATORS, PEAK_BIN
 from sweep.model.ground import LAWS
 from sweep.model.looks import COMBINED, COMMON, POWER, SPECKLES
 from sweep.model.threshold import PROCESSING, WAYS
-from sweep.spec.mistakes import near_miss
 from sweep.spec.parts import Part, rules_of, with_modes, with_parameters
-from sweep.spec.rules import Method, Rule, Window, broken
+from sweep.spec.rules import Method, Rule, Window, broken, near_miss
 
 ARCHITECTURES = ("homodyne", "heterodyne", "direct")
 _WATTS = ("1e-18 W", "1e9 W")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from pydantic import ConfigDict, Field, PrivateAttr, ValidationError
 
-import sweep.spec.rules as of
+import sweep.spec.parts as of
 from sweep.model import VERSION, accuracy, beam, looks, waveform
 from sweep.model.effects import circulator_leak
 from sweep.model.ground import pattern as pattern_of
@@ -22,7 +22,7 @@ from sweep.model.outputs import STRONGEST_OUTPUTS
 from sweep.model.resolution import BEAMLETS, is_open, rays_needed
 from sweep.model.threshold import WAYS
 from sweep.model.waveform import ENDS
-from sweep.spec.axes import Axis, Member, in_units, paths_on_axes, read_axes
+from sweep.spec.axes import Axis, Member, axis_identity, in_units, paths_on_axes, read_axes
 from sweep.spec.figures import Figure, SceneFigure, figure_findings, scene_figure_findings
 from sweep.spec.flight import AnyScanner, Platform, shots_a_cycle
 from sweep.spec.grid_rules import (
@@ -34,9 +34,17 @@ from sweep.spec.grid_rules import (
     spectra_findings,
     without_draws,
 )
-from sweep.spec.identity import axis_identity, digest, geometry_of
-from sweep.spec.mistakes import Finding, Location, Mistake, SpecError, dotted, shown
-from sweep.spec.parts import Files, Part, fill, leaves, named_files, read_as, values_of
+from sweep.spec.identity import geometry_of
+from sweep.spec.parts import (
+    Files,
+    Part,
+    digest,
+    fill,
+    leaves,
+    named_files,
+    read_as,
+    values_of,
+)
 from sweep.spec.reading import (
     Document,
     findings_of,
@@ -45,7 +53,17 @@ from sweep.spec.reading import (
     read_document,
     resolve_instrument,
 )
-from sweep.spec.rules import Numeric, Rule, Special
+from sweep.spec.rules import (
+    Finding,
+    Location,
+    Mistake,
+    Numeric,
+    Rule,
+    SpecError,
+    Special,
+    dotted,
+    shown,
+)
 from sweep.spec.scene import (
     ErrorFloor,
     Interface,
@@ -442,7 +460,7 @@ class SceneSpec(Study):
     draws: SceneDraws = SceneDraws()
     error_floor: ErrorFloor = ErrorFloor()
     navigation: Navigation = Navigation()
-    interface: Interface = Interface()
+    interface: Interface = Field(default_factory=Interface)
     storage: SceneStorage = SceneStorage()
     figures: tuple[SceneFigure, ...] = Field(
         default=(), description="Figures and tables of the results"
@@ -480,11 +498,6 @@ class SceneSpec(Study):
     def unvaried(self, path: str, value: object, location: Location) -> list[Finding]:
         """Mistakes in a parameter taking a value without the geometry changing."""
         return parameter_findings(self.parameters(), path, [value], location)
-
-    @property
-    def base(self) -> Path:
-        """Folder that the scene's files are relative to."""
-        return self._base
 
     @property
     def files(self) -> Files:
