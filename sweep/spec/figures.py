@@ -11,18 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field
 
 import sweep.spec.parts as of
-from sweep.model.outputs import (
-    ACCURACY_OUTPUTS,
-    DRAW_OUTPUTS,
-    ERROR_OUTPUTS,
-    OUTPUTS,
-    POINTS,
-    SHOTS,
-    SPECTRA_OUTPUTS,
-    STATISTICS,
-    STRONGEST_OUTPUTS,
-    XYZ,
-)
+from sweep.model import outputs
 from sweep.spec.axes import Axis
 from sweep.spec.flight import AnyScanner, shots_a_cycle
 from sweep.spec.parts import Part, read_as
@@ -190,9 +179,9 @@ Figure = Annotated[
 
 # Figures of scenes
 
+_SHOWN = outputs.SHOTS | outputs.STATISTICS | outputs.POINTS
 QUANTITIES = (
-    *(name for table in (SHOTS, STATISTICS, POINTS) for name, output in table.items()
-      if XYZ not in output.dims),
+    *(name for name, output in _SHOWN.items() if outputs.XYZ not in output.dims),
     "altitude", "x", "y", "z", "shot",
 )  # fmt: skip
 """Quantities of shots and of points that a figure can show."""
@@ -426,15 +415,15 @@ def _variable_findings(
     variable = getattr(figure, "variable", None)
     asked = ("number", "limit") if isinstance(draws, Mapping) else ()
     with_draws = any(draws.get(name, 0) not in (0, "0") for name in asked)  # type: ignore[attr-defined]
-    drawn = DRAW_OUTPUTS | ERROR_OUTPUTS | ACCURACY_OUTPUTS
-    known = {*OUTPUTS, *further}
+    drawn = outputs.DRAW_OUTPUTS | outputs.ERROR_OUTPUTS | outputs.ACCURACY_OUTPUTS
+    known = {*outputs.OUTPUTS, *further}
     if variable is None or variable in known or (with_draws and variable in drawn):
         return
     rule, remedy = "is no stored quantity", near_miss(variable, [*known, *drawn])
     if variable in drawn:
         rule = "is found over draws, and this study has none"
         remedy = "set draws: {number: ...} or {limit: ...}"
-    elif variable in STRONGEST_OUTPUTS:
+    elif variable in outputs.STRONGEST_OUTPUTS:
         rule = "is found where segments report their strongest peak alone"
         remedy = "set instrument.processing.peaks: strongest"
     yield Finding((*at, "variable"), rule, remedy, variable)
@@ -442,7 +431,7 @@ def _variable_findings(
 
 def _spectra_findings(figure: Any, at: Location) -> Iterator[Finding]:
     """Report closed forms that a study of whole spectra does not store."""
-    stored = SPECTRA_OUTPUTS | ACCURACY_OUTPUTS | DRAW_OUTPUTS
+    stored = outputs.SPECTRA_OUTPUTS | outputs.ACCURACY_OUTPUTS | outputs.DRAW_OUTPUTS
     variable = getattr(figure, "variable", None)
     if variable is None:
         rule = "shows closed forms, which a study of whole spectra does not store"

@@ -10,17 +10,9 @@ from typing import Any
 
 from pydantic import BaseModel
 
+from sweep.spec import parts
 from sweep.spec.flight import AnyScanner, Platform, rule_of_beam
 from sweep.spec.grounds import OPTICAL
-from sweep.spec.parts import (
-    Models,
-    all_parts,
-    canonical,
-    fields_of,
-    models_at,
-    rule_of,
-    values_of,
-)
 from sweep.spec.rules import Rule
 from sweep.spec.scene import ErrorFloor, Navigation, Scene, SceneDraws, SceneStorage
 from sweep.spec.sections import SECTIONS
@@ -30,8 +22,8 @@ MOST_TOLD = 8
 """Values of an axis that are told one by one."""
 LONGEST_TOLD = 200
 """Characters of a word that are told."""
-ROOTS: Models = (
-    Scene, Platform, ErrorFloor, Navigation, SceneDraws, SceneStorage, *models_at(AnyScanner)
+ROOTS: parts.Models = (
+    Scene, Platform, ErrorFloor, Navigation, SceneDraws, SceneStorage, *parts.models_at(AnyScanner)
 )  # fmt: skip
 """Sections that studies of scenes alone have."""
 
@@ -47,12 +39,12 @@ def geometry_of(
     places = {name: place for place, name in enumerate(scene.objects)}
     return {
         "objects": [
-            _object_geometry(values_of(thing, digests=digests), places)
+            _object_geometry(parts.values_of(thing, digests=digests), places)
             for thing in scene.objects.values()
         ],
         "origin": places.get(scene.origin, -1),
-        "platform": values_of(platform, digests=digests),
-        "scanner": values_of(scanner, digests=digests),
+        "platform": parts.values_of(platform, digests=digests),
+        "scanner": parts.values_of(scanner, digests=digests),
     }
 
 
@@ -67,17 +59,16 @@ def field_rules() -> MappingProxyType[str, Rule]:
     """Rule of every field by its name: one name has one unit wherever it stands."""
     return MappingProxyType({
         name: rule
-        for model in all_parts(*SECTIONS.values(), *ROOTS)
-        for name, field in fields_of(model).items()
-        if (rule := rule_of(field))
+        for model in parts.all_parts(*SECTIONS.values(), *ROOTS)
+        for name, field in parts.fields_of(model).items()
+        if (rule := parts.rule_of(field))
     })  # fmt: skip
 
 
 def difference(a: Any, b: Any) -> list[str]:
     """Lines ``path: value -> value`` for each difference between two specs or their identities."""
-    left, right = (
-        _flat(canonical(side if isinstance(side, Mapping) else side.identity())) for side in (a, b)
-    )
+    sides = (side if isinstance(side, Mapping) else side.identity() for side in (a, b))
+    left, right = (_flat(parts.canonical(side)) for side in sides)
     lines = []
     for path in [*left, *(path for path in right if path not in left)]:
         if left.get(path) != right.get(path):

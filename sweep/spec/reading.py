@@ -19,17 +19,8 @@ from pydantic import BaseModel, ValidationError
 from sweep.model.effects.phase_errors import ERROR_TABLE, NO_TABLE
 from sweep.model.threshold import PROCESSING, WAYS
 from sweep.scenes.files import SceneError, read_columns
+from sweep.spec import parts
 from sweep.spec.figures import Figure, SceneFigure
-from sweep.spec.parts import (
-    Models,
-    Place,
-    fields_of,
-    kind_of,
-    models_at,
-    place_of,
-    rule_of,
-    rules_of,
-)
 from sweep.spec.rules import (
     ABSENT,
     BROKEN_RULE,
@@ -372,9 +363,9 @@ _OTHER_STUDYS = {
 """Remedy for a section that only the other kind of study has."""
 
 _DRAWN_BY = {
-    kind_of(model): target
+    parts.kind_of(model): target
     for kind, target in ((Figure, "a target"), (SceneFigure, "a scene"))
-    for model in models_at(kind)
+    for model in parts.models_at(kind)
 }
 """Whose studies make a kind of figure."""
 
@@ -387,7 +378,7 @@ def findings_of(error: ValidationError, root: Any) -> list[Finding]:
 def _finding(detail: dict[str, Any], root: Any) -> Finding:
     """One error of pydantic's."""
     kind, written = detail["type"], detail["input"]
-    place = place_of(detail["loc"], root)
+    place = parts.place_of(detail["loc"], root)
     location = place.location
     if kind == BROKEN_RULE:
         context, path = detail["ctx"], dotted(location)
@@ -399,11 +390,11 @@ def _finding(detail: dict[str, Any], root: Any) -> Finding:
     if kind == "missing":
         return Finding(location, "is missing", _remedy(place))
     if kind == "extra_forbidden":
-        several = {kind_of(model): model for model in models_at(root)}
+        several = {parts.kind_of(model): model for model in parts.models_at(root)}
         model = several.get(detail["loc"][0], root)
         return Finding(location, "is no field", _sibling(place, model))
     if kind == "union_tag_invalid":
-        tag, kinds = detail["ctx"]["tag"], [kind_of(model) for model in place.models]
+        tag, kinds = detail["ctx"]["tag"], [parts.kind_of(model) for model in place.models]
         rule = f"must be one of {', '.join(kinds)}"
         return Finding((*location, "kind"), rule, _other_kind(str(tag), kinds), tag)
     if kind == "union_tag_not_found":
@@ -412,9 +403,9 @@ def _finding(detail: dict[str, Any], root: Any) -> Finding:
     return Finding(location, rule, "", written)
 
 
-def _with_kind(models: Models) -> str:
+def _with_kind(models: parts.Models) -> str:
     """Text that a part of several kinds is written with."""
-    return f"kind: and one of {', '.join(kind_of(model) for model in models)}"
+    return f"kind: and one of {', '.join(map(parts.kind_of, models))}"
 
 
 def _other_kind(tag: str, kinds: list[str]) -> str:
@@ -424,11 +415,11 @@ def _other_kind(tag: str, kinds: list[str]) -> str:
     return near_miss(tag, kinds)
 
 
-def _remedy(place: Place) -> str:
+def _remedy(place: parts.Place) -> str:
     """Remedy for a missing field or section."""
     name = place.location[-1]
-    field = fields_of(place.parents[0]).get(str(name)) if place.parents else None
-    rule = rule_of(field) if field is not None else None
+    field = parts.fields_of(place.parents[0]).get(str(name)) if place.parents else None
+    rule = parts.rule_of(field) if field is not None else None
     example = rule.example if rule is not None else ""
     if example:
         varies = isinstance(rule, Numeric) and dotted(place.location) in parameter_rules()
@@ -436,20 +427,20 @@ def _remedy(place: Place) -> str:
     if len(place.models) > 1:
         return f"write '{name}:' with {_with_kind(place.models)}"
     if place.models:
-        return f"write '{name}:' with {', '.join(fields_of(place.models[0]))}"
+        return f"write '{name}:' with {', '.join(parts.fields_of(place.models[0]))}"
     return f"write '{name}: ...'"
 
 
-def _sibling(place: Place, root: type[BaseModel]) -> str:
+def _sibling(place: parts.Place, root: type[BaseModel]) -> str:
     """Field that an unknown one resembles: beside it, else anywhere."""
     name = str(place.location[-1])
-    beside = [field for model in place.parents for field in fields_of(model)]
+    beside = [field for model in place.parents for field in parts.fields_of(model)]
     if name in _OTHER_STUDYS and place.parents == (root,):
         return _OTHER_STUDYS[name]
     suggestion = near_miss(name, beside)
     if suggestion:
         return suggestion
-    known = (*parameter_rules(), *rules_of(root, ""))
+    known = (*parameter_rules(), *parts.rules_of(root, ""))
     elsewhere = [path for path in known if path.rsplit(".", 1)[-1] == name]
     if elsewhere:
         return f"did you mean '{elsewhere[0]}'?"

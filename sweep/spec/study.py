@@ -22,6 +22,8 @@ from sweep.model.outputs import STRONGEST_OUTPUTS
 from sweep.model.resolution import BEAMLETS, is_open, rays_needed
 from sweep.model.threshold import WAYS
 from sweep.model.waveform import ENDS
+from sweep.spec import scene as scenes
+from sweep.spec import sections
 from sweep.spec.axes import Axis, Member, axis_identity, in_units, paths_on_axes, read_axes
 from sweep.spec.figures import Figure, SceneFigure, figure_findings, scene_figure_findings
 from sweep.spec.flight import AnyScanner, Platform, shots_a_cycle
@@ -64,33 +66,7 @@ from sweep.spec.rules import (
     dotted,
     shown,
 )
-from sweep.spec.scene import (
-    ErrorFloor,
-    Interface,
-    Navigation,
-    Scene,
-    SceneDraws,
-    SceneStorage,
-    World,
-    build,
-    surfaces_of,
-)
 from sweep.spec.scene_check import axis_findings, parameter_findings, scene_findings, why_not
-from sweep.spec.sections import (
-    SECTIONS,
-    Accuracy,
-    Atmosphere,
-    Draws,
-    Effects,
-    Execution,
-    Footprint,
-    Instrument,
-    Storage,
-    Target,
-    parameter_rules,
-    parameter_suggestion,
-    short_name,
-)
 from sweep.units import QuantityError
 
 if TYPE_CHECKING:
@@ -118,13 +94,13 @@ class Study(Part):
 
     title: str = of.text("What the study is called")
     question: str = of.text("The question that the study answers", "")
-    instrument: Instrument
-    atmosphere: Atmosphere = Atmosphere()
-    footprint: Footprint = Footprint()
-    effects: Effects = Effects()
-    accuracy: Accuracy = Accuracy()
+    instrument: sections.Instrument
+    atmosphere: sections.Atmosphere = sections.Atmosphere()
+    footprint: sections.Footprint = sections.Footprint()
+    effects: sections.Effects = sections.Effects()
+    accuracy: sections.Accuracy = sections.Accuracy()
     seed: int = of.seed("Seed of all random draws")
-    execution: Execution = Execution()
+    execution: sections.Execution = sections.Execution()
     axes: tuple[Axis, ...] = of.field(_READ_AXES, ())
 
     _written: dict[str, Any] = PrivateAttr(default_factory=dict)
@@ -218,7 +194,7 @@ class Study(Part):
         """SI values of all parameters by dotted path; of those on axes, the value off the axis."""
         return {
             path: value
-            for section in SECTIONS
+            for section in sections.SECTIONS
             if section in type(self).model_fields
             for path, value in values_of(getattr(self, section), (section,)).items()
         }
@@ -245,7 +221,7 @@ class Study(Part):
         for name, written in at.items():
             path, rule = _parameter(name, parameters | dict.fromkeys((*WAYS, *ENDS)))
             if rule is None:
-                suggestion = parameter_suggestion(name, parameters)
+                suggestion = sections.parameter_suggestion(name, parameters)
                 findings.append(Finding((name,), "is no parameter", suggestion))
                 continue
             try:
@@ -280,7 +256,7 @@ class Study(Part):
         A KeyError where no axis has it, a `QuantityError` where the value cannot be read.
         """
         member = self.member(name)
-        rule = parameter_rules()[member.path]
+        rule = sections.parameter_rules()[member.path]
         if not isinstance(rule, Numeric):
             return str(rule.read(written))
         return in_units(rule, written, member.units)
@@ -291,7 +267,7 @@ class Study(Part):
         Title, question, figures and execution are no part of it, nor are values that an axis
         overrides. The order of the axes is: it lays out the arrays.
         """
-        sections = ("draws", "error_floor", "navigation", "storage")
+        others = ("draws", "error_floor", "navigation", "storage")
         return {
             "model": VERSION,
             "parameters": self.parameters_off_axes(),
@@ -300,7 +276,7 @@ class Study(Part):
             "seed": self.seed,
         } | {
             name: values_of(getattr(self, name))
-            for name in sections
+            for name in others
             if name in type(self).model_fields
         }
 
@@ -343,8 +319,8 @@ class Study(Part):
 
 def _parameter(name: str, known: Mapping[str, object]) -> tuple[str, Rule | None]:
     """Dotted path and rule of a parameter, by its path or its last part."""
-    rules = parameter_rules()
-    paths = [path for path in known if name in (path, short_name(path))]
+    rules = sections.parameter_rules()
+    paths = [path for path in known if name in (path, sections.short_name(path))]
     return (paths[0], rules[paths[0]]) if len(paths) == 1 else (name, None)
 
 
@@ -400,9 +376,9 @@ class Spec(Study):
     Made by `load` from a file and by `from_mapping` from plain data; values are SI.
     """
 
-    target: Target
-    draws: Draws = Draws()
-    storage: Storage = Storage()
+    target: sections.Target
+    draws: sections.Draws = sections.Draws()
+    storage: sections.Storage = sections.Storage()
     figures: tuple[Figure, ...] = Field(default=(), description="Figures and tables of the results")
 
     @classmethod
@@ -412,7 +388,7 @@ class Spec(Study):
         """Figures of what the study lacks, random effects without draws, draws without an end."""
         further = STRONGEST_OUTPUTS if grid.has_point(STRONGEST_ALONE) else ()
         findings = list(figure_findings(written, grid.axes, further)) if axes_are_whole else []
-        draws = read_as(Draws, written.get("draws", {}))
+        draws = read_as(sections.Draws, written.get("draws", {}))
         if draws is not None:
             findings += spectra_findings(draws, grid)
             if draws.any and grid.has_point(STRONGEST_ALONE):
@@ -454,14 +430,14 @@ class SceneSpec(Study):
     Made by `load` from a file and by `from_mapping` from plain data; values are SI.
     """
 
-    scene: Scene
+    scene: scenes.Scene
     platform: Platform
     scanners: dict[str, AnyScanner] = Field(description="Scan patterns by name")
-    draws: SceneDraws = SceneDraws()
-    error_floor: ErrorFloor = ErrorFloor()
-    navigation: Navigation = Navigation()
-    interface: Interface = Field(default_factory=Interface)
-    storage: SceneStorage = SceneStorage()
+    draws: scenes.SceneDraws = scenes.SceneDraws()
+    error_floor: scenes.ErrorFloor = scenes.ErrorFloor()
+    navigation: scenes.Navigation = scenes.Navigation()
+    interface: scenes.Interface = Field(default_factory=scenes.Interface)
+    storage: scenes.SceneStorage = scenes.SceneStorage()
     figures: tuple[SceneFigure, ...] = Field(
         default=(), description="Figures and tables of the results"
     )
@@ -482,7 +458,7 @@ class SceneSpec(Study):
         cls, written: Mapping[str, Any], grid: Grid, base: Path | None, axes_are_whole: bool
     ) -> list[Finding]:
         """Mistakes in scene, flight, files, random effects and figures."""
-        draws = read_as(SceneDraws, written.get("draws", {})) or SceneDraws()
+        draws = read_as(scenes.SceneDraws, written.get("draws", {})) or scenes.SceneDraws()
         return [
             *scene_findings(written, base),
             *axis_findings(grid),
@@ -522,12 +498,12 @@ class SceneSpec(Study):
 
     def surfaces(self) -> tuple[Surface, ...]:
         """Surfaces by their numbers; no file is looked at."""
-        return surfaces_of(self.scene)
+        return scenes.surfaces_of(self.scene)
 
-    def world(self) -> World:
+    def world(self) -> scenes.World:
         """Build the scene; a `SceneError` for an unfit file or object."""
         flight = self.flight()
-        return build(self.scene, self.files, (flight.start, flight.stop))
+        return scenes.build(self.scene, self.files, (flight.start, flight.stop))
 
     def flight(self) -> Flight:
         """Movement of the instrument in the scene's frame; a `SceneError` for an unfit table."""
@@ -556,13 +532,13 @@ class SceneSpec(Study):
         p = self.parameters()
         return None if beam.is_thesis(p) else partial(beam.angles, p)
 
-    def interface_with(self, fields: Mapping[str, object]) -> Interface:
+    def interface_with(self, fields: Mapping[str, object]) -> scenes.Interface:
         """Return the unit's interface with some fields set anew, written as in a spec."""
         written = {path[-1]: rule.written(v) for path, rule, v in leaves(self.interface)}
         try:
-            return Interface.model_validate({**written, **fields})
+            return scenes.Interface.model_validate({**written, **fields})
         except ValidationError as error:
-            findings = findings_of(error, Interface)
+            findings = findings_of(error, scenes.Interface)
         placed = [replace(each, location=("interface", *each.location)) for each in findings]
         raise SpecError(map(Document({}).mistake, placed))
 
