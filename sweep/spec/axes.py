@@ -434,16 +434,15 @@ def _read_generator(written: dict[Any, Any], rule: Rule, location: Location) -> 
         raise rejected(location, "takes words, which have no steps", "list them")
     kind, findings = kinds[0], Findings()
     allowed = {kind} if kind == "step" else {kind, "number"}
-    for key, value in written.items():
-        if key not in allowed:
-            with findings.of():
-                where = (*location, str(key))
-                raise rejected(where, f"is no part of '{kind}'", f"write {_FORMS[kind]}", value)
+    remedy = f"write {_FORMS[kind]}"
+    for key in (key for key in written if key not in allowed):
+        where = (*location, str(key))
+        findings.append(Finding(where, f"is no part of '{kind}'", remedy, written[key]))
     number = 0
-    if kind != "step":
-        with findings.of((*location, "number"), written.get("number")):
-            if "number" not in written:
-                raise rejected(location, "lacks the number of values", f"write {_FORMS[kind]}")
+    if kind != "step" and "number" not in written:
+        findings.append(Finding(location, "lacks the number of values", remedy))
+    elif kind != "step":
+        with findings.of((*location, "number"), written["number"]):
             number = int(_NUMBER.read(written["number"]))
     values: Values | None = None
     with findings.of():

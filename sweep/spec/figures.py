@@ -235,9 +235,7 @@ def _part(along: str) -> Any:
 
 
 _SCANNER = of.name("Scanner; the first by default", None)
-_RANGES = of.choice(
-    "By whole bins, or interpolated between them", ("quantised", "interpolated"), "quantised"
-)
+_RANGES = of.choice("By whole bins, or interpolated between them", ("quantised", "interpolated"))
 _DRAW = of.count("Number of the draw, from 0", "0", "0", "1e9", default=0)
 _TIME = of.several(
     of.measure("Time", "s", "10 s", "0 s", "1e8 s"), 2, 2, None,
@@ -305,8 +303,8 @@ class _OfNavigation(SceneDrawing):
         of.named("Scanner", "three"), 1, 10_000, None,
         about="Scanners; all by default", noun="names", distinct=True,
     )  # fmt: skip
-    quantity: str = of.choice("Velocity vector or altitude", ("velocity", "altitude"), "velocity")
-    show: str = of.choice("Which statistics", ("all", "availability", "bias", "rmse"), "all")
+    quantity: str = of.choice("Velocity vector or altitude", ("velocity", "altitude"))
+    show: str = of.choice("Which statistics", ("all", "availability", "bias", "rmse"))
     bins: int = of.count("Bins of altitude", "12", "1", "1000", default=12)
 
 

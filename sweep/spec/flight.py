@@ -368,7 +368,7 @@ class Line(Part):
         of.measure("Angle", "rad", "250 urad", "-89 deg", "89 deg"), 1, 1000, (0.0,),
         about="Angle of each beam from nadir towards forward",
     )  # fmt: skip
-    wave: str = of.choice("Constant rate or resonant mirror", ("triangle", "sine"), "triangle")
+    wave: str = of.choice("Constant rate or resonant mirror", ("triangle", "sine"))
     interval: float = _AT_ONCE
 
     def pattern(self) -> Scanner:

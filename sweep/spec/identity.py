@@ -1,4 +1,4 @@
-"""What a flight sees of a scene as part of its identity, and how identities differ."""
+"""Differences of two studies, told in words."""
 
 from __future__ import annotations
 
@@ -8,11 +8,8 @@ from functools import cache
 from types import MappingProxyType
 from typing import Any
 
-from pydantic import BaseModel
-
 from sweep.spec import parts
 from sweep.spec.flight import AnyScanner, Platform, rule_of_beam
-from sweep.spec.grounds import OPTICAL
 from sweep.spec.rules import Rule
 from sweep.spec.scene import ErrorFloor, Navigation, Scene, SceneDraws, SceneStorage
 from sweep.spec.sections import SECTIONS
@@ -26,32 +23,6 @@ ROOTS: parts.Models = (
     Scene, Platform, ErrorFloor, Navigation, SceneDraws, SceneStorage, *parts.models_at(AnyScanner)
 )  # fmt: skip
 """Sections that studies of scenes alone have."""
-
-
-def geometry_of(
-    scene: Scene, platform: Platform, scanner: BaseModel, digests: Mapping[str, str]
-) -> dict[str, Any]:
-    """Scene as a flight sees it through one scanner: all but the beams' own shape.
-
-    Objects count by their place in the scene, which is where their surfaces' numbers come from,
-    and not by name.
-    """
-    places = {name: place for place, name in enumerate(scene.objects)}
-    return {
-        "objects": [
-            _object_geometry(parts.values_of(thing, digests=digests), places)
-            for thing in scene.objects.values()
-        ],
-        "origin": places.get(scene.origin, -1),
-        "platform": parts.values_of(platform, digests=digests),
-        "scanner": parts.values_of(scanner, digests=digests),
-    }
-
-
-def _object_geometry(values: Mapping[str, Any], places: Mapping[str, int]) -> dict[str, Any]:
-    """Object as rays meet it: no reflectance, and the ground that it stands on by place."""
-    kept = {path: v for path, v in values.items() if path.rsplit(".", 1)[-1] not in OPTICAL}
-    return kept | ({"on": places[kept["on"]]} if "on" in kept else {})
 
 
 @cache

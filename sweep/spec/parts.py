@@ -19,6 +19,7 @@ from sweep.model.effects.catalogue import EFFECTS, PARAMETERS
 from sweep.model.effects.effect import MODES, Parameter
 from sweep.scenes.files import SceneError, file_digest
 from sweep.spec.rules import (
+    ABSENT,
     Choice,
     File,
     Flag,
@@ -188,9 +189,10 @@ def text(about: str, default: Any = ..., **more: str) -> Any:
     return field(Text(about=about, **more), default)
 
 
-def choice(about: str, options: tuple[str, ...], default: Any = ...) -> Any:
-    """One of several words."""
-    return field(Choice(about=about, options=options), default)
+def choice(about: str, options: tuple[str, ...], default: Any = ABSENT) -> Any:
+    """One of several words, the first by default."""
+    rule = Choice(about=about, options=options)
+    return field(rule, options[0] if default is ABSENT else default)
 
 
 def flag(about: str, *, default: bool) -> Any:

@@ -67,6 +67,43 @@ class Document:
     """Mistakes found on reading."""
     file: str = ""
     """The file read; empty where there is none."""
+    nodes: int = 0
+    """YAML's nodes read, each as often as an alias repeats it."""
+
+    def read(self, node: yaml.Node, location: Location) -> Any:
+        """Value of one of YAML's nodes, whose places and mistakes are noted."""
+        self.nodes += 1
+        line = node.start_mark.line + 1
+        if self.nodes > MOST_NODES or len(location) > DEEPEST:
+            path, rule = dotted(location)[:200], "holds too many values"
+            raise SpecError([Mistake(path, rule, "", "repeat less with aliases", line, self.file)])
+        self.places.setdefault(location, (self.file, line))
+        if node.tag not in _PLAIN_TAGS:
+            rule = f"has the tag {node.tag}, and tags are not read"
+            self.findings.append(Finding(location, rule, "leave it out"))
+        if isinstance(node, yaml.MappingNode):
+            return self._mapping(node, location)
+        if isinstance(node, yaml.SequenceNode):
+            return [self.read(child, (*location, i)) for i, child in enumerate(node.value)]
+        return _scalar(node)
+
+    def _mapping(self, node: yaml.MappingNode, location: Location) -> dict[str, Any]:
+        """Read a mapping with text keys; of a key given twice the first counts."""
+        values: dict[str, Any] = {}
+        for key_node, child in node.value:
+            if not isinstance(key_node, yaml.ScalarNode):
+                rule = "has a key that is no word"
+                self.findings.append(Finding(location, rule, "begin it with a word"))
+                continue
+            key, line = key_node.value, key_node.start_mark.line + 1
+            inside = (*location, key)
+            if key in values:
+                rule = f"is given twice, on lines {self.places[inside][1]} and {line}"
+                self.findings.append(Finding(inside, rule, "keep one"))
+                continue
+            self.places[inside] = (self.file, line)
+            values[key] = self.read(child, inside)
+        return values
 
     def mistake(self, finding: Finding) -> Mistake:
         """Give a finding its file and line; those of the nearest place around it that has any."""
@@ -81,6 +118,19 @@ class Document:
         """Return findings as they stand in the file, each once; those in other files come last."""
         mistakes = dict.fromkeys(self.mistake(finding) for finding in findings)
         return sorted(mistakes, key=lambda m: (m.file != self.file, m.file, m.line or 0))
+
+
+def _scalar(node: yaml.Node) -> Any:
+    """Read a number, truth value, nothing or text; numbers in decimal notation only."""
+    kind = node.tag.rsplit(":", 1)[-1]
+    if kind == "null":
+        return None
+    if kind == "bool":
+        return node.value.lower() in ("yes", "true", "on")
+    short = len(node.value) <= _MOST_DIGITS
+    if short and kind in ("int", "float") and _DECIMAL.fullmatch(node.value):
+        return int(node.value) if node.value.lstrip("+-").isdigit() else float(node.value)
+    return node.value
 
 
 def read_document(path: Path) -> Document:
@@ -108,7 +158,7 @@ def parsed(text: str, path: Path) -> Document:
     document = Document({}, file=str(path))
     if not isinstance(root, yaml.MappingNode):
         raise _file_error(path, "must hold a mapping", "write e.g. 'title: A study'")
-    document.value = _Walk(document).value(root, ())
+    document.value = document.read(root, ())
     return document
 
 
@@ -160,66 +210,6 @@ class _Loader(yaml.SafeLoader):
         node = super().compose_node(parent, index)  # type: ignore[no-untyped-call]
         self.depth -= 1
         return node
-
-
-@dataclass
-class _Walk:
-    """A walk over YAML's nodes that builds values and notes places."""
-
-    document: Document
-    nodes: int = 0
-
-    def value(self, node: yaml.Node, location: Location) -> Any:
-        """Value of a node."""
-        self.nodes += 1
-        line = node.start_mark.line + 1
-        if self.nodes > MOST_NODES or len(location) > DEEPEST:
-            path, rule = dotted(location)[:200], "holds too many values"
-            file, remedy = self.document.file, "repeat less with aliases"
-            raise SpecError([Mistake(path, rule, "", remedy, line, file)])
-        self.document.places.setdefault(location, (self.document.file, line))
-        if node.tag not in _PLAIN_TAGS:
-            rule = f"has the tag {node.tag}, and tags are not read"
-            self.finding(location, rule, "leave it out")
-        if isinstance(node, yaml.MappingNode):
-            return self.mapping(node, location)
-        if isinstance(node, yaml.SequenceNode):
-            return [self.value(child, (*location, i)) for i, child in enumerate(node.value)]
-        return self.scalar(node, location)
-
-    def mapping(self, node: yaml.MappingNode, location: Location) -> dict[str, Any]:
-        """Read a mapping with text keys; of a key given twice the first counts."""
-        values: dict[str, Any] = {}
-        for key_node, child in node.value:
-            if not isinstance(key_node, yaml.ScalarNode):
-                self.finding(location, "has a key that is no word", "begin it with a word")
-                continue
-            key = key_node.value
-            line = key_node.start_mark.line + 1
-            if key in values:
-                first = self.document.places[(*location, key)][1]
-                rule = f"is given twice, on lines {first} and {line}"
-                self.finding((*location, f"{key}"), rule, "keep one")
-                continue
-            self.document.places[(*location, key)] = (self.document.file, line)
-            values[key] = self.value(child, (*location, key))
-        return values
-
-    def scalar(self, node: yaml.Node, location: Location) -> Any:
-        """Read a number, truth value, nothing or text; numbers in decimal notation only."""
-        kind = node.tag.rsplit(":", 1)[-1]
-        if kind == "null":
-            return None
-        if kind == "bool":
-            return node.value.lower() in ("yes", "true", "on")
-        short = len(node.value) <= _MOST_DIGITS
-        if short and kind in ("int", "float") and _DECIMAL.fullmatch(node.value):
-            return int(node.value) if node.value.lstrip("+-").isdigit() else float(node.value)
-        return node.value
-
-    def finding(self, location: Location, rule: str, suggestion: str) -> None:
-        """Record a mistake, to be reported with all the others."""
-        self.document.findings.append(Finding(location, rule, suggestion))
 
 
 def resolve_instrument(document: Document, base: Path) -> bool:

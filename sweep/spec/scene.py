@@ -263,7 +263,6 @@ class SceneDraws(Part):
         "Draw against the probabilities, add noise to the bins, or draw whole spectra of each "
         "shot for instrument.processing.detector and .estimator to look at",
         ("probabilities", "noise", SPECTRA),
-        "probabilities",
     )
     returns: int = of.count("Points kept of a shot at most", "4", at_most="64", default=4)
 
@@ -355,7 +354,6 @@ class Interface(Part):
     value: str = of.choice(
         "What a report holds of the valid shots in its period: their mean, or the last",
         ("mean", "last"),
-        "mean",
     )
     valid_shots: int = of.count(
         "Valid shots in its period that a report needs to be valid", "3", default=1
@@ -467,7 +465,13 @@ def _grounds(scene: Scene, files: Files) -> tuple[np.ndarray, dict[str, Terrain]
                 raise _unfit(name, error) from None
     origin = np.zeros(3)
     if scene.origin in own:
-        origin = _middle(scene.origin, own[scene.origin])
+        origin = own[scene.origin].centre
+        if not np.isfinite(origin).all():
+            raise SceneError(
+                f"scene.objects.{scene.origin}",
+                "has a hole in its middle, which the scene's origin should be",
+                "take another origin, or 'world'",
+            )
     grounds = {}
     for name, terrain in own.items():
         # One without coordinates of its own stands where its position says, beside the origin.
@@ -475,18 +479,6 @@ def _grounds(scene: Scene, files: Files) -> tuple[np.ndarray, dict[str, Terrain]
         shift = 0.0 if beside else origin
         grounds[name] = replace(terrain, origin=terrain.origin - shift)
     return origin, grounds
-
-
-def _middle(name: str, terrain: Terrain) -> np.ndarray:
-    """Middle of a ground, on it."""
-    centre = terrain.centre
-    if not np.isfinite(centre).all():
-        raise SceneError(
-            f"scene.objects.{name}",
-            "has a hole in its middle, which the scene's origin should be",
-            "take another origin, or 'world'",
-        )
-    return centre
 
 
 def _facets(

@@ -36,7 +36,7 @@ from sweep.spec.grid_rules import (
     spectra_findings,
     without_draws,
 )
-from sweep.spec.identity import geometry_of
+from sweep.spec.grounds import OPTICAL
 from sweep.spec.parts import (
     Files,
     Part,
@@ -361,13 +361,12 @@ def _strongest_findings(grid: Grid) -> Iterator[Finding]:
             yield grid.finding(waveform.PEAKS, rule, f"take all, or {remedy}")
 
 
-def _size_findings(axes: tuple[Axis, ...]) -> list[Finding]:
+def _size_findings(axes: tuple[Axis, ...]) -> Iterator[Finding]:
     """Report a grid too large to count."""
     points = math.prod(axis.size for axis in axes)
-    if points <= LARGEST_GRID:
-        return []
-    rule = f"make {points:.3g} points, and a study has at most {LARGEST_GRID:.0e}"
-    return [Finding(("axes",), rule, "take fewer values")]
+    if points > LARGEST_GRID:
+        rule = f"make {points:.3g} points, and a study has at most {LARGEST_GRID:.0e}"
+        yield Finding(("axes",), rule, "take fewer values")
 
 
 class Spec(Study):
@@ -559,10 +558,20 @@ class SceneSpec(Study):
         """Content of what is seen through one scanner: all that rays depend on, and no more.
 
         Names are no part of it, nor are reflectances, nor where files are: they count by content.
+        Objects count by their place in the scene, which their surfaces' numbers come from.
         """
-        p = self.parameters()
-        seen = geometry_of(self.scene, self.platform, self.scanners[name], self._digests)
-        return seen | {
+        p, digests = self.parameters(), self._digests
+        places = {key: place for place, key in enumerate(self.scene.objects)}
+        objects = []
+        for thing in self.scene.objects.values():
+            values = values_of(thing, digests=digests)
+            values = {path: v for path, v in values.items() if path.split(".")[-1] not in OPTICAL}
+            objects.append(values | ({"on": places[values["on"]]} if "on" in values else {}))
+        return {
+            "objects": objects,
+            "origin": places.get(self.scene.origin, -1),
+            "platform": values_of(self.platform, digests=digests),
+            "scanner": values_of(self.scanners[name], digests=digests),
             "model": VERSION,
             "beamlets": p[BEAMLETS],
             "pattern": self.pattern,
