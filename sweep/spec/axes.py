@@ -435,9 +435,10 @@ def _read_generator(written: dict[Any, Any], rule: Rule, location: Location) -> 
     kind, findings = kinds[0], Findings()
     allowed = {kind} if kind == "step" else {kind, "number"}
     remedy = f"write {_FORMS[kind]}"
-    for key in (key for key in written if key not in allowed):
-        where = (*location, str(key))
-        findings.append(Finding(where, f"is no part of '{kind}'", remedy, written[key]))
+    for key, value in written.items():
+        if key not in allowed:
+            where = (*location, str(key))
+            findings.append(Finding(where, f"is no part of '{kind}'", remedy, value))
     number = 0
     if kind != "step" and "number" not in written:
         findings.append(Finding(location, "lacks the number of values", remedy))

@@ -46,7 +46,7 @@ class Part(BaseModel):
 
 
 # Fields, each declared in a line. Bounds are as a user would write them; a field without a default
-# is required.
+# is required, but for a choice, which is the first of its words by default.
 
 # Far beyond all that flies, and near enough that squares and products stay within a float.
 _EITHER_WAY = {
