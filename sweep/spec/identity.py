@@ -8,7 +8,7 @@ from functools import cache
 from types import MappingProxyType
 from typing import Any
 
-from sweep.spec import parts
+import sweep.spec.parts as parts
 from sweep.spec.flight import AnyScanner, Platform, rule_of_beam
 from sweep.spec.rules import Rule
 from sweep.spec.scene import ErrorFloor, Navigation, Scene, SceneDraws, SceneStorage

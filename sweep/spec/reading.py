@@ -16,10 +16,10 @@ from typing import Any
 import yaml
 from pydantic import BaseModel, ValidationError
 
+import sweep.spec.parts as parts
 from sweep.model.effects.phase_errors import ERROR_TABLE, NO_TABLE
 from sweep.model.threshold import PROCESSING, WAYS
 from sweep.scenes.files import SceneError, read_columns
-from sweep.spec import parts
 from sweep.spec.figures import Figure, SceneFigure
 from sweep.spec.rules import (
     ABSENT,

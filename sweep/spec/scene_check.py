@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 
+import sweep.spec.flight as flights
 import sweep.spec.parts as of
+import sweep.spec.scene as scenes
 from sweep.model import beam
 from sweep.model.ground import pattern as pattern_of
 from sweep.model.outputs import CYCLES, NAVIGATION, POINTS, SHOTS, STATISTICS
 from sweep.model.resolution import PATTERN
 from sweep.scenes.files import SceneError
-from sweep.spec import flight as flights
-from sweep.spec import scene as scenes
 from sweep.spec.axes import place_on_grid
 from sweep.spec.grid_rules import Grid
 from sweep.spec.grid_rules import at as written_at

@@ -15,6 +15,8 @@ import numpy as np
 from pydantic import ConfigDict, Field, PrivateAttr, ValidationError
 
 import sweep.spec.parts as of
+import sweep.spec.scene as scenes
+import sweep.spec.sections as sections
 from sweep.model import VERSION, accuracy, beam, looks, waveform
 from sweep.model.effects import circulator_leak
 from sweep.model.ground import pattern as pattern_of
@@ -22,8 +24,6 @@ from sweep.model.outputs import STRONGEST_OUTPUTS
 from sweep.model.resolution import BEAMLETS, is_open, rays_needed
 from sweep.model.threshold import WAYS
 from sweep.model.waveform import ENDS
-from sweep.spec import scene as scenes
-from sweep.spec import sections
 from sweep.spec.axes import Axis, Member, axis_identity, in_units, paths_on_axes, read_axes
 from sweep.spec.figures import Figure, SceneFigure, figure_findings, scene_figure_findings
 from sweep.spec.flight import AnyScanner, Platform, shots_a_cycle
