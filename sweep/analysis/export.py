@@ -23,7 +23,7 @@ from sweep.analysis.scenes.recording import (
 )
 from sweep.model.pairing import FLAGS, TRUE
 from sweep.spec import Mistake, SpecError
-from sweep.spec.mistakes import near_miss
+from sweep.spec.rules import near_miss
 from sweep.storage.locations import Location, draft
 
 ROW = np.dtype(

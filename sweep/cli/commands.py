@@ -433,8 +433,8 @@ def instruments(name: str | None) -> None:
       sweep instruments settembrini_2026
     """  # noqa: D301
     from sweep.cli.terminal import instrument_lines
-    from sweep.spec.mistakes import near_miss
     from sweep.spec.reading import library, read_document
+    from sweep.spec.rules import near_miss
 
     known = library()
     if name is not None and name not in known:

@@ -4,7 +4,7 @@ from sweep.spec.axes import Axis, Member
 from sweep.spec.clusters import AnyCluster, cluster_of, load_cluster
 from sweep.spec.figures import FalseAlarmTable, Figure, Slices, Surface, Table, ThresholdTable
 from sweep.spec.identity import difference
-from sweep.spec.mistakes import Mistake, SpecError
+from sweep.spec.rules import Mistake, SpecError
 from sweep.spec.schema import json_schema
 from sweep.spec.sections import Draws
 from sweep.spec.study import SceneSpec, Spec, from_stored, load

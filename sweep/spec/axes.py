@@ -5,6 +5,7 @@ The ``axes`` section of a spec is read here as a whole.
 
 from __future__ import annotations
 
+import hashlib
 import math
 import re
 from dataclasses import dataclass, replace
@@ -13,8 +14,16 @@ from typing import Any
 
 import numpy as np
 
-from sweep.spec.mistakes import Finding, Findings, Location, near_miss, rejected
-from sweep.spec.rules import Numeric, Rule, SweepError
+from sweep.spec.rules import (
+    Finding,
+    Findings,
+    Location,
+    Numeric,
+    Rule,
+    SweepError,
+    near_miss,
+    rejected,
+)
 from sweep.spec.sections import parameter_rules, parameter_suggestion, short_name
 from sweep.units import QuantityError, Unit
 
@@ -22,6 +31,8 @@ RESERVED = ("batch", "draw", "point", "spec")
 """Names of dimensions that a store may have besides its axes."""
 
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,60}")
+_LISTED = 64
+"""Values of an axis that its identity lists at most."""
 _REMEDY = "take a word such as 'cut'"
 
 
@@ -57,6 +68,25 @@ class Axis:
     def zipped(self) -> bool:
         """True if the dimension has a name of its own."""
         return len(self.members) > 1 or self.members[0].name != self.name
+
+
+def axis_identity(axis: Axis) -> dict[str, Any]:
+    """Content of an axis: its values where they are few, else their number, ends and digest."""
+    return {"name": axis.name, "members": {m.path: _member_identity(m) for m in axis.members}}
+
+
+def _member_identity(member: Member) -> dict[str, Any]:
+    """Content of one parameter along an axis."""
+    number, words = len(member.values), isinstance(member.values, tuple)
+    if number <= _LISTED:
+        return {"values": list(member.values) if words else np.asarray(member.values).tolist()}
+    if words:
+        content = "\0".join(map(str, member.values)).encode()
+    else:
+        content = (np.asarray(member.values, dtype="<f8") + 0.0).tobytes()  # no -0.0
+    first, last = np.asarray(member.values)[[0, -1]].tolist()
+    digest = hashlib.blake2b(content, digest_size=16).hexdigest()
+    return {"number": number, "first": first, "last": last, "digest": digest}
 
 
 def place_on_grid(path: str, axes: tuple[Axis, ...]) -> Location:
@@ -124,17 +154,17 @@ def _rule_at(path: str, location: Location) -> Rule:
     return rule
 
 
-def _member(path: str, pieces: list[Any], location: Location) -> Member:
-    """Parameter along an axis, from pieces (values or words) laid end to end."""
+def _member(path: str, pieces: list[Values], location: Location) -> Member:
+    """Parameter along an axis, from pieces laid end to end."""
     name = short_name(path)
-    if isinstance(pieces[0], str):
-        return Member(path, name, tuple(pieces), np.array(pieces), "")
-    size = sum(len(piece.si) for piece in pieces)
+    size = _length(pieces)
     if size > MOST_VALUES:
         raise rejected(location, f"has {size} values, and an axis takes at most {MOST_VALUES}")
     # Not in decibels where some piece is not: those have no zero.
     unit = next((piece.unit for piece in pieces if not piece.unit.decibel), pieces[0].unit)
     values = np.concatenate([piece.si for piece in pieces])
+    if values.dtype.kind == "U":
+        return Member(path, name, tuple(values.tolist()), values, "")
     display = np.concatenate([piece.displayed(unit) for piece in pieces])
     if values.dtype == np.int64 and unit.text == "":
         display = values.copy()
@@ -174,7 +204,7 @@ def _read_zip(key: str, written: dict[str, Any], location: Location) -> Axis:
         pieces = {}
     elif isinstance(written["zip"], list):
         pieces = {(*location, "zip", i): piece for i, piece in enumerate(written["zip"])}
-    read: list[dict[str, list[Any]]] = []
+    read: list[dict[str, list[Values]]] = []
     for at, piece in pieces.items():
         with findings.of():
             read.append(_read_piece(piece, at))
@@ -186,22 +216,20 @@ def _read_zip(key: str, written: dict[str, Any], location: Location) -> Axis:
     return Axis(key, tuple(_member(path, values, location) for path, values in laid.items()))
 
 
-def _read_piece(piece: object, location: Location) -> dict[str, list[Any]]:
+def _read_piece(piece: object, location: Location) -> dict[str, list[Values]]:
     """Values of one piece by path, all of one length."""
     if not isinstance(piece, dict) or not piece:
         raise rejected(location, "must be a mapping of paths to values", "", piece)
     findings = Findings()
-    read: dict[str, list[Any]] = {}
+    read: dict[str, list[Values]] = {}
     for path, written in piece.items():
         inside = (*location, str(path))
         with findings.of():
             rule = _rule_at(str(path), inside)
-            several = isinstance(written, dict | list)
-            read[path] = (
-                list(read_pieces(written, rule, inside))
-                if several
-                else [read_single(written, rule, inside)]
-            )
+            if isinstance(written, dict | list):
+                read[path] = read_pieces(written, rule, inside)
+            else:
+                read[path] = [read_single(written, rule, inside)]
     lengths = {path: _length(read[path]) for path in read if isinstance(piece[path], dict | list)}
     if len(set(lengths.values())) > 1:
         text = ", ".join(f"{path} has {n}" for path, n in lengths.items())
@@ -209,23 +237,14 @@ def _read_piece(piece: object, location: Location) -> dict[str, list[Any]]:
     findings.refuse_any()
     length = max(lengths.values(), default=1)
     return {
-        path: values if path in lengths else _repeated(values[0], length)
+        path: values if path in lengths else [values[0].repeated(length)]
         for path, values in read.items()
     }
 
 
-def _length(pieces: list[Any]) -> int:
+def _length(pieces: list[Values]) -> int:
     """Count the values in pieces."""
-    return sum(1 if isinstance(piece, str) else len(piece.si) for piece in pieces)
-
-
-def _repeated(single: Values | str, number: int) -> list[Any]:
-    """Repeat a single value as often as the rest of its piece is long."""
-    if isinstance(single, str):
-        return [single] * number
-    assert single.progression is not None
-    progression = Progression(single.progression.start, number=number)
-    return [replace(single, si=np.repeat(single.si, number), progression=progression)]
+    return sum(len(piece.si) for piece in pieces)
 
 
 # Names
@@ -339,12 +358,8 @@ def values_in(unit: Unit, si: np.ndarray) -> np.ndarray:
 def in_units(rule: Numeric, written: object, units: str) -> float:
     """Written value in the unit of choice."""
     number, unit = rule.exact(written)
-    display = rule.exact(f"1 {units}" if units else 1)[1]
-    if unit.decibel != display.decibel:
-        return float(values_in(display, np.array([unit.to_si(number)]))[0])
-    if unit.decibel:
-        return float(number)
-    return float((unit.factor * number + unit.offset - display.offset) / display.factor)
+    single = Values(np.array([unit.to_si(number)]), unit, Progression(number))
+    return float(single.displayed(rule.exact(f"1 {units}" if units else 1)[1])[0])
 
 
 # Written values
@@ -352,12 +367,12 @@ def in_units(rule: Numeric, written: object, units: str) -> float:
 
 @dataclass(frozen=True)
 class Values:
-    """Numbers of one written piece of an axis."""
+    """Numbers or words of one written piece of an axis."""
 
     si: np.ndarray
-    """SI values (n,)."""
+    """SI values (n,), or words."""
     unit: Unit
-    """The unit they were written in."""
+    """The unit they were written in; of words none."""
     progression: Progression | None = None
     """The same numbers exactly, in `unit`, where they are regular."""
 
@@ -370,8 +385,13 @@ class Values:
         offset = (self.unit.offset - unit.offset) / unit.factor
         return self.progression.mapped(self.unit.factor / unit.factor, offset).values()
 
+    def repeated(self, number: int) -> Values:
+        """Return a single value as often as asked."""
+        progression = self.progression and replace(self.progression, number=number)
+        return replace(self, si=np.repeat(self.si, number), progression=progression)
 
-def read_pieces(written: object, rule: Rule, location: Location) -> list[Values] | list[str]:
+
+def read_pieces(written: object, rule: Rule, location: Location) -> list[Values]:
     """Values of an axis over one field: a list of values and generators, or one generator."""
     if isinstance(written, dict):
         return [_read_generator(written, rule, location)]
@@ -380,7 +400,7 @@ def read_pieces(written: object, rule: Rule, location: Location) -> list[Values]
         raise rejected(location, "must be a list or a generator", remedy, written)
     if not written:
         raise rejected(location, "holds no value", "list at least one")
-    pieces: list[Any] = []
+    pieces: list[Values] = []
     findings = Findings()
     for i, piece in enumerate(written):
         read = _read_generator if isinstance(piece, dict) else read_single
@@ -390,12 +410,12 @@ def read_pieces(written: object, rule: Rule, location: Location) -> list[Values]
     return pieces
 
 
-def read_single(written: object, rule: Rule, location: Location) -> Values | str:
+def read_single(written: object, rule: Rule, location: Location) -> Values:
     """One value: of numeric fields with its unit, of others the word."""
     try:
         value = rule.read(written)
         if not isinstance(rule, Numeric):
-            return str(value)
+            return Values(np.array([str(value)]), Unit(""))
         number, unit = rule.exact(written)
     except QuantityError as error:
         raise rejected(location, error.rule, error.suggestion, written) from None
@@ -414,16 +434,16 @@ def _read_generator(written: dict[Any, Any], rule: Rule, location: Location) -> 
         raise rejected(location, "takes words, which have no steps", "list them")
     kind, findings = kinds[0], Findings()
     allowed = {kind} if kind == "step" else {kind, "number"}
+    remedy = f"write {_FORMS[kind]}"
     for key, value in written.items():
         if key not in allowed:
-            with findings.of():
-                where = (*location, str(key))
-                raise rejected(where, f"is no part of '{kind}'", f"write {_FORMS[kind]}", value)
+            where = (*location, str(key))
+            findings.append(Finding(where, f"is no part of '{kind}'", remedy, value))
     number = 0
-    if kind != "step":
-        with findings.of((*location, "number"), written.get("number")):
-            if "number" not in written:
-                raise rejected(location, "lacks the number of values", f"write {_FORMS[kind]}")
+    if kind != "step" and "number" not in written:
+        findings.append(Finding(location, "lacks the number of values", remedy))
+    elif kind != "step":
+        with findings.of((*location, "number"), written["number"]):
             number = int(_NUMBER.read(written["number"]))
     values: Values | None = None
     with findings.of():

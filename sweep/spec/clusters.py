@@ -13,11 +13,10 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import Field, PrivateAttr, TypeAdapter, ValidationError
 
-import sweep.spec.rules as of
-from sweep.spec.mistakes import Finding, SpecError
+import sweep.spec.parts as of
 from sweep.spec.parts import Part
 from sweep.spec.reading import Document, findings_of, plain, read_document
-from sweep.spec.rules import Numeric, Rule, Special, Text
+from sweep.spec.rules import Finding, Numeric, SpecError, Special, Text
 from sweep.units import QuantityError
 
 LOOPBACK = "127.0.0.1"
@@ -67,35 +66,9 @@ def _read_variables(written: object) -> dict[str, str]:
     return {str(name): str(value) for name, value in written.items()}
 
 
-def _number(about: str, default: Any = ...) -> Any:
-    return of.field(Special(about=about, reader=_read_number), default)
-
-
-def _one_word(about: str, example: str) -> Text:
-    """Rule of one word on a command line: no blanks, no quotes, nothing that a shell reads."""
-    remedy = f"write one word, such as '{example}'"
-    pattern = r"[A-Za-z0-9_.:/@%+=,\[\]~-]{1,500}"
-    return Text(about=about, example=example, pattern=pattern, remedy=remedy)
-
-
-def _word(about: str, example: str, default: Any = ...) -> Any:
-    return of.field(_one_word(about, example), default)
-
-
-def _texts(about: str, rule: Rule, least: int = 0, default: Any = ...) -> Any:
-    return of.several(rule, least, 100_000, default, about=about, noun="texts")
-
-
-def _lines(about: str, example: str) -> Any:
-    line = Text(
-        about="One line", example=example, pattern=r"[^\n\r\0]{1,2000}", remedy="write one line"
-    )
-    return _texts(about, line, default=())
-
-
-def _memory(about: str, default: Any = ...) -> Any:
-    """Declare an amount of memory [byte]."""
-    return of.quantity(about, "byte", "4 GB", "64 MB", "100 TB", default=default)
+_LINE = {"about": "One line", "pattern": r"[^\n\r\0]{1,2000}", "remedy": "write one line"}
+_MOST_TEXTS = 100_000
+_MEMORY = ("byte", "4 GB", "64 MB", "100 TB")
 
 
 class Security(Part):
@@ -110,24 +83,24 @@ class LocalWorker(Part):
     """One worker process of this machine."""
 
     threads: int = of.count("Threads, each with a block of its own", "1", at_most="1000", default=1)
-    memory: float | None = _memory(
-        "Memory that it may take; without one, its share of 90 % of it", None
+    memory: float | None = of.quantity(
+        "Memory that it may take; without one, its share of 90 % of it", *_MEMORY, default=None
     )
 
 
 class Worker(LocalWorker):
     """One worker process."""
 
-    memory: float = _memory("Memory that it may take")
+    memory: float = of.quantity("Memory that it may take", *_MEMORY)
 
 
 class Scheduler(Part):
     """Address of the scheduler, which listens to this machine alone unless told otherwise."""
 
-    host: str = _word("Address that workers reach it by", "10.0.0.5", "")
-    interface: str = _word("Or the network interface that it has", "ib0", "")
+    host: str = of.word("Address that workers reach it by", "10.0.0.5", "")
+    interface: str = of.word("Or the network interface that it has", "ib0", "")
     port: int = of.count("Port; 0 for any", "8786", "0", "65535", default=0)
-    dashboard: str = _word(
+    dashboard: str = of.word(
         "Address of the dashboard; port 0 for any", f"{LOOPBACK}:8787", f"{LOOPBACK}:8787"
     )
 
@@ -139,13 +112,17 @@ class Job(Part):
     walltime: float = of.duration(
         "Time that a job may take; workers leave before it", "2 h", "1 min", "365 d"
     )
-    queue: str = _word("Queue or partition", "normal", "")
-    account: str = _word("Account that is charged", "lidar", "")
-    directives: tuple[str, ...] = _lines("Further options of the job", "--exclusive")
-    prologue: tuple[str, ...] = _lines(
-        "Shell lines before the worker starts", "module load python/3.12"
-    )
-    logs: str = _word("Directory for what jobs print", "logs", "logs")
+    queue: str = of.word("Queue or partition", "normal", "")
+    account: str = of.word("Account that is charged", "lidar", "")
+    directives: tuple[str, ...] = of.several(
+        Text(**_LINE, example="--exclusive"), 0, _MOST_TEXTS, (),
+        about="Further options of the job", noun="texts",
+    )  # fmt: skip
+    prologue: tuple[str, ...] = of.several(
+        Text(**_LINE, example="module load python/3.12"), 0, _MOST_TEXTS, (),
+        about="Shell lines before the worker starts", noun="texts",
+    )  # fmt: skip
+    logs: str = of.word("Directory for what jobs print", "logs", "logs")
 
 
 class Cluster(Part):
@@ -180,7 +157,9 @@ class Local(Started):
     """Processes of this machine."""
 
     kind: Literal["local"]
-    workers: Bounds | None = _number("Workers; without a number, one a core", None)
+    workers: Bounds | None = of.field(
+        Special(about="Workers; without a number, one a core", reader=_read_number), None
+    )
     worker: LocalWorker = LocalWorker()
     scheduler: Scheduler = Scheduler()
 
@@ -200,25 +179,29 @@ class SSH(Started):
     """Machines that are reached by SSH."""
 
     kind: Literal["ssh"]
-    hosts: tuple[str, ...] = _texts("Machines", _one_word("A host", "node1"), 1)
-    workers: Bounds = _number("Workers, dealt out over the machines")
+    hosts: tuple[str, ...] = of.several(
+        of.one_word("A host", "node1"), 1, _MOST_TEXTS, about="Machines", noun="texts"
+    )
+    workers: Bounds = of.field(
+        Special(about="Workers, dealt out over the machines", reader=_read_number)
+    )
     worker: Worker
     scheduler: Scheduler
-    user: str = _word("User there; without one, as here", "lidar", "")
+    user: str = of.word("User there; without one, as here", "lidar", "")
     port: int = of.count("Port of SSH", "22", at_most="65535", default=22)
     identity: str = of.file("Private key to log in with; without one, as ssh does", "")
     known_hosts: str = of.file("Keys of known machines; without one, as ssh does", "")
-    python: str = _word("Python there; without one, the path of this one", "python", "")
+    python: str = of.word("Python there; without one, the path of this one", "python", "")
 
 
 class Batch(Started):
     """Jobs of a batch system."""
 
-    workers: Bounds = _number("Workers, in whole jobs")
+    workers: Bounds = of.field(Special(about="Workers, in whole jobs", reader=_read_number))
     worker: Worker
     job: Job
     scheduler: Scheduler
-    python: str = _word("Python of the jobs; without one, the path of this one", "python", "")
+    python: str = of.word("Python of the jobs; without one, the path of this one", "python", "")
 
 
 class Slurm(Batch):
@@ -236,26 +219,26 @@ class PBS(Batch):
 class Volume(Part):
     """A persistent volume that all pods and this machine see, for stores and scenes."""
 
-    claim: str = _word("Its claim", "studies")
-    path: str = _word("Where it is mounted, the same as here", "/data")
+    claim: str = of.word("Its claim", "studies")
+    path: str = of.word("Where it is mounted, the same as here", "/data")
 
 
 class Kubernetes(Started):
     """Pods that the Dask operator of a Kubernetes cluster starts."""
 
     kind: Literal["kubernetes"]
-    workers: Bounds = _number("Workers, a pod each")
+    workers: Bounds = of.field(Special(about="Workers, a pod each", reader=_read_number))
     worker: Worker
-    image: str = _word("Image with sweep in it", "registry.example.org/sweep:0.1.0")
+    image: str = of.word("Image with sweep in it", "registry.example.org/sweep:0.1.0")
     name: str = of.text(
         "Name of the cluster",
         "sweep",
         pattern=r"[a-z]([a-z0-9-]{0,50}[a-z0-9])?",
         remedy="take small letters, digits and '-', such as 'sweep'",
     )
-    namespace: str = _word("Namespace", "lidar", "default")
+    namespace: str = of.word("Namespace", "lidar", "default")
     volume: Volume | None = None
-    secret: str = _word(
+    secret: str = of.word(
         "Secret with ca.pem, certificate.pem and key.pem, where there is TLS", "sweep-tls", ""
     )
 

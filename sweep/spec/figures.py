@@ -10,24 +10,12 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
-import sweep.spec.rules as of
-from sweep.model.outputs import (
-    ACCURACY_OUTPUTS,
-    DRAW_OUTPUTS,
-    ERROR_OUTPUTS,
-    OUTPUTS,
-    POINTS,
-    SHOTS,
-    SPECTRA_OUTPUTS,
-    STATISTICS,
-    STRONGEST_OUTPUTS,
-    XYZ,
-)
+import sweep.spec.parts as of
+from sweep.model import outputs
 from sweep.spec.axes import Axis
 from sweep.spec.flight import AnyScanner, shots_a_cycle
-from sweep.spec.mistakes import Finding, Location, near_miss
 from sweep.spec.parts import Part, read_as
-from sweep.spec.rules import Choice, Special
+from sweep.spec.rules import Choice, Finding, Location, Special, near_miss
 from sweep.spec.scene import SceneDraws
 from sweep.spec.sections import SPECTRA, parameter_rules
 from sweep.units import QuantityError, read_number
@@ -191,9 +179,9 @@ Figure = Annotated[
 
 # Figures of scenes
 
+_SHOWN = outputs.SHOTS | outputs.STATISTICS | outputs.POINTS
 QUANTITIES = (
-    *(name for table in (SHOTS, STATISTICS, POINTS) for name, output in table.items()
-      if XYZ not in output.dims),
+    *(name for name, output in _SHOWN.items() if outputs.XYZ not in output.dims),
     "altitude", "x", "y", "z", "shot",
 )  # fmt: skip
 """Quantities of shots and of points that a figure can show."""
@@ -247,9 +235,7 @@ def _part(along: str) -> Any:
 
 
 _SCANNER = of.name("Scanner; the first by default", None)
-_RANGES = of.choice(
-    "By whole bins, or interpolated between them", ("quantised", "interpolated"), "quantised"
-)
+_RANGES = of.choice("By whole bins, or interpolated between them", ("quantised", "interpolated"))
 _DRAW = of.count("Number of the draw, from 0", "0", "0", "1e9", default=0)
 _TIME = of.several(
     of.measure("Time", "s", "10 s", "0 s", "1e8 s"), 2, 2, None,
@@ -317,8 +303,8 @@ class _OfNavigation(SceneDrawing):
         of.named("Scanner", "three"), 1, 10_000, None,
         about="Scanners; all by default", noun="names", distinct=True,
     )  # fmt: skip
-    quantity: str = of.choice("Velocity vector or altitude", ("velocity", "altitude"), "velocity")
-    show: str = of.choice("Which statistics", ("all", "availability", "bias", "rmse"), "all")
+    quantity: str = of.choice("Velocity vector or altitude", ("velocity", "altitude"))
+    show: str = of.choice("Which statistics", ("all", "availability", "bias", "rmse"))
     bins: int = of.count("Bins of altitude", "12", "1", "1000", default=12)
 
 
@@ -427,15 +413,15 @@ def _variable_findings(
     variable = getattr(figure, "variable", None)
     asked = ("number", "limit") if isinstance(draws, Mapping) else ()
     with_draws = any(draws.get(name, 0) not in (0, "0") for name in asked)  # type: ignore[attr-defined]
-    drawn = DRAW_OUTPUTS | ERROR_OUTPUTS | ACCURACY_OUTPUTS
-    known = {*OUTPUTS, *further}
+    drawn = outputs.DRAW_OUTPUTS | outputs.ERROR_OUTPUTS | outputs.ACCURACY_OUTPUTS
+    known = {*outputs.OUTPUTS, *further}
     if variable is None or variable in known or (with_draws and variable in drawn):
         return
     rule, remedy = "is no stored quantity", near_miss(variable, [*known, *drawn])
     if variable in drawn:
         rule = "is found over draws, and this study has none"
         remedy = "set draws: {number: ...} or {limit: ...}"
-    elif variable in STRONGEST_OUTPUTS:
+    elif variable in outputs.STRONGEST_OUTPUTS:
         rule = "is found where segments report their strongest peak alone"
         remedy = "set instrument.processing.peaks: strongest"
     yield Finding((*at, "variable"), rule, remedy, variable)
@@ -443,7 +429,7 @@ def _variable_findings(
 
 def _spectra_findings(figure: Any, at: Location) -> Iterator[Finding]:
     """Report closed forms that a study of whole spectra does not store."""
-    stored = SPECTRA_OUTPUTS | ACCURACY_OUTPUTS | DRAW_OUTPUTS
+    stored = outputs.SPECTRA_OUTPUTS | outputs.ACCURACY_OUTPUTS | outputs.DRAW_OUTPUTS
     variable = getattr(figure, "variable", None)
     if variable is None:
         rule = "shows closed forms, which a study of whole spectra does not store"

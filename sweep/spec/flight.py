@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-import sweep.spec.rules as of
+import sweep.spec.parts as of
 from sweep.model.geometry import platform as laws
 from sweep.model.geometry import quaternion
 from sweep.model.geometry import scanner as patterns
@@ -267,20 +267,14 @@ def rule_of_beam(beam: object) -> Several:
 
 
 _REACH = ("0 deg", "89 deg")
-
-
 _RATE = of.frequency("Measurement cycles a second")
-
-
-def _interval(default: str, value: float | None) -> Any:
-    """Field of the time from beam to beam."""
-    about = f"Time from one beam of a cycle to the next; {default} by default"
-    return of.duration(about, "10 ms", default=value)
-
-
-def _angles(about: str, example: str, *bounds: str, number: tuple[int, int], **more: Any) -> Any:
-    """Field of several angles."""
-    return of.several(of.measure("Angle", "rad", example, *bounds), *number, about=about, **more)
+_AT_ONCE = of.duration(
+    "Time from one beam of a cycle to the next; 0, all at once, by default", "10 ms", default=0.0
+)
+_SPREAD = of.duration(
+    "Time from one beam of a cycle to the next; spread evenly over the cycle by default",
+    "10 ms", default=None,
+)  # fmt: skip
 
 
 class Cone(Part):
@@ -291,7 +285,7 @@ class Cone(Part):
     half_angle: float = of.angle("From nadir", "22.5 deg", *_REACH)
     azimuth: float = of.angle("Of the first beam, from forward to the left", default=0.0)
     rate: float = _RATE
-    interval: float = _interval("0, all at once,", 0.0)
+    interval: float = _AT_ONCE
 
     def pattern(self) -> Scanner:
         """Return the scan pattern."""
@@ -307,7 +301,7 @@ class FixedBeams(Part):
         Beams(about="Angles towards forward and left, or vectors in the body frame, of each beam")
     )
     rate: float = _RATE
-    interval: float = _interval("0, all at once,", 0.0)
+    interval: float = _AT_ONCE
 
     def pattern(self) -> Scanner:
         """Return the scan pattern."""
@@ -321,7 +315,7 @@ class Corners(Part):
     kind: Literal["corners"]
     angle: float = of.angle("Of both axes from nadir", "22.5 deg", *_REACH)
     rate: float = _RATE
-    interval: float | None = _interval("spread evenly over the cycle", None)
+    interval: float | None = _SPREAD
 
     def pattern(self) -> Scanner:
         """Return the scan pattern."""
@@ -332,12 +326,12 @@ class Squares(Part):
     """One beam steered by stacked elements, square after square; a cycle is a square."""
 
     kind: Literal["squares"]
-    elements: Vector = _angles(
-        "Angle by which each element of an axis throws the beam to either side",
-        "15 deg", "1e-6 deg", "45 deg", number=(1, 5),
+    elements: Vector = of.several(
+        of.measure("Angle", "rad", "15 deg", "1e-6 deg", "45 deg"), 1, 5,
+        about="Angle by which each element of an axis throws the beam to either side",
     )  # fmt: skip
     rate: float = _RATE
-    interval: float | None = _interval("spread evenly over the cycle", None)
+    interval: float | None = _SPREAD
 
     def pattern(self) -> Scanner:
         """Return the scan pattern."""
@@ -351,9 +345,10 @@ class RasterScan(Part):
     kind: Literal["raster"]
     columns: int = of.count("Directions across", "32", at_most=str(MOST_BEAMS))
     rows: int = of.count("Directions along", "32", at_most=str(MOST_BEAMS))
-    half_angles: Vector = _angles(
-        "Reach to each side of nadir, across and along", "10 deg", *_REACH, number=(2, 2)
-    )
+    half_angles: Vector = of.several(
+        of.measure("Angle", "rad", "10 deg", *_REACH), 2, 2,
+        about="Reach to each side of nadir, across and along",
+    )  # fmt: skip
     rate: float = _RATE
     both_ways: bool = of.flag("Every other row runs backwards", default=True)
 
@@ -369,12 +364,12 @@ class Line(Part):
     half_angle: float = of.angle("Reach of the sweep to each side", "5 deg", *_REACH)
     line_rate: float = of.frequency("Lines a second; a sweep one way is a line")
     rate: float = _RATE
-    along: Vector = _angles(
-        "Angle of each beam from nadir towards forward",
-        "250 urad", "-89 deg", "89 deg", number=(1, 1000), default=(0.0,),
+    along: Vector = of.several(
+        of.measure("Angle", "rad", "250 urad", "-89 deg", "89 deg"), 1, 1000, (0.0,),
+        about="Angle of each beam from nadir towards forward",
     )  # fmt: skip
-    wave: str = of.choice("Constant rate or resonant mirror", ("triangle", "sine"), "triangle")
-    interval: float = _interval("0, all at once,", 0.0)
+    wave: str = of.choice("Constant rate or resonant mirror", ("triangle", "sine"))
+    interval: float = _AT_ONCE
 
     def pattern(self) -> Scanner:
         """Return the scan pattern."""

@@ -29,8 +29,8 @@ from sweep.model.estimators import DEFAULTS, DETECTOR, ESTIMATOR
 from sweep.model.preparation import RECORD
 from sweep.model.waveform import ENDS, RANGES, VELOCITIES
 from sweep.spec.axes import Axis, place_on_grid
-from sweep.spec.mistakes import ABSENT, Finding
-from sweep.spec.parts import OFF, ON, rules_of
+from sweep.spec.parts import AUTO, OFF, ON, rules_of
+from sweep.spec.rules import ABSENT, Finding
 from sweep.spec.sections import SPECTRA, Draws, Effects, default_of, parameter_rules
 from sweep.units import QuantityError
 
@@ -87,10 +87,8 @@ class Grid:
                     values[path] = value
         modes: dict[str, str] = {}
         for name, rule in rules_of(Effects, "").items():
-            found = at(written, f"effects.{name}")
             with suppress(QuantityError):
-                default = Effects.model_fields[name].default
-                modes[name] = default if found is ABSENT else rule.read(found)
+                modes[name] = rule.read(at(written, f"effects.{name}", AUTO))
         return cls(values, axes, modes)
 
     def knows(self, *paths: str) -> bool:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-import sweep.spec.rules as of
+import sweep.spec.parts as of
 from sweep.model.ground import LAWS
 from sweep.scenes.rasters import MOST_CELLS, raster_digest, read_raster
 from sweep.spec.parts import Files, Part

@@ -1,100 +1,28 @@
-"""Identity of a study: its content in SI values, and the hash of it."""
+"""Differences of two studies, told in words."""
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from functools import cache
 from types import MappingProxyType
 from typing import Any
 
-import numpy as np
-from pydantic import BaseModel
-
-from sweep.spec.axes import Axis, Member
+import sweep.spec.parts as parts
 from sweep.spec.flight import AnyScanner, Platform, rule_of_beam
-from sweep.spec.grounds import OPTICAL
-from sweep.spec.parts import Models, all_parts, fields_of, models_at, rule_of, values_of
 from sweep.spec.rules import Rule
 from sweep.spec.scene import ErrorFloor, Navigation, Scene, SceneDraws, SceneStorage
 from sweep.spec.sections import SECTIONS
 from sweep.units import read_unit
 
-LISTED_VALUES = 64
 MOST_TOLD = 8
 """Values of an axis that are told one by one."""
 LONGEST_TOLD = 200
 """Characters of a word that are told."""
-ROOTS: Models = (
-    Scene, Platform, ErrorFloor, Navigation, SceneDraws, SceneStorage, *models_at(AnyScanner)
+ROOTS: parts.Models = (
+    Scene, Platform, ErrorFloor, Navigation, SceneDraws, SceneStorage, *parts.models_at(AnyScanner)
 )  # fmt: skip
 """Sections that studies of scenes alone have."""
-
-
-def axis_identity(axis: Axis) -> dict[str, Any]:
-    """Content of an axis: its values where they are few, else their number, ends and digest."""
-    return {"name": axis.name, "members": {m.path: _member_identity(m) for m in axis.members}}
-
-
-def _member_identity(member: Member) -> dict[str, Any]:
-    """Content of one parameter along an axis."""
-    number, words = len(member.values), isinstance(member.values, tuple)
-    if number <= LISTED_VALUES:
-        return {"values": list(member.values) if words else np.asarray(member.values).tolist()}
-    if words:
-        content = "\0".join(map(str, member.values)).encode()
-    else:
-        content = (np.asarray(member.values, dtype="<f8") + 0.0).tobytes()  # no -0.0
-    first, last = np.asarray(member.values)[[0, -1]].tolist()
-    digest = hashlib.blake2b(content, digest_size=16).hexdigest()
-    return {"number": number, "first": first, "last": last, "digest": digest}
-
-
-def canonical(value: Any) -> Any:
-    """Value in the one form that its equals share: whole floats as integers, keys in order."""
-    if isinstance(value, Mapping):
-        return {str(key): canonical(value[key]) for key in sorted(value)}
-    if isinstance(value, list | tuple):
-        return [canonical(item) for item in value]
-    if isinstance(value, float) and value.is_integer() and abs(value) < 2**53:
-        return int(value)
-    return value
-
-
-def digest(identity: Mapping[str, Any]) -> str:
-    """Hash of an identity: 128 bits of BLAKE2b over its canonical JSON, in hex."""
-    text = json.dumps(
-        canonical(identity), separators=(",", ":"), ensure_ascii=True, allow_nan=False
-    )
-    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
-
-
-def geometry_of(
-    scene: Scene, platform: Platform, scanner: BaseModel, digests: Mapping[str, str]
-) -> dict[str, Any]:
-    """Scene as a flight sees it through one scanner: all but the beams' own shape.
-
-    Objects count by their place in the scene, which is where their surfaces' numbers come from,
-    and not by name.
-    """
-    places = {name: place for place, name in enumerate(scene.objects)}
-    return {
-        "objects": [
-            _object_geometry(values_of(thing, digests=digests), places)
-            for thing in scene.objects.values()
-        ],
-        "origin": places.get(scene.origin, -1),
-        "platform": values_of(platform, digests=digests),
-        "scanner": values_of(scanner, digests=digests),
-    }
-
-
-def _object_geometry(values: Mapping[str, Any], places: Mapping[str, int]) -> dict[str, Any]:
-    """Object as rays meet it: no reflectance, and the ground that it stands on by place."""
-    kept = {path: v for path, v in values.items() if path.rsplit(".", 1)[-1] not in OPTICAL}
-    return kept | ({"on": places[kept["on"]]} if "on" in kept else {})
 
 
 @cache
@@ -102,17 +30,16 @@ def field_rules() -> MappingProxyType[str, Rule]:
     """Rule of every field by its name: one name has one unit wherever it stands."""
     return MappingProxyType({
         name: rule
-        for model in all_parts(*SECTIONS.values(), *ROOTS)
-        for name, field in fields_of(model).items()
-        if (rule := rule_of(field))
+        for model in parts.all_parts(*SECTIONS.values(), *ROOTS)
+        for name, field in parts.fields_of(model).items()
+        if (rule := parts.rule_of(field))
     })  # fmt: skip
 
 
 def difference(a: Any, b: Any) -> list[str]:
     """Lines ``path: value -> value`` for each difference between two specs or their identities."""
-    left, right = (
-        _flat(canonical(side if isinstance(side, Mapping) else side.identity())) for side in (a, b)
-    )
+    sides = (side if isinstance(side, Mapping) else side.identity() for side in (a, b))
+    left, right = (_flat(parts.canonical(side)) for side in sides)
     lines = []
     for path in [*left, *(path for path in right if path not in left)]:
         if left.get(path) != right.get(path):

@@ -1,8 +1,10 @@
-"""Sections of a spec and walks over them: their fields, their values, the files they name."""
+"""Sections of a spec: how their fields are declared, and walks over fields, values and files."""
 
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import json
 import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -11,13 +13,23 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, NamedTuple, TypeVar, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError, create_model
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, create_model
 
 from sweep.model.effects.catalogue import EFFECTS, PARAMETERS
 from sweep.model.effects.effect import MODES, Parameter
 from sweep.scenes.files import SceneError, file_digest
-from sweep.spec.mistakes import Location
-from sweep.spec.rules import Choice, File, Numeric, Rule, SweepError, Text
+from sweep.spec.rules import (
+    ABSENT,
+    Choice,
+    File,
+    Flag,
+    Location,
+    Numeric,
+    Rule,
+    Several,
+    SweepError,
+    Text,
+)
 
 AUTO, ON, OFF = MODES
 Models = tuple[type[BaseModel], ...]
@@ -31,6 +43,166 @@ class Part(BaseModel):
     """A section of a spec: frozen, and with no field but its own."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+# Fields, each declared in a line. Bounds are as a user would write them; a field without a default
+# is required, but for a choice, which is the first of its words by default.
+
+# Far beyond all that flies, and near enough that squares and products stay within a float.
+_EITHER_WAY = {
+    "m": "1e9 m",
+    "rad": "1e6 deg",
+    "m/s": "1000 km/s",
+    "m/s^2": "1e6 m/s^2",
+    "rad/s": "1e6 deg/s",
+    "": "1e12",
+}
+"""Largest magnitude of a signed quantity, by its SI unit."""
+
+
+def field(rule: Rule, default: Any = ..., *, alias: str | None = None) -> Any:
+    """Field that holds what a rule says; required without a default."""
+    info = Field(default, alias=alias)
+    info.metadata.append(rule)
+    return info
+
+
+def measure(
+    about: str, unit: str, example: str, at_least: str = "", at_most: str = "", **more: Any
+) -> Numeric:
+    """Rule of a quantity within bounds, wide ones by default."""
+    bounds = {"at_least": at_least or f"-{_EITHER_WAY[unit]}"} if "above" not in more else {}
+    bounds |= {"at_most": at_most or _EITHER_WAY[unit]} if "below" not in more else {}
+    return Numeric(about=about, si_unit=unit, example=example, **bounds, **more)  # type: ignore[arg-type]
+
+
+def quantity(
+    about: str,
+    unit: str,
+    example: str,
+    at_least: str = "",
+    at_most: str = "",
+    *,
+    default: Any = ...,
+    word: str = "",
+    **more: Any,
+) -> Any:
+    """Declare a number with a unit; the word, if there is one, stands for the default."""
+    more |= {"word": word, "means": more.get("means", default)} if word else {}
+    return field(measure(about, unit, example, at_least, at_most, **more), default)
+
+
+def number(about: str, example: str = "0.5", *bounds: str, **more: Any) -> Any:
+    """Pure number."""
+    return quantity(about, "", example, *bounds, **more)
+
+
+def count(
+    about: str, example: str = "3", at_least: str = "1", at_most: str = "1e6", **more: Any
+) -> Any:
+    """Whole number."""
+    return quantity(about, "", example, at_least, at_most, whole=True, **more)
+
+
+def length(about: str, example: str = "10 m", *bounds: str, **more: Any) -> Any:
+    """Length of either sign."""
+    return quantity(about, "m", example, *bounds, **more)
+
+
+def size(about: str, example: str = "10 m", **more: Any) -> Any:
+    """Length above 0."""
+    return length(about, example, "1 um", **more)
+
+
+def angle(about: str, example: str = "10 deg", *bounds: str, **more: Any) -> Any:
+    """Angle of either sign."""
+    return quantity(about, "rad", example, *bounds, **more)
+
+
+def speed(about: str, **more: Any) -> Any:
+    """Speed, not signed."""
+    return quantity(about, "m/s", "30 m/s", "0 m/s", **more)
+
+
+def duration(
+    about: str, example: str = "10 s", at_least: str = "0 s", at_most: str = "1e8 s", **more: Any
+) -> Any:
+    """Time, 0 to some years by default."""
+    return quantity(about, "s", example, at_least, at_most, **more)
+
+
+def frequency(about: str, example: str = "20 Hz") -> Any:
+    """Rate above 0."""
+    return quantity(about, "Hz", example, "1e-6 Hz", "1e9 Hz")
+
+
+def several(of: Rule, least: int, most: int, default: Any = ..., **more: Any) -> Any:
+    """List of values, each held to the same rule, described by `about`."""
+    alias = more.pop("alias", None)
+    return field(Several(of=of, least=least, most=most, **more), default, alias=alias)
+
+
+def vector(about: str, unit: str, example: str, *, of: int = 3, **more: Any) -> Any:
+    """Components of a vector of so many dimensions."""
+    return several(measure("Component", unit, example), of, of, about=about, **more)
+
+
+def position(about: str, *, of: int = 3, **more: Any) -> Any:
+    """Position in so many dimensions."""
+    return vector(about, "m", "10 m", of=of, **more)
+
+
+def seed(about: str = "Seed of its random numbers") -> Any:
+    """Seed, 0 by default."""
+    return count(about, "1", "0", "2^63", default=0)
+
+
+def named(about: str, example: str = "ground") -> Text:
+    """Rule of the name of an object or a scanner."""
+    return Text(
+        about=about,
+        example=example,
+        pattern=r"[a-z][a-z0-9_]{0,59}",
+        remedy="take small letters, digits and '_', such as 'ground'",
+    )
+
+
+def name(about: str, default: Any = ...) -> Any:
+    """Name of an object or a scanner."""
+    return field(named(about), default)
+
+
+def one_word(about: str, example: str) -> Text:
+    """Rule of one word on a command line: no blanks, no quotes, nothing that a shell reads."""
+    remedy = f"write one word, such as '{example}'"
+    pattern = r"[A-Za-z0-9_.:/@%+=,\[\]~-]{1,500}"
+    return Text(about=about, example=example, pattern=pattern, remedy=remedy)
+
+
+def word(about: str, example: str, default: Any = ...) -> Any:
+    """One word on a command line."""
+    return field(one_word(about, example), default)
+
+
+def text(about: str, default: Any = ..., **more: str) -> Any:
+    """Text for people, or of a pattern with a remedy."""
+    return field(Text(about=about, **more), default)
+
+
+def choice(about: str, options: tuple[str, ...], default: Any = ABSENT) -> Any:
+    """One of several words, the first by default."""
+    rule = Choice(about=about, options=options)
+    return field(rule, options[0] if default is ABSENT else default)
+
+
+def flag(about: str, *, default: bool) -> Any:
+    """Declare a field that is true or false."""
+    return field(Flag(about=about), default)
+
+
+def file(about: str, default: Any = ..., **more: Any) -> Any:
+    """Path of a file."""
+    return field(File(about=about, **more), default)
 
 
 # Fields that physical effects bring into sections, as the model's catalogue declares them
@@ -234,6 +406,28 @@ def fill(mapping: dict[str, Any], path: list[str], value: Any) -> bool:
     lacking = path[-1] not in mapping
     mapping.setdefault(path[-1], value)
     return lacking
+
+
+# Identities
+
+
+def canonical(value: Any) -> Any:
+    """Value in the one form that its equals share: whole floats as integers, keys in order."""
+    if isinstance(value, Mapping):
+        return {str(key): canonical(value[key]) for key in sorted(value)}
+    if isinstance(value, list | tuple):
+        return [canonical(item) for item in value]
+    if isinstance(value, float) and value.is_integer() and abs(value) < 2**53:
+        return int(value)
+    return value
+
+
+def digest(identity: Mapping[str, Any]) -> str:
+    """Hash of an identity: 128 bits of BLAKE2b over its canonical JSON, in hex."""
+    text = json.dumps(
+        canonical(identity), separators=(",", ":"), ensure_ascii=True, allow_nan=False
+    )
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
 
 # Files that sections name

@@ -9,22 +9,25 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import yaml
 from pydantic import BaseModel, ValidationError
 
+import sweep.spec.parts as parts
 from sweep.model.effects.phase_errors import ERROR_TABLE, NO_TABLE
 from sweep.model.threshold import PROCESSING, WAYS
 from sweep.scenes.files import SceneError, read_columns
 from sweep.spec.figures import Figure, SceneFigure
-from sweep.spec.mistakes import (
+from sweep.spec.rules import (
     ABSENT,
+    BROKEN_RULE,
     Finding,
     Location,
     Mistake,
+    Numeric,
     Rejected,
     SpecError,
     dotted,
@@ -32,17 +35,6 @@ from sweep.spec.mistakes import (
     rejected,
     shown,
 )
-from sweep.spec.parts import (
-    Models,
-    Place,
-    fields_of,
-    kind_of,
-    models_at,
-    place_of,
-    rule_of,
-    rules_of,
-)
-from sweep.spec.rules import BROKEN_RULE, Numeric
 from sweep.spec.sections import parameter_rules
 
 LARGEST_FILE = 1_000_000
@@ -75,6 +67,43 @@ class Document:
     """Mistakes found on reading."""
     file: str = ""
     """The file read; empty where there is none."""
+    nodes: int = 0
+    """YAML's nodes read, each as often as an alias repeats it."""
+
+    def read(self, node: yaml.Node, location: Location) -> Any:
+        """Value of one of YAML's nodes, whose places and mistakes are noted."""
+        self.nodes += 1
+        line = node.start_mark.line + 1
+        if self.nodes > MOST_NODES or len(location) > DEEPEST:
+            path, rule = dotted(location)[:200], "holds too many values"
+            raise SpecError([Mistake(path, rule, "", "repeat less with aliases", line, self.file)])
+        self.places.setdefault(location, (self.file, line))
+        if node.tag not in _PLAIN_TAGS:
+            rule = f"has the tag {node.tag}, and tags are not read"
+            self.findings.append(Finding(location, rule, "leave it out"))
+        if isinstance(node, yaml.MappingNode):
+            return self._mapping(node, location)
+        if isinstance(node, yaml.SequenceNode):
+            return [self.read(child, (*location, i)) for i, child in enumerate(node.value)]
+        return _scalar(node)
+
+    def _mapping(self, node: yaml.MappingNode, location: Location) -> dict[str, Any]:
+        """Read a mapping with text keys; of a key given twice the first counts."""
+        values: dict[str, Any] = {}
+        for key_node, child in node.value:
+            if not isinstance(key_node, yaml.ScalarNode):
+                rule = "has a key that is no word"
+                self.findings.append(Finding(location, rule, "begin it with a word"))
+                continue
+            key, line = key_node.value, key_node.start_mark.line + 1
+            inside = (*location, key)
+            if key in values:
+                rule = f"is given twice, on lines {self.places[inside][1]} and {line}"
+                self.findings.append(Finding(inside, rule, "keep one"))
+                continue
+            self.places[inside] = (self.file, line)
+            values[key] = self.read(child, inside)
+        return values
 
     def mistake(self, finding: Finding) -> Mistake:
         """Give a finding its file and line; those of the nearest place around it that has any."""
@@ -89,6 +118,19 @@ class Document:
         """Return findings as they stand in the file, each once; those in other files come last."""
         mistakes = dict.fromkeys(self.mistake(finding) for finding in findings)
         return sorted(mistakes, key=lambda m: (m.file != self.file, m.file, m.line or 0))
+
+
+def _scalar(node: yaml.Node) -> Any:
+    """Read a number, truth value, nothing or text; numbers in decimal notation only."""
+    kind = node.tag.rsplit(":", 1)[-1]
+    if kind == "null":
+        return None
+    if kind == "bool":
+        return node.value.lower() in ("yes", "true", "on")
+    short = len(node.value) <= _MOST_DIGITS
+    if short and kind in ("int", "float") and _DECIMAL.fullmatch(node.value):
+        return int(node.value) if node.value.lstrip("+-").isdigit() else float(node.value)
+    return node.value
 
 
 def read_document(path: Path) -> Document:
@@ -116,7 +158,7 @@ def parsed(text: str, path: Path) -> Document:
     document = Document({}, file=str(path))
     if not isinstance(root, yaml.MappingNode):
         raise _file_error(path, "must hold a mapping", "write e.g. 'title: A study'")
-    document.value = _Walk(document).value(root, ())
+    document.value = document.read(root, ())
     return document
 
 
@@ -170,66 +212,6 @@ class _Loader(yaml.SafeLoader):
         return node
 
 
-@dataclass
-class _Walk:
-    """A walk over YAML's nodes that builds values and notes places."""
-
-    document: Document
-    nodes: int = 0
-
-    def value(self, node: yaml.Node, location: Location) -> Any:
-        """Value of a node."""
-        self.nodes += 1
-        line = node.start_mark.line + 1
-        if self.nodes > MOST_NODES or len(location) > DEEPEST:
-            path, rule = dotted(location)[:200], "holds too many values"
-            file, remedy = self.document.file, "repeat less with aliases"
-            raise SpecError([Mistake(path, rule, "", remedy, line, file)])
-        self.document.places.setdefault(location, (self.document.file, line))
-        if node.tag not in _PLAIN_TAGS:
-            rule = f"has the tag {node.tag}, and tags are not read"
-            self.finding(location, rule, "leave it out")
-        if isinstance(node, yaml.MappingNode):
-            return self.mapping(node, location)
-        if isinstance(node, yaml.SequenceNode):
-            return [self.value(child, (*location, i)) for i, child in enumerate(node.value)]
-        return self.scalar(node, location)
-
-    def mapping(self, node: yaml.MappingNode, location: Location) -> dict[str, Any]:
-        """Read a mapping with text keys; of a key given twice the first counts."""
-        values: dict[str, Any] = {}
-        for key_node, child in node.value:
-            if not isinstance(key_node, yaml.ScalarNode):
-                self.finding(location, "has a key that is no word", "begin it with a word")
-                continue
-            key = key_node.value
-            line = key_node.start_mark.line + 1
-            if key in values:
-                first = self.document.places[(*location, key)][1]
-                rule = f"is given twice, on lines {first} and {line}"
-                self.finding((*location, f"{key}"), rule, "keep one")
-                continue
-            self.document.places[(*location, key)] = (self.document.file, line)
-            values[key] = self.value(child, (*location, key))
-        return values
-
-    def scalar(self, node: yaml.Node, location: Location) -> Any:
-        """Read a number, truth value, nothing or text; numbers in decimal notation only."""
-        kind = node.tag.rsplit(":", 1)[-1]
-        if kind == "null":
-            return None
-        if kind == "bool":
-            return node.value.lower() in ("yes", "true", "on")
-        short = len(node.value) <= _MOST_DIGITS
-        if short and kind in ("int", "float") and _DECIMAL.fullmatch(node.value):
-            return int(node.value) if node.value.lstrip("+-").isdigit() else float(node.value)
-        return node.value
-
-    def finding(self, location: Location, rule: str, suggestion: str) -> None:
-        """Record a mistake, to be reported with all the others."""
-        self.document.findings.append(Finding(location, rule, suggestion))
-
-
 def resolve_instrument(document: Document, base: Path) -> bool:
     """Put an instrument of the library or of a file in the place of its name; False without one."""
     written = document.value.get("instrument")
@@ -245,22 +227,17 @@ def resolve_instrument(document: Document, base: Path) -> bool:
     elif not isinstance(written, str):
         return True
     try:
-        inside, read = _instrument_of(reference, location, base)
+        read = _instrument_of(reference, location, base)
     except Rejected as error:
         document.findings += error.findings
         return False
-    own = read.value["instrument"] if inside else read.value
+    own = read.value["instrument"]
     _read_error_table(document, own, Path(read.file).parent)
     document.value["instrument"] = merged(_without_threshold(own, overrides), overrides)
     kept = {place: at for place, at in document.places.items() if _is_leaf(document.value, place)}
-    within = {place: at for place, at in read.places.items() if len(place) > inside}
-    if inside:
-        within = {place[1:]: at for place, at in within.items() if place[0] == "instrument"}
-    places = {("instrument", *place): at for place, at in within.items()}
-    document.places = document.places | places | kept
-    document.findings += [
-        Finding(("instrument", *f.location), f.rule, f.suggestion, f.written) for f in read.findings
-    ]
+    within = {place: at for place, at in read.places.items() if place[:1] == _INSTRUMENT != place}
+    document.places = document.places | within | kept
+    document.findings += read.findings
     return True
 
 
@@ -284,23 +261,26 @@ def _read_error_table(document: Document, instrument: dict[str, Any], base: Path
     chirp[name] = [[f"{time!r} s", f"{error!r} Hz"] for time, error in rows]
 
 
-def _instrument_of(reference: object, location: Location, base: Path) -> tuple[int, Document]:
-    """Document that holds an instrument, and how many keys down it stands there."""
+def _instrument_of(reference: object, location: Location, base: Path) -> Document:
+    """Document of an instrument, where it stands as in a spec."""
     if not isinstance(reference, str):
         what = "name of an instrument, see sweep instruments" if "like" in location else ""
         raise rejected(location, f"must be the {what or 'path of a YAML file'}", "", reference)
     file, known = base / os.path.expanduser(reference), library()
     if "file" not in location and reference in known:
-        return 1, read_document(known[reference])
+        return read_document(known[reference])
     is_word = reference.isidentifier() and not os.path.exists(file)
     if "like" in location or (is_word and "file" not in location):
         remedy = near_miss(reference, known, otherwise=f"the library has {', '.join(known)}")
         raise rejected(location, "is no instrument of the library", remedy, reference)
     try:
-        return 0, read_document(file)
+        read = read_document(file)
     except SpecError as error:
         rule = f"names a file that {error.mistakes[0].rule}"
         raise rejected(location, rule, error.mistakes[0].suggestion, reference) from None
+    places = {(*_INSTRUMENT, *place): at for place, at in read.places.items()}
+    findings = [replace(f, location=(*_INSTRUMENT, *f.location)) for f in read.findings]
+    return Document({"instrument": read.value}, places, findings, read.file)
 
 
 def library() -> dict[str, Path]:
@@ -373,9 +353,9 @@ _OTHER_STUDYS = {
 """Remedy for a section that only the other kind of study has."""
 
 _DRAWN_BY = {
-    kind_of(model): target
+    parts.kind_of(model): target
     for kind, target in ((Figure, "a target"), (SceneFigure, "a scene"))
-    for model in models_at(kind)
+    for model in parts.models_at(kind)
 }
 """Whose studies make a kind of figure."""
 
@@ -388,7 +368,7 @@ def findings_of(error: ValidationError, root: Any) -> list[Finding]:
 def _finding(detail: dict[str, Any], root: Any) -> Finding:
     """One error of pydantic's."""
     kind, written = detail["type"], detail["input"]
-    place = place_of(detail["loc"], root)
+    place = parts.place_of(detail["loc"], root)
     location = place.location
     if kind == BROKEN_RULE:
         context, path = detail["ctx"], dotted(location)
@@ -400,11 +380,11 @@ def _finding(detail: dict[str, Any], root: Any) -> Finding:
     if kind == "missing":
         return Finding(location, "is missing", _remedy(place))
     if kind == "extra_forbidden":
-        several = {kind_of(model): model for model in models_at(root)}
+        several = {parts.kind_of(model): model for model in parts.models_at(root)}
         model = several.get(detail["loc"][0], root)
         return Finding(location, "is no field", _sibling(place, model))
     if kind == "union_tag_invalid":
-        tag, kinds = detail["ctx"]["tag"], [kind_of(model) for model in place.models]
+        tag, kinds = detail["ctx"]["tag"], [parts.kind_of(model) for model in place.models]
         rule = f"must be one of {', '.join(kinds)}"
         return Finding((*location, "kind"), rule, _other_kind(str(tag), kinds), tag)
     if kind == "union_tag_not_found":
@@ -413,9 +393,9 @@ def _finding(detail: dict[str, Any], root: Any) -> Finding:
     return Finding(location, rule, "", written)
 
 
-def _with_kind(models: Models) -> str:
+def _with_kind(models: parts.Models) -> str:
     """Text that a part of several kinds is written with."""
-    return f"kind: and one of {', '.join(kind_of(model) for model in models)}"
+    return f"kind: and one of {', '.join(map(parts.kind_of, models))}"
 
 
 def _other_kind(tag: str, kinds: list[str]) -> str:
@@ -425,11 +405,11 @@ def _other_kind(tag: str, kinds: list[str]) -> str:
     return near_miss(tag, kinds)
 
 
-def _remedy(place: Place) -> str:
+def _remedy(place: parts.Place) -> str:
     """Remedy for a missing field or section."""
     name = place.location[-1]
-    field = fields_of(place.parents[0]).get(str(name)) if place.parents else None
-    rule = rule_of(field) if field is not None else None
+    field = parts.fields_of(place.parents[0]).get(str(name)) if place.parents else None
+    rule = parts.rule_of(field) if field is not None else None
     example = rule.example if rule is not None else ""
     if example:
         varies = isinstance(rule, Numeric) and dotted(place.location) in parameter_rules()
@@ -437,20 +417,20 @@ def _remedy(place: Place) -> str:
     if len(place.models) > 1:
         return f"write '{name}:' with {_with_kind(place.models)}"
     if place.models:
-        return f"write '{name}:' with {', '.join(fields_of(place.models[0]))}"
+        return f"write '{name}:' with {', '.join(parts.fields_of(place.models[0]))}"
     return f"write '{name}: ...'"
 
 
-def _sibling(place: Place, root: type[BaseModel]) -> str:
+def _sibling(place: parts.Place, root: type[BaseModel]) -> str:
     """Field that an unknown one resembles: beside it, else anywhere."""
     name = str(place.location[-1])
-    beside = [field for model in place.parents for field in fields_of(model)]
+    beside = [field for model in place.parents for field in parts.fields_of(model)]
     if name in _OTHER_STUDYS and place.parents == (root,):
         return _OTHER_STUDYS[name]
     suggestion = near_miss(name, beside)
     if suggestion:
         return suggestion
-    known = (*parameter_rules(), *rules_of(root, ""))
+    known = (*parameter_rules(), *parts.rules_of(root, ""))
     elsewhere = [path for path in known if path.rsplit(".", 1)[-1] == name]
     if elsewhere:
         return f"did you mean '{elsewhere[0]}'?"

@@ -1,4 +1,4 @@
-"""Rules of single fields of a spec, which read what the user wrote and say what is wrong.
+"""Rules of single fields of a spec, and mistakes: what is wrong, where, and what to write instead.
 
 A rule sits in a field's metadata. Pydantic reads the field with it, an axis over the field holds
 every one of its values to it, and the JSON Schema describes it.
@@ -10,8 +10,10 @@ import dataclasses
 import math
 import re
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from difflib import get_close_matches
 from fractions import Fraction
 from functools import lru_cache
 from itertools import pairwise
@@ -19,15 +21,133 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import Field, GetCoreSchemaHandler, GetJsonSchemaHandler
+from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from sweep.model.effects.phase_errors import NO_TABLE
 from sweep.model.effects.sweep_table import sweep_table
 from sweep.model.window import ALIASES, COSINE_SUMS
 from sweep.scenes.files import file_digest
-from sweep.spec.mistakes import near_miss
 from sweep.units import DECIBEL, QuantityError, Unit, read_number, read_quantity
+
+# Mistakes of users
+
+Location = tuple[str | int, ...]
+
+ABSENT = object()
+"""Stands for a value where none is written."""
+_LONGEST_VALUE = 60
+
+
+@dataclass(frozen=True, order=True)
+class Mistake:
+    """One mistake in a spec; texts are empty where there is nothing to tell."""
+
+    path: str
+    """Dotted path in the file, such as ``instrument.laser.power`` or ``axes.target.range[2]``."""
+    rule: str
+    """The rule broken, as the end of a sentence about the path."""
+    value: str = ""
+    """The value as the user wrote it."""
+    suggestion: str = ""
+    """A near miss or a remedy."""
+    line: int | None = None
+    """Line in the file, from 1."""
+    file: str = ""
+
+    def __str__(self) -> str:
+        place = f"{self.file}:{self.line}: " if self.line else f"{self.file}: " if self.file else ""
+        said = f"{self.path}: {self.rule}" if self.path else self.rule
+        wrote = f" (you wrote {self.value})" if self.value else ""
+        return place + said + wrote + (f"; {self.suggestion}" if self.suggestion else "")
+
+
+class SpecError(Exception):
+    """Everything that is wrong with a spec, at once, in the order in which to show it."""
+
+    def __init__(self, mistakes: Iterable[Mistake]) -> None:
+        self.mistakes = list(mistakes)
+        super().__init__(self.mistakes)
+
+    def __str__(self) -> str:
+        if len(self.mistakes) == 1:
+            return str(self.mistakes[0])
+        lines = [f"{len(self.mistakes)} mistakes:", *(f"  {mistake}" for mistake in self.mistakes)]
+        return "\n".join(lines)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A mistake whose place in the file is still to be looked up."""
+
+    location: Location
+    """Keys and list indices that lead to it."""
+    rule: str
+    suggestion: str = ""
+    written: object = ABSENT
+    """The value as read from the file, if it is to be shown."""
+
+
+class Rejected(Exception):
+    """A part of a spec that cannot be read, with everything that is wrong with it."""
+
+    def __init__(self, *findings: Finding) -> None:
+        super().__init__(*findings)
+        self.findings = list(findings)
+
+
+def rejected(
+    location: Location, rule: str, suggestion: str = "", written: object = ABSENT
+) -> Rejected:
+    """Refusal for a single reason, to be raised."""
+    return Rejected(Finding(location, rule, suggestion, written))
+
+
+class Findings(list[Finding]):
+    """Findings of several parts, which are read one after the other whatever is wrong with one."""
+
+    @contextmanager
+    def of(self, location: Location = (), written: object = ABSENT) -> Iterator[None]:
+        """Context that keeps what is wrong with a part, or with the value at a location."""
+        try:
+            yield
+        except Rejected as error:
+            self.extend(error.findings)
+        except QuantityError as error:
+            self.append(Finding(location, error.rule, error.suggestion, written))
+
+    def refuse_any(self) -> None:
+        """Raise all findings, if there are any."""
+        if self:
+            raise Rejected(*self)
+
+
+def dotted(location: Location) -> str:
+    """Path of keys and indices as text: ``axes.target.range[2]``."""
+    text = ""
+    for part in location:
+        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)
+    return text
+
+
+def shown(written: object) -> str:
+    """Format a written value on one short line; empty for ``ABSENT`` and for whole sections."""
+    if written is ABSENT or isinstance(written, dict | list | tuple):
+        return ""
+    if written is None:
+        return "nothing"
+    text = repr(written) if isinstance(written, str) else str(written)
+    return text if len(text) <= _LONGEST_VALUE else text[: _LONGEST_VALUE - 3] + "..."
+
+
+def near_miss(name: str, known: Iterable[str], *, otherwise: str = "") -> str:
+    """Suggestion of the known name that `name` resembles, else a remedy."""
+    names = list(known)
+    close = [k for k in names if k.lower() == name.lower()] or get_close_matches(name, names, n=1)
+    return f"did you mean '{close[0]}'?" if close else otherwise
+
+
+# Rules
 
 BROKEN_RULE = "broken_rule"
 
@@ -493,150 +613,3 @@ def _try_window(name: str, parameters: tuple[float, ...]) -> None:
         raise QuantityError("is no periodic window that scipy.signal makes", remedy) from None
     if not np.all(np.isfinite(values)) or not np.sum(values) > 0:
         raise QuantityError("has parameters that make no usable window")
-
-
-# Fields, each declared in a line. Bounds are as a user would write them; a field without a default
-# is required.
-
-# Far beyond all that flies, and near enough that squares and products stay within a float.
-_EITHER_WAY = {
-    "m": "1e9 m",
-    "rad": "1e6 deg",
-    "m/s": "1000 km/s",
-    "m/s^2": "1e6 m/s^2",
-    "rad/s": "1e6 deg/s",
-    "": "1e12",
-}
-"""Largest magnitude of a signed quantity, by its SI unit."""
-
-
-def field(rule: Rule, default: Any = ..., *, alias: str | None = None) -> Any:
-    """Field that holds what a rule says; required without a default."""
-    info = Field(default, alias=alias)
-    info.metadata.append(rule)
-    return info
-
-
-def measure(
-    about: str, unit: str, example: str, at_least: str = "", at_most: str = "", **more: Any
-) -> Numeric:
-    """Rule of a quantity within bounds, wide ones by default."""
-    bounds = {"at_least": at_least or f"-{_EITHER_WAY[unit]}"} if "above" not in more else {}
-    bounds |= {"at_most": at_most or _EITHER_WAY[unit]} if "below" not in more else {}
-    return Numeric(about=about, si_unit=unit, example=example, **bounds, **more)  # type: ignore[arg-type]
-
-
-def quantity(
-    about: str,
-    unit: str,
-    example: str,
-    at_least: str = "",
-    at_most: str = "",
-    *,
-    default: Any = ...,
-    word: str = "",
-    **more: Any,
-) -> Any:
-    """Declare a number with a unit; the word, if there is one, stands for the default."""
-    more |= {"word": word, "means": more.get("means", default)} if word else {}
-    return field(measure(about, unit, example, at_least, at_most, **more), default)
-
-
-def number(about: str, example: str = "0.5", *bounds: str, **more: Any) -> Any:
-    """Pure number."""
-    return quantity(about, "", example, *bounds, **more)
-
-
-def count(
-    about: str, example: str = "3", at_least: str = "1", at_most: str = "1e6", **more: Any
-) -> Any:
-    """Whole number."""
-    return quantity(about, "", example, at_least, at_most, whole=True, **more)
-
-
-def length(about: str, example: str = "10 m", *bounds: str, **more: Any) -> Any:
-    """Length of either sign."""
-    return quantity(about, "m", example, *bounds, **more)
-
-
-def size(about: str, example: str = "10 m", **more: Any) -> Any:
-    """Length above 0."""
-    return length(about, example, "1 um", **more)
-
-
-def angle(about: str, example: str = "10 deg", *bounds: str, **more: Any) -> Any:
-    """Angle of either sign."""
-    return quantity(about, "rad", example, *bounds, **more)
-
-
-def speed(about: str, **more: Any) -> Any:
-    """Speed, not signed."""
-    return quantity(about, "m/s", "30 m/s", "0 m/s", **more)
-
-
-def duration(
-    about: str, example: str = "10 s", at_least: str = "0 s", at_most: str = "1e8 s", **more: Any
-) -> Any:
-    """Time, 0 to some years by default."""
-    return quantity(about, "s", example, at_least, at_most, **more)
-
-
-def frequency(about: str, example: str = "20 Hz") -> Any:
-    """Rate above 0."""
-    return quantity(about, "Hz", example, "1e-6 Hz", "1e9 Hz")
-
-
-def several(of: Rule, least: int, most: int, default: Any = ..., **more: Any) -> Any:
-    """List of values, each held to the same rule, described by `about`."""
-    alias = more.pop("alias", None)
-    return field(Several(of=of, least=least, most=most, **more), default, alias=alias)
-
-
-def vector(about: str, unit: str, example: str, *, of: int = 3, **more: Any) -> Any:
-    """Components of a vector of so many dimensions."""
-    return several(measure("Component", unit, example), of, of, about=about, **more)
-
-
-def position(about: str, *, of: int = 3, **more: Any) -> Any:
-    """Position in so many dimensions."""
-    return vector(about, "m", "10 m", of=of, **more)
-
-
-def seed(about: str = "Seed of its random numbers") -> Any:
-    """Seed, 0 by default."""
-    return count(about, "1", "0", "2^63", default=0)
-
-
-def named(about: str, example: str = "ground") -> Text:
-    """Rule of the name of an object or a scanner."""
-    return Text(
-        about=about,
-        example=example,
-        pattern=r"[a-z][a-z0-9_]{0,59}",
-        remedy="take small letters, digits and '_', such as 'ground'",
-    )
-
-
-def name(about: str, default: Any = ...) -> Any:
-    """Name of an object or a scanner."""
-    return field(named(about), default)
-
-
-def text(about: str, default: Any = ..., **more: str) -> Any:
-    """Text for people, or of a pattern with a remedy."""
-    return field(Text(about=about, **more), default)
-
-
-def choice(about: str, options: tuple[str, ...], default: Any = ...) -> Any:
-    """One of several words."""
-    return field(Choice(about=about, options=options), default)
-
-
-def flag(about: str, *, default: bool) -> Any:
-    """Declare a field that is true or false."""
-    return field(Flag(about=about), default)
-
-
-def file(about: str, default: Any = ..., **more: Any) -> Any:
-    """Path of a file."""
-    return field(File(about=about, **more), default)

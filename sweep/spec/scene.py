@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-import sweep.spec.rules as of
+import sweep.spec.parts as of
 from sweep.scenes.files import SceneError
 from sweep.spec.flight import Motion, Span, Turn
 from sweep.spec.grounds import (
@@ -263,7 +263,6 @@ class SceneDraws(Part):
         "Draw against the probabilities, add noise to the bins, or draw whole spectra of each "
         "shot for instrument.processing.detector and .estimator to look at",
         ("probabilities", "noise", SPECTRA),
-        "probabilities",
     )
     returns: int = of.count("Points kept of a shot at most", "4", at_most="64", default=4)
 
@@ -318,10 +317,7 @@ class ErrorFloor(Part):
     )  # fmt: skip
 
 
-def _end(about: str, *rule: str) -> Any:
-    """Field of an end of what a report can hold; none by default."""
-    whole = f"{about}; what lies beyond is clipped and reported as invalid"
-    return of.quantity(whole, *rule, default=None)
+_CLIPPED = "what lies beyond is clipped and reported as invalid"
 
 
 class Interface(Part):
@@ -337,14 +333,20 @@ class Interface(Part):
         "Step in which radial velocities are reported",
         "m/s", "1 mm/s", "1e-9 m/s", "1 km/s", default=None,
     )  # fmt: skip
-    min_range: float | None = _end("Least range that a report can hold", "m", "10 m", "0 m")
-    max_range: float | None = _end("Largest range that a report can hold", "m", "5 km", "0 m")
-    min_radial_velocity: float | None = _end(
-        "Least radial velocity that a report can hold, positive when closing", "m/s", "-60 m/s"
+    min_range: float | None = of.length(
+        f"Least range that a report can hold; {_CLIPPED}", "10 m", "0 m", default=None
     )
-    max_radial_velocity: float | None = _end(
-        "Largest radial velocity that a report can hold, positive when closing", "m/s", "220 m/s"
+    max_range: float | None = of.length(
+        f"Largest range that a report can hold; {_CLIPPED}", "5 km", "0 m", default=None
     )
+    min_radial_velocity: float | None = of.quantity(
+        f"Least radial velocity that a report can hold, positive when closing; {_CLIPPED}",
+        "m/s", "-60 m/s", default=None,
+    )  # fmt: skip
+    max_radial_velocity: float | None = of.quantity(
+        f"Largest radial velocity that a report can hold, positive when closing; {_CLIPPED}",
+        "m/s", "220 m/s", default=None,
+    )  # fmt: skip
     rate: float | None = of.quantity(
         "Reports of each beam per second; without it every shot is a report",
         "Hz", "20 Hz", "1e-6 Hz", "1e9 Hz", default=None,
@@ -352,7 +354,6 @@ class Interface(Part):
     value: str = of.choice(
         "What a report holds of the valid shots in its period: their mean, or the last",
         ("mean", "last"),
-        "mean",
     )
     valid_shots: int = of.count(
         "Valid shots in its period that a report needs to be valid", "3", default=1
@@ -464,7 +465,13 @@ def _grounds(scene: Scene, files: Files) -> tuple[np.ndarray, dict[str, Terrain]
                 raise _unfit(name, error) from None
     origin = np.zeros(3)
     if scene.origin in own:
-        origin = _middle(scene.origin, own[scene.origin])
+        origin = own[scene.origin].centre
+        if not np.isfinite(origin).all():
+            raise SceneError(
+                f"scene.objects.{scene.origin}",
+                "has a hole in its middle, which the scene's origin should be",
+                "take another origin, or 'world'",
+            )
     grounds = {}
     for name, terrain in own.items():
         # One without coordinates of its own stands where its position says, beside the origin.
@@ -472,18 +479,6 @@ def _grounds(scene: Scene, files: Files) -> tuple[np.ndarray, dict[str, Terrain]
         shift = 0.0 if beside else origin
         grounds[name] = replace(terrain, origin=terrain.origin - shift)
     return origin, grounds
-
-
-def _middle(name: str, terrain: Terrain) -> np.ndarray:
-    """Middle of a ground, on it."""
-    centre = terrain.centre
-    if not np.isfinite(centre).all():
-        raise SceneError(
-            f"scene.objects.{name}",
-            "has a hole in its middle, which the scene's origin should be",
-            "take another origin, or 'world'",
-        )
-    return centre
 
 
 def _facets(

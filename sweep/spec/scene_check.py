@@ -11,32 +11,26 @@ from typing import Any
 
 import numpy as np
 
-import sweep.spec.rules as of
+import sweep.spec.flight as flights
+import sweep.spec.parts as of
+import sweep.spec.scene as scenes
 from sweep.model import beam
 from sweep.model.ground import pattern as pattern_of
 from sweep.model.outputs import CYCLES, NAVIGATION, POINTS, SHOTS, STATISTICS
 from sweep.model.resolution import PATTERN
 from sweep.scenes.files import SceneError
-from sweep.spec.flight import (
-    AnyScanner,
-    Motion,
-    Platform,
-    Span,
-    Tracked,
-    WaypointPath,
-    shots_a_cycle,
-)
+from sweep.spec.axes import place_on_grid
 from sweep.spec.grid_rules import Grid
 from sweep.spec.grid_rules import at as written_at
 from sweep.spec.grounds import Craters, Ground, Jacksboro
-from sweep.spec.mistakes import Finding, Location, near_miss
 from sweep.spec.parts import Files, named_files, read_as
-from sweep.spec.scene import WORLD, AnyObject, Boulders, Box, MeshObject, Solid, Sphere, Trees
+from sweep.spec.rules import Finding, Location, near_miss
 from sweep.spec.sections import default_of
 from sweep.units import QuantityError, read_unit
 
 RESERVED = ("map_height", "map_x", "map_y")
 """Names that arrays of a store have beside its scanners."""
+_PLACED = (scenes.Sphere, scenes.Box)
 OBJECTS: Location = ("scene", "objects")
 _LOOKS = 257
 """Times at which an attitude is tried."""
@@ -59,11 +53,11 @@ def scene_findings(written: Mapping[str, Any], base: Path | None) -> list[Findin
 
     Sections that cannot be read are passed over; files are left alone without a base.
     """
-    objects = _readable(_section(written, *OBJECTS), AnyObject)
-    scanners = _readable(_section(written, "scanners"), AnyScanner)
-    platform = read_as(Platform, written.get("platform"))
+    objects = _readable(_section(written, *OBJECTS), scenes.AnyObject)
+    scanners = _readable(_section(written, "scanners"), flights.AnyScanner)
+    platform = read_as(flights.Platform, written.get("platform"))
     findings = [
-        *_name_findings(written, OBJECTS, lambda name: name == WORLD, "scene"),
+        *_name_findings(written, OBJECTS, lambda name: name == scenes.WORLD, "scene"),
         *_name_findings(written, ("scanners",), lambda name: name in RESERVED, "store"),
         *_reference_findings(written, objects),
     ]
@@ -71,8 +65,8 @@ def scene_findings(written: Mapping[str, Any], base: Path | None) -> list[Findin
         findings += _object_findings(thing, (*OBJECTS, name))
     files = [] if base is None else list(_file_findings(objects, platform, base))
     known = {finding.location for finding in files}
-    flights = _flight_findings(platform, scanners, objects, base)
-    return findings + files + [f for f in flights if f.location not in known]
+    others = _flight_findings(platform, scanners, objects, base)
+    return findings + files + [f for f in others if f.location not in known]
 
 
 # Names, references, files
@@ -101,8 +95,8 @@ def _reference_findings(
     named = _section(written, *OBJECTS)
     if not named:
         return
-    origin = _section(written, "scene").get("origin", WORLD)
-    if isinstance(origin, str) and origin != WORLD:
+    origin = _section(written, "scene").get("origin", scenes.WORLD)
+    if isinstance(origin, str) and origin != scenes.WORLD:
         yield from _reference(origin, ("scene", "origin"), named, objects, ", or 'world'")
         if any(getattr(objects.get(origin), "position", None) or ()):
             rule, remedy = "places the scene's origin, which lies at zero", "leave it out, or "
@@ -128,7 +122,7 @@ def _reference(
 
 
 def _file_findings(
-    objects: Mapping[str, Any], platform: Platform | None, base: Path
+    objects: Mapping[str, Any], platform: flights.Platform | None, base: Path
 ) -> Iterator[Finding]:
     """Files that are missing or can not be read."""
     things: list[tuple[Location, Any]] = [((*OBJECTS, n), thing) for n, thing in objects.items()]
@@ -158,11 +152,11 @@ def _object_findings(thing: Any, location: Location) -> Iterator[Finding]:
     """Mistakes in an object at a location, its references and files apart."""
     if isinstance(thing, Ground):
         yield from _ground_findings(thing, location)
-    if isinstance(thing, Solid):
+    if isinstance(thing, scenes.Solid):
         yield from _solid_findings(thing, location)
-    if isinstance(thing, Boulders):
+    if isinstance(thing, scenes.Boulders):
         yield from _size_findings(thing, location)
-    if isinstance(thing, Trees) and not thing.tree.crown_base < thing.tree.height:
+    if isinstance(thing, scenes.Trees) and not thing.tree.crown_base < thing.tree.height:
         base, top = f"{thing.tree.crown_base:g} m", f"{thing.tree.height:g} m"
         at = (*location, "tree", "crown_base")
         if "crown_base" in thing.tree.model_fields_set:
@@ -173,7 +167,7 @@ def _object_findings(thing: Any, location: Location) -> Iterator[Finding]:
             )
 
 
-def _size_findings(thing: Boulders | Craters, location: Location) -> Iterator[Finding]:
+def _size_findings(thing: scenes.Boulders | Craters, location: Location) -> Iterator[Finding]:
     """Diameters without a range."""
     if not thing.smallest < thing.largest:
         rule = f"must exceed the smallest diameter, {thing.smallest:g} m"
@@ -195,16 +189,16 @@ def _ground_findings(ground: Ground, location: Location) -> Iterator[Finding]:
         yield Finding(at, rule, f"{remedy}grid finer", f"{smallest:g} m")
 
 
-def _solid_findings(thing: Solid, location: Location) -> Iterator[Finding]:
+def _solid_findings(thing: scenes.Solid, location: Location) -> Iterator[Finding]:
     """Report a solid that is placed twice or nowhere, or whose lengths have no unit."""
     place = (*location, "position")
     if thing.motion is not None and thing.position is not None:
         rule = "stands beside a motion, whose path places the object"
         yield Finding(place, rule, "leave one of them out")
-    if isinstance(thing, Sphere | Box) and thing.motion is None and thing.position is None:
+    if isinstance(thing, _PLACED) and thing.motion is None and thing.position is None:
         yield Finding(place, "is missing", "write e.g. 'position: [0 m, 0 m, 10 m]'")
     yield from _refused(thing.rotation.turn, (*location, "rotation"))
-    if isinstance(thing, MeshObject) and thing.unit is not None:
+    if isinstance(thing, scenes.MeshObject) and thing.unit is not None:
         try:
             read_unit(thing.unit, si_unit="m", example="mm")
         except QuantityError as error:
@@ -215,13 +209,13 @@ def _solid_findings(thing: Solid, location: Location) -> Iterator[Finding]:
 
 
 def _flight_findings(
-    platform: Platform | None,
+    platform: flights.Platform | None,
     scanners: Mapping[str, Any],
     objects: Mapping[str, Any],
     base: Path | None,
 ) -> list[Finding]:
     """Mistakes in platform, scanners and moving objects, of those that can be read."""
-    span: Span | None = None
+    span: flights.Span | None = None
     findings: list[Finding] = []
     files = Files(base or Path())
     if platform is not None and (base is not None or not _on_files(platform)):
@@ -238,13 +232,13 @@ def _flight_findings(
     return findings
 
 
-def _on_files(motion: Motion) -> bool:
+def _on_files(motion: flights.Motion) -> bool:
     """Return true if a path or an attitude is read from a table."""
-    return isinstance(motion.path, WaypointPath) or isinstance(motion.attitude, Tracked)
+    return motion.path.kind == "waypoints" or motion.attitude.kind == "track"
 
 
 def _motion_findings(
-    motion: Motion, location: Location, files: Files, span: Span | None
+    motion: flights.Motion, location: Location, files: Files, span: flights.Span | None
 ) -> Iterator[Finding]:
     """Report a path or attitude that can not be flown, or a path shorter than the flight."""
     section = "path"
@@ -270,14 +264,16 @@ def _motion_findings(
         yield Finding((*location, "path"), rule, "make it last throughout the flight")
 
 
-def _pattern_findings(scanner: Any, location: Location, span: Span | None) -> Iterator[Finding]:
+def _pattern_findings(
+    scanner: Any, location: Location, span: flights.Span | None
+) -> Iterator[Finding]:
     """Report a scan pattern that can not be made, or that makes no whole cycle in the flight."""
     unfit = _refused(scanner.pattern, location)
     yield from unfit
     if unfit or span is None:
         return
     pattern = scanner.pattern()
-    each = shots_a_cycle(pattern)
+    each = flights.shots_a_cycle(pattern)
     if pattern.number(span[1] - span[0]) < each:
         rule = f"makes no whole cycle of {each} shots in a flight of {span[1] - span[0]:.6g} s"
         yield Finding((*location, "rate"), rule, "raise it, or lengthen the flight")
@@ -285,13 +281,13 @@ def _pattern_findings(scanner: Any, location: Location, span: Span | None) -> It
 
 # Axes: what may vary while the light falls where it fell
 
-STORED = frozenset(
-    name
-    for table in (SHOTS, CYCLES, STATISTICS, POINTS, NAVIGATION)
-    for stored, output in table.items()
-    for name in (stored, *output.dims)
-)
-"""Names of a store's arrays and dimensions."""
+
+def stored_names() -> frozenset[str]:
+    """Names of a store's arrays and dimensions."""
+    tables = (SHOTS, CYCLES, STATISTICS, POINTS, NAVIGATION)
+    dims = (output.dims for table in tables for output in table.values())
+    return frozenset().union(*tables, *dims)
+
 
 _OTHER = "make another study of it"
 _BEAMS = (beam.DIVERGENCE, beam.WAIST, beam.QUALITY, beam.FOCUS, beam.RECEIVED_WAIST, beam.COUPLING)
@@ -344,8 +340,8 @@ def axis_findings(grid: Grid) -> Iterator[Finding]:
         yield Finding(("footprint", "pattern"), rule, "take hexagonal", p[PATTERN])
     for axis in grid.axes:
         for member in axis.members:
-            at: Location = ("axes", axis.name if axis.zipped else member.path)
+            at = place_on_grid(member.path, grid.axes)
             yield from parameter_findings(p, member.path, member.values, at)
-        if axis.zipped and axis.name in STORED:
+        if axis.zipped and axis.name in stored_names():
             rule = "bears the name of something stored"
             yield Finding(("axes", axis.name), rule, "take a word such as 'cut'")

@@ -12,18 +12,17 @@ from typing import Any, Self
 
 from pydantic import BaseModel, model_validator
 
-import sweep.spec.rules as of
+import sweep.spec.parts as of
 from sweep.model import waveform
 from sweep.model.accuracy import AUTOMATIC, COUNTED
-from sweep.model.beam import COUPLINGS, SINGLE_MODE
+from sweep.model.beam import COUPLINGS
 from sweep.model.detectors import DETECTORS, FIXED
 from sweep.model.estimators import ESTIMATORS, PEAK_BIN
 from sweep.model.ground import LAWS
-from sweep.model.looks import COMBINED, COMMON, POWER, SPECKLES
+from sweep.model.looks import COMBINED, SPECKLES
 from sweep.model.threshold import PROCESSING, WAYS
-from sweep.spec.mistakes import near_miss
 from sweep.spec.parts import Part, rules_of, with_modes, with_parameters
-from sweep.spec.rules import Method, Rule, Window, broken
+from sweep.spec.rules import Method, Rule, Window, broken, near_miss
 
 ARCHITECTURES = ("homodyne", "heterodyne", "direct")
 _WATTS = ("1e-18 W", "1e9 W")
@@ -70,7 +69,6 @@ class Chirp(Part):
         "chirp, which tells the Doppler shift alone. 'up down' is the triangle of automotive "
         "lidars, whose beats are read as |f_d| < f_r. Direct detection has none without a chirp",
         waveform.ORDERS,
-        waveform.ORDERS[0],
     )
     doppler_slope: float = of.number(
         "Chirp rate of the segment 'doppler' over that of the segment 'up', with its sign: 0 for "
@@ -102,7 +100,6 @@ class Telescope(Part):
         "Light that mixes with the local oscillator: that of a single mode, or all in "
         "the aperture, as the thesis has it; direct detection always has all",
         COUPLINGS,
-        SINGLE_MODE,
     )
 
 
@@ -144,15 +141,13 @@ class Receiver(Part):
         "Density of the receiver's noise: shaped by its bandwidths as signals are, or "
         "white over the record",
         ("receiver", "white"),
-        "receiver",
     )
-    architecture: str = of.choice("How the echo is detected", ARCHITECTURES, "homodyne")
+    architecture: str = of.choice("How the echo is detected", ARCHITECTURES)
     record: str = of.choice(
         "Samples of a record: real, or complex from I and Q behind a 90 deg hybrid, which keep the "
         "beat's sign: no folding, twice as many bins, and the noise of two receivers in each; "
         "coherent receivers only",
         ("real", "complex"),
-        "real",
     )
     local_oscillator_power: float = of.quantity(
         "Power of the local oscillator; direct detection has none", "W", "1 mW", *_WATTS,
@@ -271,38 +266,32 @@ class Processing(Part):
     bins_counted: str = of.choice(
         "Bins that may raise a false alarm: half the FFT, as a real record has, or all",
         ("half", "all"),
-        "half",
     )
     detection: str = of.choice(
         "Bins by which an echo is detected: any that it occupies, or the largest alone",
         ("any_bin", "peak_bin"),
-        "any_bin",
     )
     shot_detection: str = of.choice(
         "Segments in which a shot is detected: both chirps; or any two of three, which still tell "
         "range and velocity where the third is missed",
         waveform.SHOT_DETECTIONS,
-        waveform.BOTH_CHIRPS,
     )
     peaks: str = of.choice(
         "Peaks of a segment that are reported: all that cross the threshold; or the strongest "
         "alone, which may be another than the echo's (p_wrong_range); in grids without draws, and "
         "in flights that draw whole spectra",
         waveform.REPORTED_PEAKS,
-        waveform.ALL,
     )
     two_beats: str = of.choice(
         "What is taken for granted where two beats of a real record tell range and velocity: far, "
         "the range beat of a chirp exceeds the Doppler shift (and where one of them is of the "
         "light without a chirp, the target is closing); fast, the Doppler shift exceeds them",
         waveform.ASSUMPTIONS,
-        waveform.FAR_TARGET,
     )
     noise_bins: str = of.choice(
         "Noise of bins: correlated as window and padding make it, and real at DC and "
         "Nyquist; or independent and circular, as the thesis takes it",
         ("correlated", "independent"),
-        "correlated",
     )
     search: Search = Search()
     detector: Detector = Detector()
@@ -335,7 +324,6 @@ class LooksOfShot(Part):
         "or by their sum in amplitude, with the phases that a steady velocity makes put right. "
         "tnr and threshold_to_mean are over the noise of one record, or of the mean of a sum",
         COMBINED,
-        POWER,
     )
     votes: int = of.count(
         "Records that must cross in a bin; binary only", "3", "1", "256", default=1
@@ -344,7 +332,6 @@ class LooksOfShot(Part):
         "Speckle of the records: common to all, as they follow one another at once; or "
         "independent, where the beam moves on by its own width from one to the next",
         SPECKLES,
-        COMMON,
     )
 
 
@@ -467,13 +454,11 @@ class Draws(Part):
         "Draw against the probabilities, add noise to the bins that matter, or draw "
         "whole spectra for instrument.processing.detector and .estimator to look at",
         ("probabilities", "noise", SPECTRA),
-        "probabilities",
     )
     interval: str = of.choice(
         "Interval of the share of draws with a detection, where noise alone is drawn: "
         "at least as sure as promised everywhere, or on the average",
         tuple(COUNTED),
-        "clopper_pearson",
     )
 
     @property

@@ -14,7 +14,9 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from pydantic import ConfigDict, Field, PrivateAttr, ValidationError
 
-import sweep.spec.rules as of
+import sweep.spec.parts as of
+import sweep.spec.scene as scenes
+import sweep.spec.sections as sections
 from sweep.model import VERSION, accuracy, beam, looks, waveform
 from sweep.model.effects import circulator_leak
 from sweep.model.ground import pattern as pattern_of
@@ -22,7 +24,7 @@ from sweep.model.outputs import STRONGEST_OUTPUTS
 from sweep.model.resolution import BEAMLETS, is_open, rays_needed
 from sweep.model.threshold import WAYS
 from sweep.model.waveform import ENDS
-from sweep.spec.axes import Axis, Member, in_units, paths_on_axes, read_axes
+from sweep.spec.axes import Axis, Member, axis_identity, in_units, paths_on_axes, read_axes
 from sweep.spec.figures import Figure, SceneFigure, figure_findings, scene_figure_findings
 from sweep.spec.flight import AnyScanner, Platform, shots_a_cycle
 from sweep.spec.grid_rules import (
@@ -34,9 +36,17 @@ from sweep.spec.grid_rules import (
     spectra_findings,
     without_draws,
 )
-from sweep.spec.identity import axis_identity, digest, geometry_of
-from sweep.spec.mistakes import Finding, Location, Mistake, SpecError, dotted, shown
-from sweep.spec.parts import Files, Part, fill, leaves, named_files, read_as, values_of
+from sweep.spec.grounds import OPTICAL
+from sweep.spec.parts import (
+    Files,
+    Part,
+    digest,
+    fill,
+    leaves,
+    named_files,
+    read_as,
+    values_of,
+)
 from sweep.spec.reading import (
     Document,
     findings_of,
@@ -45,34 +55,18 @@ from sweep.spec.reading import (
     read_document,
     resolve_instrument,
 )
-from sweep.spec.rules import Numeric, Rule, Special
-from sweep.spec.scene import (
-    ErrorFloor,
-    Interface,
-    Navigation,
-    Scene,
-    SceneDraws,
-    SceneStorage,
-    World,
-    build,
-    surfaces_of,
+from sweep.spec.rules import (
+    Finding,
+    Location,
+    Mistake,
+    Numeric,
+    Rule,
+    SpecError,
+    Special,
+    dotted,
+    shown,
 )
 from sweep.spec.scene_check import axis_findings, parameter_findings, scene_findings, why_not
-from sweep.spec.sections import (
-    SECTIONS,
-    Accuracy,
-    Atmosphere,
-    Draws,
-    Effects,
-    Execution,
-    Footprint,
-    Instrument,
-    Storage,
-    Target,
-    parameter_rules,
-    parameter_suggestion,
-    short_name,
-)
 from sweep.units import QuantityError
 
 if TYPE_CHECKING:
@@ -100,13 +94,13 @@ class Study(Part):
 
     title: str = of.text("What the study is called")
     question: str = of.text("The question that the study answers", "")
-    instrument: Instrument
-    atmosphere: Atmosphere = Atmosphere()
-    footprint: Footprint = Footprint()
-    effects: Effects = Effects()
-    accuracy: Accuracy = Accuracy()
+    instrument: sections.Instrument
+    atmosphere: sections.Atmosphere = sections.Atmosphere()
+    footprint: sections.Footprint = sections.Footprint()
+    effects: sections.Effects = sections.Effects()
+    accuracy: sections.Accuracy = sections.Accuracy()
     seed: int = of.seed("Seed of all random draws")
-    execution: Execution = Execution()
+    execution: sections.Execution = sections.Execution()
     axes: tuple[Axis, ...] = of.field(_READ_AXES, ())
 
     _written: dict[str, Any] = PrivateAttr(default_factory=dict)
@@ -200,7 +194,7 @@ class Study(Part):
         """SI values of all parameters by dotted path; of those on axes, the value off the axis."""
         return {
             path: value
-            for section in SECTIONS
+            for section in sections.SECTIONS
             if section in type(self).model_fields
             for path, value in values_of(getattr(self, section), (section,)).items()
         }
@@ -227,7 +221,7 @@ class Study(Part):
         for name, written in at.items():
             path, rule = _parameter(name, parameters | dict.fromkeys((*WAYS, *ENDS)))
             if rule is None:
-                suggestion = parameter_suggestion(name, parameters)
+                suggestion = sections.parameter_suggestion(name, parameters)
                 findings.append(Finding((name,), "is no parameter", suggestion))
                 continue
             try:
@@ -262,7 +256,7 @@ class Study(Part):
         A KeyError where no axis has it, a `QuantityError` where the value cannot be read.
         """
         member = self.member(name)
-        rule = parameter_rules()[member.path]
+        rule = sections.parameter_rules()[member.path]
         if not isinstance(rule, Numeric):
             return str(rule.read(written))
         return in_units(rule, written, member.units)
@@ -273,7 +267,7 @@ class Study(Part):
         Title, question, figures and execution are no part of it, nor are values that an axis
         overrides. The order of the axes is: it lays out the arrays.
         """
-        sections = ("draws", "error_floor", "navigation", "storage")
+        others = ("draws", "error_floor", "navigation", "storage")
         return {
             "model": VERSION,
             "parameters": self.parameters_off_axes(),
@@ -282,7 +276,7 @@ class Study(Part):
             "seed": self.seed,
         } | {
             name: values_of(getattr(self, name))
-            for name in sections
+            for name in others
             if name in type(self).model_fields
         }
 
@@ -325,8 +319,8 @@ class Study(Part):
 
 def _parameter(name: str, known: Mapping[str, object]) -> tuple[str, Rule | None]:
     """Dotted path and rule of a parameter, by its path or its last part."""
-    rules = parameter_rules()
-    paths = [path for path in known if name in (path, short_name(path))]
+    rules = sections.parameter_rules()
+    paths = [path for path in known if name in (path, sections.short_name(path))]
     return (paths[0], rules[paths[0]]) if len(paths) == 1 else (name, None)
 
 
@@ -367,13 +361,12 @@ def _strongest_findings(grid: Grid) -> Iterator[Finding]:
             yield grid.finding(waveform.PEAKS, rule, f"take all, or {remedy}")
 
 
-def _size_findings(axes: tuple[Axis, ...]) -> list[Finding]:
+def _size_findings(axes: tuple[Axis, ...]) -> Iterator[Finding]:
     """Report a grid too large to count."""
     points = math.prod(axis.size for axis in axes)
-    if points <= LARGEST_GRID:
-        return []
-    rule = f"make {points:.3g} points, and a study has at most {LARGEST_GRID:.0e}"
-    return [Finding(("axes",), rule, "take fewer values")]
+    if points > LARGEST_GRID:
+        rule = f"make {points:.3g} points, and a study has at most {LARGEST_GRID:.0e}"
+        yield Finding(("axes",), rule, "take fewer values")
 
 
 class Spec(Study):
@@ -382,9 +375,9 @@ class Spec(Study):
     Made by `load` from a file and by `from_mapping` from plain data; values are SI.
     """
 
-    target: Target
-    draws: Draws = Draws()
-    storage: Storage = Storage()
+    target: sections.Target
+    draws: sections.Draws = sections.Draws()
+    storage: sections.Storage = sections.Storage()
     figures: tuple[Figure, ...] = Field(default=(), description="Figures and tables of the results")
 
     @classmethod
@@ -394,7 +387,7 @@ class Spec(Study):
         """Figures of what the study lacks, random effects without draws, draws without an end."""
         further = STRONGEST_OUTPUTS if grid.has_point(STRONGEST_ALONE) else ()
         findings = list(figure_findings(written, grid.axes, further)) if axes_are_whole else []
-        draws = read_as(Draws, written.get("draws", {}))
+        draws = read_as(sections.Draws, written.get("draws", {}))
         if draws is not None:
             findings += spectra_findings(draws, grid)
             if draws.any and grid.has_point(STRONGEST_ALONE):
@@ -436,14 +429,14 @@ class SceneSpec(Study):
     Made by `load` from a file and by `from_mapping` from plain data; values are SI.
     """
 
-    scene: Scene
+    scene: scenes.Scene
     platform: Platform
     scanners: dict[str, AnyScanner] = Field(description="Scan patterns by name")
-    draws: SceneDraws = SceneDraws()
-    error_floor: ErrorFloor = ErrorFloor()
-    navigation: Navigation = Navigation()
-    interface: Interface = Interface()
-    storage: SceneStorage = SceneStorage()
+    draws: scenes.SceneDraws = scenes.SceneDraws()
+    error_floor: scenes.ErrorFloor = scenes.ErrorFloor()
+    navigation: scenes.Navigation = scenes.Navigation()
+    interface: scenes.Interface = Field(default_factory=scenes.Interface)
+    storage: scenes.SceneStorage = scenes.SceneStorage()
     figures: tuple[SceneFigure, ...] = Field(
         default=(), description="Figures and tables of the results"
     )
@@ -464,7 +457,7 @@ class SceneSpec(Study):
         cls, written: Mapping[str, Any], grid: Grid, base: Path | None, axes_are_whole: bool
     ) -> list[Finding]:
         """Mistakes in scene, flight, files, random effects and figures."""
-        draws = read_as(SceneDraws, written.get("draws", {})) or SceneDraws()
+        draws = read_as(scenes.SceneDraws, written.get("draws", {})) or scenes.SceneDraws()
         return [
             *scene_findings(written, base),
             *axis_findings(grid),
@@ -480,11 +473,6 @@ class SceneSpec(Study):
     def unvaried(self, path: str, value: object, location: Location) -> list[Finding]:
         """Mistakes in a parameter taking a value without the geometry changing."""
         return parameter_findings(self.parameters(), path, [value], location)
-
-    @property
-    def base(self) -> Path:
-        """Folder that the scene's files are relative to."""
-        return self._base
 
     @property
     def files(self) -> Files:
@@ -509,12 +497,12 @@ class SceneSpec(Study):
 
     def surfaces(self) -> tuple[Surface, ...]:
         """Surfaces by their numbers; no file is looked at."""
-        return surfaces_of(self.scene)
+        return scenes.surfaces_of(self.scene)
 
-    def world(self) -> World:
+    def world(self) -> scenes.World:
         """Build the scene; a `SceneError` for an unfit file or object."""
         flight = self.flight()
-        return build(self.scene, self.files, (flight.start, flight.stop))
+        return scenes.build(self.scene, self.files, (flight.start, flight.stop))
 
     def flight(self) -> Flight:
         """Movement of the instrument in the scene's frame; a `SceneError` for an unfit table."""
@@ -543,13 +531,13 @@ class SceneSpec(Study):
         p = self.parameters()
         return None if beam.is_thesis(p) else partial(beam.angles, p)
 
-    def interface_with(self, fields: Mapping[str, object]) -> Interface:
+    def interface_with(self, fields: Mapping[str, object]) -> scenes.Interface:
         """Return the unit's interface with some fields set anew, written as in a spec."""
         written = {path[-1]: rule.written(v) for path, rule, v in leaves(self.interface)}
         try:
-            return Interface.model_validate({**written, **fields})
+            return scenes.Interface.model_validate({**written, **fields})
         except ValidationError as error:
-            findings = findings_of(error, Interface)
+            findings = findings_of(error, scenes.Interface)
         placed = [replace(each, location=("interface", *each.location)) for each in findings]
         raise SpecError(map(Document({}).mistake, placed))
 
@@ -570,10 +558,20 @@ class SceneSpec(Study):
         """Content of what is seen through one scanner: all that rays depend on, and no more.
 
         Names are no part of it, nor are reflectances, nor where files are: they count by content.
+        Objects count by their place in the scene, which their surfaces' numbers come from.
         """
-        p = self.parameters()
-        seen = geometry_of(self.scene, self.platform, self.scanners[name], self._digests)
-        return seen | {
+        p, digests = self.parameters(), self._digests
+        places = {key: place for place, key in enumerate(self.scene.objects)}
+        objects = []
+        for thing in self.scene.objects.values():
+            values = values_of(thing, digests=digests)
+            values = {path: v for path, v in values.items() if path.split(".")[-1] not in OPTICAL}
+            objects.append(values | ({"on": places[values["on"]]} if "on" in values else {}))
+        return {
+            "objects": objects,
+            "origin": places.get(self.scene.origin, -1),
+            "platform": values_of(self.platform, digests=digests),
+            "scanner": values_of(self.scanners[name], digests=digests),
             "model": VERSION,
             "beamlets": p[BEAMLETS],
             "pattern": self.pattern,

@@ -18,7 +18,7 @@ import numpy as np
 from sweep.scenes.files import SceneError
 from sweep.spec import SceneSpec, Spec, SpecError, difference, from_stored
 from sweep.spec.grid_rules import is_method
-from sweep.spec.mistakes import Mistake
+from sweep.spec.rules import Mistake
 from sweep.spec.sections import parameter_rules
 from sweep.storage import logs, opening
 from sweep.storage.locations import Location, located, real

@@ -210,7 +210,7 @@ def generator(draw: st.DrawFn, rule: Numeric, kind: str, spread: float) -> Any:
 def _all_distinct(rule: Numeric, listed: list[Any]) -> bool:
     """Whether a mixed list holds no value twice."""
     from sweep.spec.axes import read_pieces
-    from sweep.spec.mistakes import Rejected
+    from sweep.spec.rules import Rejected
 
     try:
         found = [value for piece in read_pieces(listed, rule, ()) for value in piece.si.tolist()]

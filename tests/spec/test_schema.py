@@ -13,8 +13,7 @@ from written_specs import written
 from sweep.model import window as model_window
 from sweep.model.ground import LAWS
 from sweep.spec import SceneSpec, Spec, SpecError, json_schema, load
-from sweep.spec.identity import digest
-from sweep.spec.parts import all_parts, fields_of, rule_of
+from sweep.spec.parts import all_parts, digest, fields_of, rule_of
 from sweep.spec.reading import read_document
 from sweep.spec.rules import WINDOWS, Numeric
 from sweep.spec.sections import parameter_rules

@@ -17,7 +17,7 @@ from sweep.model.outputs import BEAMLETS, CYCLES, POINTS, SHOTS, STATISTICS, XYZ
 from sweep.model.pairing import FLAGS, TRUE
 from sweep.scenes.eyepoint_arrays import from_arrays
 from sweep.spec import Mistake, SpecError
-from sweep.spec.mistakes import near_miss
+from sweep.spec.rules import near_miss
 from sweep.storage.locations import PACKED, Location, eyepoints_path, located, zarr_store
 from sweep.storage.opening import CHECKED, NotAStoreError
 from sweep.units import QuantityError
