@@ -180,13 +180,6 @@ def scale_of(variable: str, words: str, layers: Sequence[np.ndarray]) -> Scale:
     return Scale(low, high if high > low else low + 1.0, False, words)
 
 
-def axis_of(variable: str, words: str, layers: Sequence[np.ndarray]) -> Axis:
-    """Return the axis of a variable: pd from 0 to 1, wide spans by decades."""
-    if variable.startswith("pd_"):
-        return Axis(words, limits=CHANCE)
-    return Axis(words, LOG if scale_of(variable, words, layers).decades else LINEAR)
-
-
 def worst(variable: str) -> str:
     """Worst kind of the values that share a cell; empty if neither end is bad."""
     if variable.startswith(("pd_", "snr_")):
@@ -299,7 +292,10 @@ def slices(found: Points, *, x: str, by: str, variable: str, words: str, most: i
     named, lacking = lines_of(parts, lines_by)
     drawn, remarks = along([(own, variable) for _, _, own in named], x)
     ruler = Ruler.of(found, x)
-    panels = panels_of(named, drawn, ruler, axis_of(variable, words, [line.y for line in drawn]))
+    scale = scale_of(variable, words, [line.y for line in drawn])
+    limits = CHANCE if variable.startswith("pd_") else None
+    up = Axis(words, LOG if scale.decades else LINEAR, limits)
+    panels = panels_of(named, drawn, ruler, up)
     return Chart(
         words,
         alternative(words, ruler.span(np.unique(found.values(x))), panels[0]),

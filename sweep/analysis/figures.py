@@ -22,7 +22,6 @@ from sweep.analysis.scenes.recording import (
     Interval,
     Place,
     Recording,
-    eyepoints_of,
     gathered,
     place,
     read_eyepoints,
@@ -88,19 +87,14 @@ class Study:
         """The figures that it asks for; a usual set where it asks for none."""
         return list(self.spec.figures) or default_figures(self.spec)
 
-    def words(self, variable: str) -> str:
-        """Return a variable's name in words, with its units."""
-        attributes = self.dataset[variable].attrs
-        return labels.with_units(attributes.get("long_name", variable), attributes.get("units", ""))
-
     def chart(self, figure: Surface | Slices, room: charts.Room) -> charts.Chart | None:
         """Return the chart of a figure, or None if no point is within its limits."""
         found = confined(self.points, self.spec, figure.where)
         if not found.size:
             return None
-        options: dict[str, Any] = {
-            "x": figure.x, "variable": figure.variable, "words": self.words(figure.variable),
-        }  # fmt: skip
+        about = self.dataset[figure.variable].attrs
+        words = labels.with_units(about.get("long_name", figure.variable), about.get("units", ""))
+        options: dict[str, Any] = {"x": figure.x, "variable": figure.variable, "words": words}
         if isinstance(figure, Surface):
             return charts.surface(found, y=figure.y, room=room, **options)
         return charts.slices(found, by=figure.by, **options)
@@ -368,7 +362,7 @@ def _shot(study: SceneStudy, figure: ShotSpectra, at: Place) -> canvas.Sheet | s
         return "no shot tells several surfaces apart"
     if number >= recording.shots:
         return f"there is no shot {number}"
-    eyepoints = read_eyepoints(eyepoints_of(study.path, recording.dataset), np.array([number]))
+    eyepoints = read_eyepoints(study.path, recording.dataset, np.array([number]))
     if not eyepoints.seen.all():
         return f"shot {number} sees nothing"
     parameters = parameters_at(study.spec, at.index)

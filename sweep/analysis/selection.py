@@ -56,26 +56,6 @@ def known(array: xr.DataArray) -> xr.DataArray:
     return array if array.dtype.kind == "f" else array.astype(float).where(array >= 0)
 
 
-def coarsened(
-    array: xr.DataArray, sides: Sequence[tuple[Side, int]], at: Mapping[str, int], kind: str
-) -> xr.DataArray:
-    """Return an array in cells along some sides, at one place along the others; lazy.
-
-    Sides come with the largest number of their cells; kinds are ``mean``, ``lowest``,
-    ``highest``.
-    """
-    array = array.isel(dict(at))
-    for side, _ in sides:
-        if not np.array_equal(side.positions, np.arange(array.sizes[side.dim])):
-            array = array.isel({side.dim: side.positions})
-    array = xr.DataArray(known(array).variable)
-    together = {side.dim: side.together(most) for side, most in sides}
-    if max(together.values()) > 1:
-        cells = array.coarsen(together, boundary="pad")
-        array = {MEAN: cells.mean, LOWEST: cells.min, HIGHEST: cells.max}[kind]()
-    return array.transpose(*together)
-
-
 @dataclass(frozen=True)
 class Points:
     """Points of a dataset: all combinations of some places along its dimensions.
@@ -112,7 +92,7 @@ class Points:
     def values(self, name: str) -> np.ndarray:
         """Return a coordinate, or the number of the place, at each place along its dimension."""
         own = self.places[self.dim_of(name)]
-        return np.asarray(own[name] if name in own else own.index)
+        return np.asarray(own.get(name, own.index))
 
     def units(self, name: str) -> str:
         """Units of a coordinate."""
@@ -176,9 +156,21 @@ class Points:
         return {dim: int(own.index[0]) for dim, own in self.places.items() if dim not in shown}
 
     def cells(self, variable: str, sides: Sequence[tuple[Side, int]], kind: str) -> xr.DataArray:
-        """Return a variable in cells along some sides, as :func:`coarsened` makes them."""
-        at = self.first(*(side for side, _ in sides))
-        return coarsened(self.dataset[variable], sides, at, kind)
+        """Return a variable in cells along some sides, at the first place along the others; lazy.
+
+        Sides come with the largest number of their cells; kinds are ``mean``, ``lowest``,
+        ``highest``.
+        """
+        array = self.dataset[variable].isel(self.first(*(side for side, _ in sides)))
+        for side, _ in sides:
+            if not np.array_equal(side.positions, np.arange(array.sizes[side.dim])):
+                array = array.isel({side.dim: side.positions})
+        array = xr.DataArray(known(array).variable)
+        together = {side.dim: side.together(most) for side, most in sides}
+        if max(together.values()) > 1:
+            cells = array.coarsen(together, boundary="pad")
+            array = {MEAN: cells.mean, LOWEST: cells.min, HIGHEST: cells.max}[kind]()
+        return array.transpose(*together)
 
 
 def is_any(values: np.ndarray, wanted: list[object]) -> np.ndarray:

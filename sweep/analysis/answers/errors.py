@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
@@ -43,7 +42,7 @@ def range_error(dataset: xr.Dataset) -> xr.Dataset:
         threshold noise is taken for signal, and no estimate comes near the bound. A study that
         draws whole spectra has instead what it stores: `bias`, `rmse` and `bound`.
     """
-    return _errors(dataset, "range", "range_error", lambda found: found.range)
+    return _errors(dataset, "range")
 
 
 def velocity_error(dataset: xr.Dataset) -> xr.Dataset:
@@ -51,18 +50,10 @@ def velocity_error(dataset: xr.Dataset) -> xr.Dataset:
 
     Parameters and results as of :func:`range_error`, in m/s.
     """
-    return _errors(
-        dataset, "radial velocity", "radial_velocity_error", lambda found: found.radial_velocity
-    )
+    return _errors(dataset, "radial_velocity")
 
 
-def _errors(
-    dataset: xr.Dataset,
-    words: str,
-    stored: str,
-    which: Callable[[estimators.Deviation], np.ndarray],
-) -> xr.Dataset:
-    quantity = stored.removesuffix("_error")
+def _errors(dataset: xr.Dataset, quantity: str) -> xr.Dataset:
     if f"{quantity}_rmse" in dataset:
         kinds = {kind: dataset[f"{quantity}_{kind}"] for kind in ("bias", "rmse", "bound")}
         return xr.Dataset(kinds).assign_attrs(dataset.attrs)
@@ -77,7 +68,8 @@ def _errors(
 
     def bound(*arrays: np.ndarray) -> np.ndarray:
         names = dict(zip(values, arrays[3:], strict=True))
-        return which(_bounds(arrays[:3], names))
+        found: np.ndarray = getattr(_bounds(arrays[:3], names), quantity)
+        return found
 
     bounds = xr.apply_ufunc(
         bound, *snr, *values.values(), dask="parallelized", output_dtypes=[float]
@@ -85,16 +77,16 @@ def _errors(
     width = values["sample_rate"] / values["fft_size"]
     bins = (
         SPEED_OF_LIGHT / 2 * values["duration"] / values["bandwidth"] * width
-        if stored == "range_error"
+        if quantity == "range"
         else values["wavelength"] / 2 * width
     )
     # Half sum and half difference of two peaks, each off by a bin over sqrt(12).
     result = xr.Dataset({
-        "reported": dataset[stored],
+        "reported": dataset[f"{quantity}_error"],
         "resolution": bins / np.sqrt(24.0) + xr.zeros_like(bounds),
         "bound": bounds,
     })  # fmt: skip
-    units = str(dataset[stored].attrs.get("units", ""))
+    units, words = str(result["reported"].attrs.get("units", "")), quantity.replace("_", " ")
     for name, text in (
         ("resolution", f"standard deviation that whole bins give to the {words}"),
         ("bound", f"Cramer-Rao bound on the standard deviation of the {words}"),

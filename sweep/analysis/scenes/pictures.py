@@ -392,8 +392,7 @@ def scatter_sheet(
     columns = {name: shown(name, table[name]) for name in (x, y)}
     limits = {name: _limits(name, columns[name], true) for name in (x, y)}
     inside = np.logical_and.reduce([Interval(*limits[n]).holds(columns[n]) for n in (x, y)])
-    what = labels.counted(found.total, "point" if "flags" in table else "shot")
-    said = [what + f", one in {found.every} of them shown" * (found.every > 1)]
+    said = [found.counted("point" if "flags" in table else "shot")]
     if outside := int((~inside & ~true).sum()) * found.every:
         said.append(f"{labels.counted(outside, 'false point')} outside of the picture")
     stage = Stage(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -62,7 +62,6 @@ KINDS = {name: bit for name, bit in FLAGS.items() if name != "unconfirmed"}
 class Quantity:
     """A quantity of each shot or of each point."""
 
-    name: str
     words: str
     units: str
     of_points: bool
@@ -73,18 +72,17 @@ def _listed() -> dict[str, Quantity]:
     for table, of_points in ((SHOTS, False), (STATISTICS, False), (POINTS, True)):
         for name, output in table.items():
             if XYZ not in output.dims:
-                found[name] = Quantity(name, output.long_name, output.units, of_points)
+                found[name] = Quantity(output.long_name, output.units, of_points)
     plain = {
         "range": "range", "radial_velocity": "radial velocity", "snr": "signal-to-noise ratio",
         "pd": "probability of detection", "time": "time", "beam": "beam", "surface": "surface",
     }  # fmt: skip
     for name, words in plain.items():
-        found[name] = Quantity(name, words, found[name].units, found[name].of_points)
+        found[name] = replace(found[name], words=words)
     altitude = CYCLES["true_altitude"]
-    derived = [Quantity("altitude", "altitude above ground", altitude.units, False)]
-    derived += [Quantity(axis, axis, "m", True) for axis in "xyz"]
-    derived += [Quantity("shot", "number of the shot", "1", False)]
-    return found | {quantity.name: quantity for quantity in derived}
+    found["altitude"] = Quantity("altitude above ground", altitude.units, False)
+    found |= {axis: Quantity(axis, "m", True) for axis in AXES}
+    return found | {"shot": Quantity("number of the shot", "1", False)}
 
 
 QUANTITIES = _listed()
@@ -286,23 +284,20 @@ class Thinned:
     def __init__(self, most: int) -> None:
         self.most, self.every, self.total = most, 1, 0
         self._parts: list[Table] = []
-        self._kept = 0
 
     def add(self, table: Table) -> None:
         """Rows that follow."""
-        size = len(next(iter(table.values())))
-        number = np.arange(self.total, self.total + size)
-        self.total += size
-        self._append(table, number % self.every == 0)
-        while self._kept > self.most:
+        first = -self.total % self.every
+        self.total += len(next(iter(table.values())))
+        self._parts.append({n: values[first :: self.every].copy() for n, values in table.items()})
+        while self.total > self.most * self.every:
             self.every *= 2
-            whole = self.rows()
-            self._parts, self._kept = [], 0
-            self._append(whole, np.arange(len(next(iter(whole.values())))) % 2 == 0)
+            self._parts = [{n: values[::2].copy() for n, values in self.rows().items()}]
 
-    def _append(self, table: Table, chosen: np.ndarray) -> None:
-        self._parts.append({name: values[chosen] for name, values in table.items()})
-        self._kept += int(chosen.sum())
+    def counted(self, thing: str, what: str = "") -> str:
+        """Return the number of all rows in words, and how many of them are kept."""
+        kept = f", one in {self.every} of them shown" if self.every > 1 else ""
+        return labels.counted(self.total, thing) + what + kept
 
     def rows(self) -> Table:
         """Return the rows kept; empty where none were added."""
@@ -345,10 +340,10 @@ def place(spec: SceneSpec, where: Mapping[str, object]) -> Place:
     for name, written in where.items():
         several = list(written) if isinstance(written, tuple | list) else [written]
         try:
-            axis, found = _fitting(spec, name, several)
+            axis, found, there = _fitting(spec, name, several)
             fits[axis] &= found
             if not fits[axis].any():
-                raise QuantityError("is no value of this study", _values(spec, name))
+                raise QuantityError("is no value of this study", there)
         except QuantityError as error:
             mistakes.append(Mistake(f"where.{name}", error.rule, f"{written}", error.suggestion))
     if mistakes:
@@ -364,29 +359,23 @@ def place_at(spec: SceneSpec, numbers: Sequence[int]) -> Place:
     return Place(index, _words(spec, index), ())
 
 
-def _fitting(spec: SceneSpec, name: str, several: list[object]) -> tuple[str, np.ndarray]:
-    """Return the axis of a coordinate, and which of its values are among those asked for."""
+def _fitting(spec: SceneSpec, name: str, several: list[object]) -> tuple[str, np.ndarray, str]:
+    """Return the axis of a coordinate, which of its values are asked for, and them in words."""
     for axis in spec.axes:
-        if name in [member.name for member in axis.members]:
-            wanted: list[object] = [spec.coordinate_value(name, value) for value in several]
-            return axis.name, is_any(np.asarray(spec.member(name).display), wanted)
+        for member in axis.members:
+            if name == member.name:
+                wanted: list[object] = [spec.coordinate_value(name, value) for value in several]
+                shown = [labels.quantity(value, member.units) for value in member.display[:8]]
+                there = f"it has {', '.join(shown)}" + (", ..." if axis.size > 8 else "")
+                return axis.name, is_any(np.asarray(member.display), wanted), there
         if name == axis.name:
-            return axis.name, np.isin(np.arange(axis.size), [int(str(v)) for v in several])
+            numbers = np.isin(np.arange(axis.size), [int(str(v)) for v in several])
+            return axis.name, numbers, f"they are numbered 0 to {axis.size - 1}"
     known = [member.name for axis in spec.axes for member in axis.members]
     otherwise = f"the coordinates are {', '.join(known)}" if known else "it has no axes"
     raise QuantityError(
         "is no coordinate of this study", near_miss(name, known, otherwise=otherwise)
     )
-
-
-def _values(spec: SceneSpec, name: str) -> str:
-    """Return the values that there are, in words."""
-    for axis in spec.axes:
-        for member in axis.members:
-            if name == member.name:
-                shown = [labels.quantity(value, member.units) for value in member.display[:8]]
-                return f"it has {', '.join(shown)}" + (", ..." if axis.size > 8 else "")
-    return f"they are numbered 0 to {next(a.size for a in spec.axes if a.name == name) - 1}"
 
 
 def _words(spec: SceneSpec, index: Mapping[str, int]) -> str:
@@ -412,19 +401,21 @@ Box = dict[str, tuple[float, float]]
 class Cloud:
     """Points of a picture, and what else is in it.
 
-    Dropouts are what shots without a point aimed at. Totals are those within the limits, one of
-    `every` is shown; false points `outside` of the box of the picture [m] are left out.
+    Of the rows within the limits, false points `outside` of the box of the picture [m] are left
+    out. Lost are shots without a point, and dropouts what they aimed at.
     """
 
     points: Table
-    dropouts: Table
     path: Table
-    total: int
-    total_dropouts: int
+    rows: Thinned
+    lost: Thinned
     outside: int
-    every: int
-    every_dropout: int
     box: Box
+
+    @property
+    def dropouts(self) -> Table:
+        """Places that shots without a point aimed at; empty where none were looked for."""
+        return self.lost.rows()
 
     @property
     def true(self) -> np.ndarray:
@@ -434,17 +425,12 @@ class Cloud:
     @property
     def remarks(self) -> list[str]:
         """Numbers of points, dropouts and false points outside, and how many of them are shown."""
-        said = [labels.counted(self.total, "point") + _one_in(self.every)]
+        said = [self.rows.counted("point")]
         if self.dropouts:
-            lost = labels.counted(self.total_dropouts, "shot")
-            said.append(f"{lost} without a point{_one_in(self.every_dropout)}")
+            said.append(self.lost.counted("shot", " without a point"))
         if self.outside:
             said.append(f"{labels.counted(self.outside, 'false point')} outside of the picture")
         return said
-
-
-def _one_in(every: int) -> str:
-    return f", one in {every} of them shown" if every > 1 else ""
 
 
 def gathered(
@@ -485,13 +471,10 @@ def gathered(
     inside_box = np.logical_and.reduce([Interval(*box[axis]).holds(rows[axis]) for axis in AXES])
     return Cloud(
         points={name: values[inside_box] for name, values in rows.items()},
-        dropouts=lost.rows(),
         path=track.rows(),
-        total=found.total,
-        total_dropouts=lost.total,
+        rows=found,
+        lost=lost,
         outside=int((~inside_box).sum()) * found.every,
-        every=found.every,
-        every_dropout=lost.every,
         box=box,
     )
 
@@ -511,13 +494,9 @@ def _box(rows: Table, lost: Table, track: Table, places: Mapping[str, Interval])
     return {axis: (low - room, high + room) for axis, (low, high) in box.items()}
 
 
-def eyepoints_of(store_path: Location, scanner: xr.Dataset) -> Location:
-    """Store of the eyepoints that a scanner's clouds were made of."""
-    return eyepoints_path(store_path, str(scanner.attrs["geometry_id"]))
-
-
-def read_eyepoints(path: Location, index: np.ndarray) -> Eyepoints:
-    """Eyepoints of some shots."""
+def read_eyepoints(store_path: Location, scanner: xr.Dataset, index: np.ndarray) -> Eyepoints:
+    """Eyepoints of some shots that a scanner's clouds in a store were made of."""
+    path = eyepoints_path(store_path, str(scanner.attrs["geometry_id"]))
     if not path.exists():
         raise NotAStoreError(
             f"the eyepoints of the study are not at {path}: they are kept beside its store; "
