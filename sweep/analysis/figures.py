@@ -14,12 +14,11 @@ from sweep.analysis import accuracy, canvas, charts, labels, tables
 from sweep.analysis.opening import ACCURACY, SCENE, opened, read_attributes
 from sweep.analysis.opening import open as open_store
 from sweep.analysis.scenes import pictures
-from sweep.analysis.scenes.navigation import Curve, curves, navigation_chart, navigation_page
+from sweep.analysis.scenes.navigation import curves, navigation_chart, navigation_page
 from sweep.analysis.scenes.pictures import Ground
 from sweep.analysis.scenes.recording import (
     AXES,
     QUANTITIES,
-    Interval,
     Place,
     Recording,
     gathered,
@@ -267,7 +266,7 @@ class SceneStudy:
             Scatter: _scatter,
             ShotSpectra: _shot,
             NavigationFigure: _navigation,
-            NavigationTable: _navigation_table,
+            NavigationTable: _navigation,
         }
         return makers[type(figure)](self, figure, place(self.spec, figure.where))
 
@@ -288,10 +287,6 @@ def _recording(
     return at.recording(study.tree, figure.scanner or study.scanners[0])
 
 
-def _interval(limits: tuple[float, ...] | None) -> Interval | None:
-    return Interval(*limits) if limits is not None else None
-
-
 def _remarks(study: SceneStudy, recording: Recording, at: Place, figure: Any) -> list[str]:
     """Scanner, ranges, draw and place of what is shown, as far as there is a choice."""
     said = []
@@ -306,7 +301,7 @@ def _remarks(study: SceneStudy, recording: Recording, at: Place, figure: Any) ->
 
 def _cloud(study: SceneStudy, figure: CloudFigure, at: Place) -> canvas.Sheet | str:
     recording = _recording(study, figure, at)
-    asked = {name: _interval(getattr(figure, name)) for name in (*AXES, "time")}
+    asked = {name: getattr(figure, name) for name in (*AXES, "time")}
     found = gathered(
         recording,
         [figure.colour],
@@ -338,7 +333,7 @@ def _scatter(study: SceneStudy, figure: Scatter, at: Place) -> canvas.Sheet | st
     recording = _recording(study, figure, at)
     found = recording.rows(
         [figure.x, figure.y, figure.colour], MOST_SCATTERED, draw=figure.draw,
-        ranges=figure.ranges, time=_interval(figure.time),
+        ranges=figure.ranges, time=figure.time,
     )  # fmt: skip
     if not found.total:
         return NO_POINT
@@ -381,27 +376,17 @@ def _shot(study: SceneStudy, figure: ShotSpectra, at: Place) -> canvas.Sheet | s
     )
 
 
-def _curves(
+def _navigation(
     study: SceneStudy, figure: NavigationFigure | NavigationTable, at: Place
-) -> list[Curve]:
+) -> canvas.Sheet | Page | str:
     scanners = figure.scanners or study.scanners
     named = [(scanner, at.recording(study.tree, scanner)) for scanner in scanners]
-    return curves(named, quantity=figure.quantity, bins=figure.bins)
-
-
-def _navigation(study: SceneStudy, figure: NavigationFigure, at: Place) -> canvas.Sheet | str:
-    found = _curves(study, figure, at)
+    found = curves(named, quantity=figure.quantity, bins=figure.bins)
+    note = labels.joined([at.words, study.note])
+    if isinstance(figure, NavigationTable):
+        title = figure.title or study.spec.title
+        return navigation_page(found, show=figure.show, title=title, remarks=[note])
     if not found:
         return "no measurement cycle of three shots or more"
-    return canvas.sheet_of(
-        navigation_chart(found, figure.show),
-        study.titled(figure, f"Navigation: {figure.quantity}"),
-        labels.joined([at.words, study.note]),
-    )
-
-
-def _navigation_table(study: SceneStudy, figure: NavigationTable, at: Place) -> Page:
-    return navigation_page(
-        _curves(study, figure, at), show=figure.show, title=figure.title or study.spec.title,
-        remarks=[labels.joined([at.words, study.note])],
-    )  # fmt: skip
+    title = study.titled(figure, f"Navigation: {figure.quantity}")
+    return canvas.sheet_of(navigation_chart(found, figure.show), title, note)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
+import pandas
 import xarray as xr
 from scipy.interpolate import CubicSpline
 
@@ -27,6 +28,8 @@ _PARAMETERS = {
     "delay": "processing.acquisition_delay", "line_width": "laser.line_width",
     "line_shape": "laser.line_shape", "looks": "looks.number", "combine": "looks.combine",
 }  # fmt: skip
+_ALIKE = ("architecture", "segments", "window", "fft_size", "duration", "delay", "sample_rate")
+"""Parameters that points have in common whose bounds are worked out together."""
 
 
 def range_error(dataset: xr.Dataset) -> xr.Dataset:
@@ -100,14 +103,11 @@ def _bounds(snr: tuple[np.ndarray, ...], p: dict[str, np.ndarray]) -> estimators
     shape = np.broadcast_shapes(*(np.shape(a) for a in (*snr, *p.values())))
     flat = {name: np.broadcast_to(a, shape).ravel() for name, a in p.items()}
     seen = [np.broadcast_to(a, shape).ravel() for a in snr]
-    kinds = list(zip(flat["architecture"], flat["segments"], flat["window"], flat["fft_size"],
-                     flat["duration"], flat["delay"], flat["sample_rate"],
-                     strict=True))  # fmt: skip
+    kinds = pandas.DataFrame({name: flat[name] for name in _ALIKE})
     spread = np.empty((2, len(kinds)))
-    for kind in dict.fromkeys(kinds):
-        mask = np.fromiter((other == kind for other in kinds), bool, len(kinds))
-        part = {name: a[mask] for name, a in flat.items()}
-        spread[:, mask] = _alike([s[mask] for s in seen], part)
+    for places in kinds.groupby(list(kinds), sort=False).indices.values():
+        part = {name: a[places] for name, a in flat.items()}
+        spread[:, places] = _alike([s[places] for s in seen], part)
     return estimators.Deviation(*spread.reshape(2, *shape))
 
 

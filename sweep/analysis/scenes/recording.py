@@ -117,16 +117,16 @@ def kinds(flags: np.ndarray) -> np.ndarray:
 Table = dict[str, np.ndarray]
 
 
-@dataclass(frozen=True)
-class Interval:
-    """Limits of a quantity, either of them none."""
+Limits = tuple[float, ...]
+"""Lowest and highest value of a quantity."""
 
-    low: float = -np.inf
-    high: float = np.inf
+UNLIMITED: Limits = (-np.inf, np.inf)
 
-    def holds(self, values: np.ndarray) -> np.ndarray:
-        """Mask of the values within; nan is not."""
-        return (values >= self.low) & (values <= self.high)
+
+def within(table: Table, limits: Mapping[str, Limits]) -> np.ndarray:
+    """Mask of the rows in which all quantities that have limits lie within them; nan does not."""
+    inside = [(table[n] >= low) & (table[n] <= high) for n, (low, high) in limits.items()]
+    return np.asarray(np.logical_and.reduce(inside))
 
 
 @dataclass(frozen=True)
@@ -142,11 +142,10 @@ class Recording:
         """Number of shots."""
         return int(self.dataset.sizes["shot"])
 
-    def stretches(self, time: Interval | None = None) -> Iterator[slice]:
-        """Ranges of shots, without those that are not computed or lie outside of an interval."""
+    def stretches(self, time: Limits = UNLIMITED) -> Iterator[slice]:
+        """Ranges of shots, without those that are not computed or lie outside of limits."""
         for part in stretches(self.dataset["flags"], "shot"):
-            at = self.read("time", part)
-            if np.isfinite(at).any() and (time is None or time.holds(at).any()):
+            if within({"time": self.read("time", part)}, {"time": time}).any():
                 yield part
 
     def computed(self, part: slice, draw: int = 0) -> np.ndarray:
@@ -204,13 +203,13 @@ class Recording:
         *,
         draw: int = 0,
         ranges: str = QUANTISED,
-        time: Interval | None = None,
+        time: Limits | None = None,
     ) -> Thinned:
         """Quantities of every point, or of every computed shot if all are a shot's; thinned."""
         of_points = any(QUANTITIES[name].of_points for name in names)
-        crops = {"time": time} if time else {}
+        limits = {"time": time} if time else {}
         found = Thinned(most)
-        for part in self.stretches(time):
+        for part in self.stretches(time or UNLIMITED):
             if of_points:
                 every = list(dict.fromkeys([*names, "flags", "time"]))
                 table = self.points(every, part, draw, ranges)
@@ -218,7 +217,7 @@ class Recording:
                 known = self.computed(part)
                 every = list(dict.fromkeys([*names, "time"]))
                 table = {name: self.of_shots(name, part)[known] for name in every}
-            found.add(confined(table, crops))
+            found.add(confined(table, limits))
         return found
 
     def _positions(
@@ -270,12 +269,12 @@ def several_surfaces(recording: Recording, draw: int = 0) -> int | None:
     return fallback
 
 
-def confined(tables: Table, crops: Mapping[str, Interval]) -> Table:
-    """Rows of a table in which every quantity lies within its interval."""
-    if not crops:
-        return tables
-    inside = np.logical_and.reduce([crop.holds(tables[name]) for name, crop in crops.items()])
-    return {name: values[inside] for name, values in tables.items()}
+def confined(table: Table, limits: Mapping[str, Limits]) -> Table:
+    """Rows of a table that lie within limits."""
+    if not limits:
+        return table
+    inside = within(table, limits)
+    return {name: values[inside] for name, values in table.items()}
 
 
 class Thinned:
@@ -439,7 +438,7 @@ def gathered(
     *,
     ranges: str,
     draw: int = 0,
-    crops: Mapping[str, Interval] | None = None,
+    crops: Mapping[str, Limits] | None = None,
     dropouts: bool = False,
     path: bool = False,
     most: int = MOST_POINTS,
@@ -449,12 +448,13 @@ def gathered(
     places = {name: crop for name, crop in crops.items() if name in AXES}
     kept = list(dict.fromkeys([*AXES, "flags", *names]))
     found, lost, track = Thinned(most), Thinned(MOST_DROPOUTS), Thinned(MOST_PATH)
-    for part in recording.stretches(crops.get("time")):
+    asked = crops.get("time", UNLIMITED)
+    for part in recording.stretches(asked):
         every = recording.points(list(dict.fromkeys([*kept, *crops])), part, draw, ranges)
         inside = confined(every, crops)
         found.add({name: inside[name] for name in kept})
         time = recording.read("time", part)
-        chosen = crops.get("time", Interval()).holds(time)
+        chosen = within({"time": time}, {"time": asked})
         if dropouts:
             none = ~(recording.read("flags", part, draw) > 0).any(axis=-1)
             none &= recording.computed(part, draw) & (chosen | ("time" not in crops))
@@ -468,7 +468,7 @@ def gathered(
         return None
     rows = found.rows()
     box = _box(rows, lost.rows(), track.rows(), places)
-    inside_box = np.logical_and.reduce([Interval(*box[axis]).holds(rows[axis]) for axis in AXES])
+    inside_box = within(rows, box)
     return Cloud(
         points={name: values[inside_box] for name, values in rows.items()},
         path=track.rows(),
@@ -479,17 +479,17 @@ def gathered(
     )
 
 
-def _box(rows: Table, lost: Table, track: Table, places: Mapping[str, Interval]) -> Box:
+def _box(rows: Table, lost: Table, track: Table, places: Mapping[str, Limits]) -> Box:
     """Box around what a figure shows: asked limits, else true points, dropouts and the path."""
     true = (rows["flags"] & TRUE) > 0
     box: Box = {}
     for axis in AXES:
         values = rows[axis][true] if true.any() else rows[axis]
         every = [values, *(t[axis] for t in (lost, track) if t)]
-        crop = places.get(axis, Interval())
+        lowest, highest = places.get(axis, UNLIMITED)
         low = min(float(v.min()) for v in every if v.size)
         high = max(float(v.max()) for v in every if v.size)
-        box[axis] = (max(low, crop.low), min(high, crop.high))
+        box[axis] = (max(low, lowest), min(high, highest))
     room = MARGIN * max(max(high - low for low, high in box.values()), 1.0)
     return {axis: (low - room, high + room) for axis, (low, high) in box.items()}
 
