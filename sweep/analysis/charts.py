@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 from typing import Any
 
 import dask
@@ -224,17 +225,14 @@ def surface(
         for kind in kinds
     ]
     layers = [np.asarray(layer, float) for layer in dask.compute(*lazy)]
-    rulers = Ruler.of(found, x), Ruler.of(found, y)
-    maps = [
-        Map(rulers[0].shown(across.middles(most[0])), rulers[1].shown(up.middles(most[1])), layer)
-        for (_, across, up), layer in zip(
-            (plane for plane in planes for _ in kinds), layers, strict=True
-        )
-    ]
-    choices = [{"part": name, "cell": f"{kind} of each cell" if max(by) > 1 else ""}
-               for name, _ in parts for kind in kinds]  # fmt: skip
-    spans = [ruler.span(np.unique(found.values(n)))
-             for ruler, n in zip(rulers, (x, y), strict=True)]  # fmt: skip
+    x_ruler, y_ruler = Ruler.of(found, x), Ruler.of(found, y)
+    panels = []
+    for ((name, _), (_, across, up)), kind in product(zip(parts, planes, strict=True), kinds):
+        when = {"part": name, "cell": f"{kind} of each cell" if max(by) > 1 else ""}
+        columns, rows = across.middles(most[0]), up.middles(most[1])
+        layer = Map(x_ruler.shown(columns), y_ruler.shown(rows), layers[len(panels)])
+        panels.append(Panel(when, x_ruler.axis, y_ruler.axis, map=layer))
+    spans = [ruler.span(np.unique(found.values(n))) for ruler, n in ((x_ruler, x), (y_ruler, y))]
     remarks = [_reduction(math.prod(by), planes[0][1:], kinds), not_shown(left_out)]
     if any(np.isnan(layer).any() for layer in layers):
         remarks.append("grey or empty: not computed, or without a value")
@@ -242,11 +240,10 @@ def surface(
         words,
         f"Heat map of {words} over {' and '.join(spans)}: {labels.extent(layers[0])}.",
         remarks,
-        [Panel(when, rulers[0].axis, rulers[1].axis, map=one)
-         for when, one in zip(choices, maps, strict=True)],
+        panels,
         {"part": "Shown for", "cell": "Each cell shows the"},
         scale_of(variable, words, layers),
-    )  # fmt: skip
+    )
 
 
 def _most(planes: Sequence[tuple[Points, Side, Side]], room: Room, layers: int) -> tuple[int, int]:
