@@ -96,7 +96,7 @@ class Track:
 def tracks(study: Study) -> tuple[list[Track], int]:
     """Tracks along the main coordinate, and how many are left out.
 
-    That is range where it varies, else the longest of the numeric coordinates.
+    The main coordinate is range where it varies, else the longest one of numbers.
     """
     every = [member for axis in study.spec.axes for member in axis.members]
     numeric = [member for member in every if not isinstance(member.values, tuple)]

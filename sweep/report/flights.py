@@ -220,9 +220,9 @@ def _longest(sides: np.ndarray) -> float:
     """Longest side at which all of a box is seen from every view, in the library's lengths."""
     corners = np.array(list(product((-0.5, 0.5), repeat=3))) * sides
     eyes = [np.array([view[axis] for axis in AXES]) for view in VIEWS.values()]
-    sizes = np.linspace(2.0, 0.1, 191)
-    fits = np.all([[_seen(size * corners, eye) for eye in eyes] for size in sizes], axis=1)
-    return float(sizes[np.argmax(fits)])
+    sizes = np.linspace(2.0, 0.1, 191).tolist()
+    fitting = (size for size in sizes if all(_seen(size * corners, eye) for eye in eyes))
+    return next(fitting, sizes[0])
 
 
 def _seen(corners: np.ndarray, eye: np.ndarray) -> bool:

@@ -305,9 +305,7 @@ def _draw(picture: Flat | Solid, colour: np.ndarray) -> None:
 def _within(cloud: Cloud, table: Table) -> np.ndarray:
     """Places (3, n), nan outside of the box."""
     columns = np.array([table[axis] for axis in AXES])
-    low, high = np.array([cloud.box[axis] for axis in AXES]).T
-    inside = ((columns >= low[:, None]) & (columns <= high[:, None])).all(axis=0)
-    return np.where(inside, columns, np.nan)
+    return np.where(within(table, cloud.box), columns, np.nan)
 
 
 def _paper(ground: Ground) -> np.ndarray:
