@@ -226,7 +226,7 @@ def surface(
     ]
     layers = [np.asarray(layer, float) for layer in dask.compute(*lazy)]
     x_ruler, y_ruler = Ruler.of(found, x), Ruler.of(found, y)
-    panels = []
+    panels: list[Panel] = []
     for ((name, _), (_, across, up)), kind in product(zip(parts, planes, strict=True), kinds):
         when = {"part": name, "cell": f"{kind} of each cell" if max(by) > 1 else ""}
         columns, rows = across.middles(most[0]), up.middles(most[1])

@@ -478,7 +478,7 @@ def chosen(spec: Spec, at: Mapping[str, str]) -> list[tuple[str, Parameters]]:
     members = [member for axis in spec.axes for member in axis.members]
     paths, rules = {m.name: m.path for m in members}, parameter_rules()
     several = not at and len(spec.axes) == 1 and spec.axes[0].size <= MOST_SHOTS
-    found = []
+    found: list[tuple[str, Parameters]] = []
     for i in range(spec.axes[0].size if several else 1):
         written: dict[str, object] = {m.path: rules[m.path].written(m.values[i]) for m in members}
         # what is no coordinate is left for the spec to read, or to refuse
