@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 from typing import Any
 
 import dask
@@ -180,13 +181,6 @@ def scale_of(variable: str, words: str, layers: Sequence[np.ndarray]) -> Scale:
     return Scale(low, high if high > low else low + 1.0, False, words)
 
 
-def axis_of(variable: str, words: str, layers: Sequence[np.ndarray]) -> Axis:
-    """Return the axis of a variable: pd from 0 to 1, wide spans by decades."""
-    if variable.startswith("pd_"):
-        return Axis(words, limits=CHANCE)
-    return Axis(words, LOG if scale_of(variable, words, layers).decades else LINEAR)
-
-
 def worst(variable: str) -> str:
     """Worst kind of the values that share a cell; empty if neither end is bad."""
     if variable.startswith(("pd_", "snr_")):
@@ -231,17 +225,14 @@ def surface(
         for kind in kinds
     ]
     layers = [np.asarray(layer, float) for layer in dask.compute(*lazy)]
-    rulers = Ruler.of(found, x), Ruler.of(found, y)
-    maps = [
-        Map(rulers[0].shown(across.middles(most[0])), rulers[1].shown(up.middles(most[1])), layer)
-        for (_, across, up), layer in zip(
-            (plane for plane in planes for _ in kinds), layers, strict=True
-        )
-    ]
-    choices = [{"part": name, "cell": f"{kind} of each cell" if max(by) > 1 else ""}
-               for name, _ in parts for kind in kinds]  # fmt: skip
-    spans = [ruler.span(np.unique(found.values(n)))
-             for ruler, n in zip(rulers, (x, y), strict=True)]  # fmt: skip
+    x_ruler, y_ruler = Ruler.of(found, x), Ruler.of(found, y)
+    panels: list[Panel] = []
+    for ((name, _), (_, across, up)), kind in product(zip(parts, planes, strict=True), kinds):
+        when = {"part": name, "cell": f"{kind} of each cell" if max(by) > 1 else ""}
+        columns, rows = across.middles(most[0]), up.middles(most[1])
+        layer = Map(x_ruler.shown(columns), y_ruler.shown(rows), layers[len(panels)])
+        panels.append(Panel(when, x_ruler.axis, y_ruler.axis, map=layer))
+    spans = [ruler.span(np.unique(found.values(n))) for ruler, n in ((x_ruler, x), (y_ruler, y))]
     remarks = [_reduction(math.prod(by), planes[0][1:], kinds), not_shown(left_out)]
     if any(np.isnan(layer).any() for layer in layers):
         remarks.append("grey or empty: not computed, or without a value")
@@ -249,11 +240,10 @@ def surface(
         words,
         f"Heat map of {words} over {' and '.join(spans)}: {labels.extent(layers[0])}.",
         remarks,
-        [Panel(when, rulers[0].axis, rulers[1].axis, map=one)
-         for when, one in zip(choices, maps, strict=True)],
+        panels,
         {"part": "Shown for", "cell": "Each cell shows the"},
         scale_of(variable, words, layers),
-    )  # fmt: skip
+    )
 
 
 def _most(planes: Sequence[tuple[Points, Side, Side]], room: Room, layers: int) -> tuple[int, int]:
@@ -272,7 +262,8 @@ def _plane(found: Points, variable: str, x: str, y: str) -> tuple[Points, Side, 
     columns, column = np.unique(found.values(x), return_inverse=True)
     rows, row = np.unique(found.values(y), return_inverse=True)
     both = found.dim_of(x)
-    along = Side(both, found.positions[both], found.positions[both])
+    places = np.asarray(found.places[both].index)
+    along = Side(both, places, places)
     values = np.full((rows.size, columns.size), np.nan)
     values[row.ravel(), column.ravel()] = found.cells(variable, [(along, along.values.size)], MEAN)
     plane = Points.of(xr.Dataset({variable: (("y", "x"), values)}))
@@ -298,7 +289,10 @@ def slices(found: Points, *, x: str, by: str, variable: str, words: str, most: i
     named, lacking = lines_of(parts, lines_by)
     drawn, remarks = along([(own, variable) for _, _, own in named], x)
     ruler = Ruler.of(found, x)
-    panels = panels_of(named, drawn, ruler, axis_of(variable, words, [line.y for line in drawn]))
+    scale = scale_of(variable, words, [line.y for line in drawn])
+    limits = CHANCE if variable.startswith("pd_") else None
+    up = Axis(words, LOG if scale.decades else LINEAR, limits)
+    panels = panels_of(named, drawn, ruler, up)
     return Chart(
         words,
         alternative(words, ruler.span(np.unique(found.values(x))), panels[0]),

@@ -78,7 +78,7 @@ class PointTable:
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
         for part in self.recording.stretches():
             table = self.recording.points("xyz", part, self.draw, self.ranges)
-            places = np.array([table[axis] for axis in "xyz"]) + self.origin[:, None]
+            places = np.array([*table.values()]) + self.origin[:, None]
             low = np.minimum(low, places.min(axis=1, initial=np.inf))
             high = np.maximum(high, places.max(axis=1, initial=-np.inf))
         return low, high
@@ -117,7 +117,7 @@ def write_csv(table: PointTable, path: Path, remarks: Remarks) -> int:
     number = 0
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(f"{n} [{UNITS[n]}]" if n in UNITS else n for n in COLUMNS)
+        writer.writerow(labels.with_brackets(n, UNITS.get(n, "")) for n in COLUMNS)
         for rows in table.parts():
             writer.writerows(rows.tolist())
             number += rows.size

@@ -14,15 +14,13 @@ from sweep.analysis import accuracy, canvas, charts, labels, tables
 from sweep.analysis.opening import ACCURACY, SCENE, opened, read_attributes
 from sweep.analysis.opening import open as open_store
 from sweep.analysis.scenes import pictures
-from sweep.analysis.scenes.navigation import Curve, curves, navigation_chart, navigation_page
+from sweep.analysis.scenes.navigation import curves, navigation_chart, navigation_page
 from sweep.analysis.scenes.pictures import Ground
 from sweep.analysis.scenes.recording import (
     AXES,
     QUANTITIES,
-    Interval,
     Place,
     Recording,
-    eyepoints_of,
     gathered,
     place,
     read_eyepoints,
@@ -88,19 +86,14 @@ class Study:
         """The figures that it asks for; a usual set where it asks for none."""
         return list(self.spec.figures) or default_figures(self.spec)
 
-    def words(self, variable: str) -> str:
-        """Return a variable's name in words, with its units."""
-        attributes = self.dataset[variable].attrs
-        return labels.with_units(attributes.get("long_name", variable), attributes.get("units", ""))
-
     def chart(self, figure: Surface | Slices, room: charts.Room) -> charts.Chart | None:
         """Return the chart of a figure, or None if no point is within its limits."""
         found = confined(self.points, self.spec, figure.where)
         if not found.size:
             return None
-        options: dict[str, Any] = {
-            "x": figure.x, "variable": figure.variable, "words": self.words(figure.variable),
-        }  # fmt: skip
+        about = self.dataset[figure.variable].attrs
+        words = labels.with_units(about.get("long_name", figure.variable), about.get("units", ""))
+        options: dict[str, Any] = {"x": figure.x, "variable": figure.variable, "words": words}
         if isinstance(figure, Surface):
             return charts.surface(found, y=figure.y, room=room, **options)
         return charts.slices(found, by=figure.by, **options)
@@ -273,7 +266,7 @@ class SceneStudy:
             Scatter: _scatter,
             ShotSpectra: _shot,
             NavigationFigure: _navigation,
-            NavigationTable: _navigation_table,
+            NavigationTable: _navigation,
         }
         return makers[type(figure)](self, figure, place(self.spec, figure.where))
 
@@ -294,10 +287,6 @@ def _recording(
     return at.recording(study.tree, figure.scanner or study.scanners[0])
 
 
-def _interval(limits: tuple[float, ...] | None) -> Interval | None:
-    return Interval(*limits) if limits is not None else None
-
-
 def _remarks(study: SceneStudy, recording: Recording, at: Place, figure: Any) -> list[str]:
     """Scanner, ranges, draw and place of what is shown, as far as there is a choice."""
     said = []
@@ -312,7 +301,7 @@ def _remarks(study: SceneStudy, recording: Recording, at: Place, figure: Any) ->
 
 def _cloud(study: SceneStudy, figure: CloudFigure, at: Place) -> canvas.Sheet | str:
     recording = _recording(study, figure, at)
-    asked = {name: _interval(getattr(figure, name)) for name in (*AXES, "time")}
+    asked = {name: getattr(figure, name) for name in (*AXES, "time")}
     found = gathered(
         recording,
         [figure.colour],
@@ -344,7 +333,7 @@ def _scatter(study: SceneStudy, figure: Scatter, at: Place) -> canvas.Sheet | st
     recording = _recording(study, figure, at)
     found = recording.rows(
         [figure.x, figure.y, figure.colour], MOST_SCATTERED, draw=figure.draw,
-        ranges=figure.ranges, time=_interval(figure.time),
+        ranges=figure.ranges, time=figure.time,
     )  # fmt: skip
     if not found.total:
         return NO_POINT
@@ -368,7 +357,7 @@ def _shot(study: SceneStudy, figure: ShotSpectra, at: Place) -> canvas.Sheet | s
         return "no shot tells several surfaces apart"
     if number >= recording.shots:
         return f"there is no shot {number}"
-    eyepoints = read_eyepoints(eyepoints_of(study.path, recording.dataset), np.array([number]))
+    eyepoints = read_eyepoints(study.path, recording.dataset, np.array([number]))
     if not eyepoints.seen.all():
         return f"shot {number} sees nothing"
     parameters = parameters_at(study.spec, at.index)
@@ -387,27 +376,17 @@ def _shot(study: SceneStudy, figure: ShotSpectra, at: Place) -> canvas.Sheet | s
     )
 
 
-def _curves(
+def _navigation(
     study: SceneStudy, figure: NavigationFigure | NavigationTable, at: Place
-) -> list[Curve]:
+) -> canvas.Sheet | Page | str:
     scanners = figure.scanners or study.scanners
     named = [(scanner, at.recording(study.tree, scanner)) for scanner in scanners]
-    return curves(named, quantity=figure.quantity, bins=figure.bins)
-
-
-def _navigation(study: SceneStudy, figure: NavigationFigure, at: Place) -> canvas.Sheet | str:
-    found = _curves(study, figure, at)
+    found = curves(named, quantity=figure.quantity, bins=figure.bins)
+    note = labels.joined([at.words, study.note])
+    if isinstance(figure, NavigationTable):
+        title = figure.title or study.spec.title
+        return navigation_page(found, show=figure.show, title=title, remarks=[note])
     if not found:
         return "no measurement cycle of three shots or more"
-    return canvas.sheet_of(
-        navigation_chart(found, figure.show),
-        study.titled(figure, f"Navigation: {figure.quantity}"),
-        labels.joined([at.words, study.note]),
-    )
-
-
-def _navigation_table(study: SceneStudy, figure: NavigationTable, at: Place) -> Page:
-    return navigation_page(
-        _curves(study, figure, at), show=figure.show, title=figure.title or study.spec.title,
-        remarks=[labels.joined([at.words, study.note])],
-    )  # fmt: skip
+    title = study.titled(figure, f"Navigation: {figure.quantity}")
+    return canvas.sheet_of(navigation_chart(found, figure.show), title, note)

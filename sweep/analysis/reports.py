@@ -15,6 +15,7 @@ import numpy as np
 import pandas
 import xarray as xr
 
+from sweep.analysis import labels
 from sweep.analysis.export import chosen
 from sweep.analysis.figures import SceneStudy
 from sweep.analysis.scenes.recording import INTERPOLATED, Recording, by_ranges
@@ -97,18 +98,14 @@ def reports(
     table = reported(shots, study.spec.interface_with(interface or {}))
     if file is not None:
         with draft(Path(file), replace=True) as made:
-            _write(table, made)
+            headers = {name: labels.with_brackets(name, u) for name, (u, _) in COLUMNS.items()}
+            frame = pandas.DataFrame({header: table[name] for name, header in headers.items()})
+            frame.to_csv(made, index=False, na_rep="nan", lineterminator="\r\n")
     arrays = {
         name: ("report", table[name], {"units": units, "long_name": words})
         for name, (units, words) in COLUMNS.items()
     }
     return xr.Dataset(arrays)
-
-
-def _write(table: Table, path: Path) -> None:
-    names = {n: f"{n} [{u}]" if u != "1" else n for n, (u, _) in COLUMNS.items()}
-    frame = pandas.DataFrame({header: table[name] for name, header in names.items()})
-    frame.to_csv(path, index=False, na_rep="nan", lineterminator="\r\n")
 
 
 def _shots(recording: Recording, draw: int, ranges: str) -> Table:
@@ -214,10 +211,8 @@ def _weights(report: np.ndarray, valid: np.ndarray, number: np.ndarray, value: s
 
 def _at(time: np.ndarray, beam: np.ndarray, shots: Table, name: str) -> np.ndarray:
     """Truth of beams at times, linear between their shots; nan outside of them and of nothing."""
-    found, truth = (
-        np.full(time.size, np.nan),
-        np.where(np.isfinite(shots[name]), shots[name], np.nan),
-    )
+    found = np.full(time.size, np.nan)
+    truth = np.where(np.isfinite(shots[name]), shots[name], np.nan)
     for number in np.unique(beam):
         here, own = beam == number, shots["beam"] == number
         found[here] = np.interp(time[here], shots["time"][own], truth[own], np.nan, np.nan)

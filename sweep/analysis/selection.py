@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import dask.array
 import numpy as np
+import pandas
 import xarray as xr
 
 from sweep.analysis import labels
@@ -55,71 +56,52 @@ def known(array: xr.DataArray) -> xr.DataArray:
     return array if array.dtype.kind == "f" else array.astype(float).where(array >= 0)
 
 
-def coarsened(
-    array: xr.DataArray, sides: Sequence[tuple[Side, int]], at: Mapping[str, int], kind: str
-) -> xr.DataArray:
-    """Return an array in cells along some sides, at one place along the others; lazy.
-
-    Sides come with the largest number of their cells; kinds are ``mean``, ``lowest``,
-    ``highest``.
-    """
-    array = array.isel(dict(at))
-    for side, _ in sides:
-        if not np.array_equal(side.positions, np.arange(array.sizes[side.dim])):
-            array = array.isel({side.dim: side.positions})
-    array = xr.DataArray(known(array).variable)
-    together = {side.dim: side.together(most) for side, most in sides}
-    if max(together.values()) > 1:
-        cells = array.coarsen(together, boundary="pad")
-        array = {MEAN: cells.mean, LOWEST: cells.min, HIGHEST: cells.max}[kind]()
-    return array.transpose(*together)
-
-
 @dataclass(frozen=True)
 class Points:
-    """Points of a dataset: all combinations of some places, in rising order, along its dimensions.
+    """Points of a dataset: all combinations of some places along its dimensions.
 
-    A dimension without a coordinate of its name, as a zipped axis is, has the number of the
-    place.
+    Places are rows of their dimension's table: their number, and the coordinates there.
     """
 
     dataset: xr.Dataset
-    positions: Mapping[str, np.ndarray]
+    places: Mapping[str, pandas.DataFrame]
 
     @classmethod
     def of(cls, dataset: xr.Dataset) -> Points:
         """All points of a dataset."""
         largest = max(dataset.data_vars.values(), key=lambda array: array.ndim)
-        return cls(dataset, {str(dim): np.arange(dataset.sizes[dim]) for dim in largest.dims})
+        every: dict[str, dict[str, np.ndarray]] = {str(dim): {} for dim in largest.dims}
+        for name, coordinate in dataset.coords.items():
+            if coordinate.dims and coordinate.dims[0] in every:
+                every[str(coordinate.dims[0])][str(name)] = coordinate.values
+        places = {
+            dim: pandas.DataFrame(own, index=pandas.RangeIndex(dataset.sizes[dim]))
+            for dim, own in every.items()
+        }
+        return cls(dataset, places)
 
     @property
     def size(self) -> int:
         """Number of points."""
-        return int(np.prod([own.size for own in self.positions.values()], dtype=np.int64))
+        return math.prod(map(len, self.places.values()))
 
     def dim_of(self, name: str) -> str:
-        """Return the dimension of a coordinate."""
-        return str(self.dataset.coords[name].dims[0]) if name in self.dataset.coords else name
+        """Return the dimension of a coordinate; a zipped axis, which is none, is its own."""
+        return next((dim for dim, own in self.places.items() if name in own), name)
 
     def values(self, name: str) -> np.ndarray:
-        """Return a coordinate at each place along its dimension."""
-        positions = self.positions[self.dim_of(name)]
-        if name not in self.dataset.coords:
-            return positions
-        return np.asarray(self.dataset.coords[name].values)[positions]
+        """Return a coordinate, or the number of the place, at each place along its dimension."""
+        own = self.places[self.dim_of(name)]
+        return np.asarray(own.get(name, own.index))
 
     def units(self, name: str) -> str:
         """Units of a coordinate."""
         coordinate = self.dataset.coords.get(name)
         return "" if coordinate is None else str(coordinate.attrs.get("units", ""))
 
-    def parameters(self, dim: str) -> list[str]:
-        """Coordinates along a dimension."""
-        return [str(name) for name, c in self.dataset.coords.items() if c.dims == (dim,)]
-
-    def at(self, dim: str, chosen: np.ndarray | slice) -> Points:
+    def at(self, dim: str, chosen: np.ndarray) -> Points:
         """Points at some of the places along a dimension, by their indices or a mask."""
-        return replace(self, positions={**self.positions, dim: self.positions[dim][chosen]})
+        return replace(self, places={**self.places, dim: self.places[dim].iloc[chosen]})
 
     def where(self, name: str, wanted: list[object]) -> Points:
         """Points at which a coordinate has one of the values."""
@@ -127,66 +109,68 @@ class Points:
 
     def once(self) -> Points:
         """Points without repetition of all their coordinates."""
-        found = self
-        for dim in self.positions:
-            if names := self.parameters(dim):
-                codes = [np.unique(self.values(n), return_inverse=True)[1].ravel() for n in names]
-                first = np.unique(np.stack(codes), axis=1, return_index=True)[1]
-                found = found.at(dim, np.sort(first))
-        return found
+        places = {dim: own.drop_duplicates() if len(own.columns) else own
+                  for dim, own in self.places.items()}  # fmt: skip
+        return replace(self, places=places)
 
     def distinct(self, name: str) -> list[object]:
         """Values of a coordinate, in the order in which they first appear."""
-        values, first = np.unique(self.values(name), return_index=True)
-        return list(values[np.argsort(first)])
+        return list(pandas.unique(self.values(name)))
 
     def varying(self) -> list[str]:
         """Coordinates with more than one value."""
-        every = [name for dim in self.positions for name in self.parameters(dim)]
-        return [name for name in every if (self.values(name) != self.values(name)[:1]).any()]
+        return [n for own in self.places.values() for n in own if own[n].nunique() > 1]
 
     def further(self, names: Sequence[str]) -> list[str]:
         """Coordinates that tell points apart which those named leave together, the fewest."""
-        return [name for dim in self.positions for name in self.further_along(dim, names)]
+        return [name for dim in self.places for name in self.further_along(dim, names)]
 
     def further_along(self, dim: str, names: Sequence[str]) -> list[str]:
         """Those of :meth:`further` that lie along a dimension."""
-        named = [name for name in names if self.dim_of(name) == dim]
-        others = [n for n in self.varying() if self.dim_of(n) == dim and n not in named]
-        code = np.zeros(self.positions[dim].size, np.int64)
-        number, needed = 0, []
-        for name in [*named, *others]:
-            values, group = np.unique(self.values(name), return_inverse=True)
-            found, code_with = np.unique(code * values.size + group.ravel(), return_inverse=True)
-            if name in named or found.size > number:
-                number, code = found.size, code_with.ravel()
-                needed += [] if name in named else [name]
+        own = self.places[dim]
+        told = [name for name in names if name in own]
+        needed: list[str] = []
+        number = len(own[told].drop_duplicates()) if told else 1
+        for name in [n for n in own if n not in told]:
+            apart = len(own[[*told, *needed, name]].drop_duplicates())
+            if apart > number:
+                number = apart
+                needed.append(name)
         return needed
 
     def apart(self, name: str) -> list[tuple[object, Points]]:
         """Points of each value of a coordinate, in the order in which the values first appear."""
-        values, first, group = np.unique(self.values(name), return_index=True, return_inverse=True)
-        order = np.argsort(group.ravel(), kind="stable")
-        ends = np.cumsum(np.bincount(group.ravel(), minlength=values.size))
-        members = np.split(order, ends[:-1])
         dim = self.dim_of(name)
-        return [(values[i], self.at(dim, members[i])) for i in np.argsort(first)]
+        groups = self.places[dim].groupby(self.values(name), sort=False)
+        return [(value, replace(self, places={**self.places, dim: own})) for value, own in groups]
 
     def side(self, name: str) -> Side:
         """Places along a coordinate, in rising order, each value of the coordinate once."""
         values, first = np.unique(self.values(name), return_index=True)
         dim = self.dim_of(name)
-        return Side(dim, self.positions[dim][first], values)
+        return Side(dim, np.asarray(self.places[dim].index)[first], values)
 
     def first(self, *sides: Side) -> dict[str, int]:
         """Return the first place along every dimension but those of some sides."""
         shown = {side.dim for side in sides}
-        return {dim: int(own[0]) for dim, own in self.positions.items() if dim not in shown}
+        return {dim: int(own.index[0]) for dim, own in self.places.items() if dim not in shown}
 
     def cells(self, variable: str, sides: Sequence[tuple[Side, int]], kind: str) -> xr.DataArray:
-        """Return a variable in cells along some sides, as :func:`coarsened` makes them."""
-        at = self.first(*(side for side, _ in sides))
-        return coarsened(self.dataset[variable], sides, at, kind)
+        """Return a variable in cells along some sides, at the first place along the others; lazy.
+
+        Sides come with the largest number of their cells; kinds are ``mean``, ``lowest``,
+        ``highest``.
+        """
+        array = self.dataset[variable].isel(self.first(*(side for side, _ in sides)))
+        for side, _ in sides:
+            if not np.array_equal(side.positions, np.arange(array.sizes[side.dim])):
+                array = array.isel({side.dim: side.positions})
+        array = xr.DataArray(known(array).variable)
+        together = {side.dim: side.together(most) for side, most in sides}
+        if max(together.values()) > 1:
+            cells = array.coarsen(together, boundary="pad")
+            array = {MEAN: cells.mean, LOWEST: cells.min, HIGHEST: cells.max}[kind]()
+        return array.transpose(*together)
 
 
 def is_any(values: np.ndarray, wanted: list[object]) -> np.ndarray:
@@ -292,19 +276,14 @@ def _pieces(axis: Axis) -> list[tuple[Member, object]]:
     pieces: list[tuple[Member, object]] = []
     start = 0
     while start < axis.size:
-        lengths = [_constant(member.display[start:]) for member in members]
+        alike = [member.display[start:] == member.display[start] for member in members]
+        lengths = [int(np.argmin([*own, False])) for own in alike]
         longest = int(np.argmax(lengths))
         piece = (members[longest], members[longest].display[start].item())
         if piece not in pieces:
             pieces.append(piece)
         start += lengths[longest]
     return pieces
-
-
-def _constant(values: np.ndarray) -> int:
-    """Return the number of leading values that are equal."""
-    different = values != values[0]
-    return int(np.argmax(different)) if different.any() else values.size
 
 
 def beyond(found: Points, spec: Spec, distance: str, *, included: bool = False) -> Points:
@@ -341,7 +320,8 @@ class Statistics:
 
 def statistics(groups: Sequence[Points], variable: str) -> list[Statistics]:
     """Statistics of a variable over the points of each group, read once for all of them."""
-    arrays = [known(group.dataset[variable].isel(dict(group.positions))) for group in groups]
+    places = [{dim: np.asarray(own.index) for dim, own in g.places.items()} for g in groups]
+    arrays = [known(g.dataset[variable].isel(at)) for g, at in zip(groups, places, strict=True)]
     with TemporaryFile() as file:  # which holds the values, as memory may not
         sizes = [array.size for array in arrays]
         room = np.memmap(file, float, "w+", shape=(sum(sizes) + 1,)).view(np.ndarray)

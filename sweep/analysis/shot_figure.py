@@ -475,34 +475,17 @@ def report(
 
 def chosen(spec: Spec, at: Mapping[str, str]) -> list[tuple[str, Parameters]]:
     """Parameters of the shots to draw, each with its label."""
-    written = {_path(spec, name): value for name, value in at.items()}
-    if at or len(spec.axes) != 1 or spec.axes[0].size > MOST_SHOTS:
-        return [("", spec.parameters_at(_position(spec, [0] * len(spec.axes)) | written))]
-    axis = spec.axes[0]
-    return [
-        (
-            ", ".join(labels.valued(m.name, m.display[i], m.units) for m in axis.members),
-            spec.parameters_at(_position(spec, [i])),
-        )
-        for i in range(axis.size)
-    ]
-
-
-def _path(spec: Spec, name: str) -> str:
-    """Dotted path of a coordinate; what is none is left for the spec to refuse."""
-    try:
-        return spec.member(name).path
-    except KeyError:
-        return name
-
-
-def _position(spec: Spec, index: list[int]) -> dict[str, object]:
-    """Values at a position on the axes, as one would write them."""
-    return {
-        member.path: parameter_rules()[member.path].written(member.values[i])
-        for axis, i in zip(spec.axes, index, strict=True)
-        for member in axis.members
-    }
+    members = [member for axis in spec.axes for member in axis.members]
+    paths, rules = {m.name: m.path for m in members}, parameter_rules()
+    several = not at and len(spec.axes) == 1 and spec.axes[0].size <= MOST_SHOTS
+    found: list[tuple[str, Parameters]] = []
+    for i in range(spec.axes[0].size if several else 1):
+        written: dict[str, object] = {m.path: rules[m.path].written(m.values[i]) for m in members}
+        # what is no coordinate is left for the spec to read, or to refuse
+        written |= {paths.get(name, name): value for name, value in at.items()}
+        label = ", ".join(labels.valued(m.name, m.display[i], m.units) for m in members)
+        found.append((label if several else "", spec.parameters_at(written)))
+    return found
 
 
 def _told(shot: Shot, paths: tuple[str, ...]) -> list[tuple[str, str]]:

@@ -17,7 +17,6 @@ from sweep.analysis.answers.probability import of_a_shot
 from sweep.analysis.selection import (
     NEAREST,
     Points,
-    Statistics,
     beyond,
     confined,
     cuts,
@@ -118,16 +117,20 @@ def mean_page(found: Points, spec: Spec, asked: Asked, units: str, title: str) -
         for row, of_row in found.apart(asked.rows)
         for column in columns
     ]
-    records = [
-        {
-            "row": labels.quantity(row, found.units(asked.rows)),
-            "column": _column(found, asked.columns, column),
-            **_figures(own, _published(asked.printed, *divmod(k, len(columns)))),
-        }
-        for k, ((row, column, _), own) in enumerate(
-            zip(named, statistics([part for *_, part in named], asked.variable), strict=True)
-        )
-    ]
+    figures = statistics([part for *_, part in named], asked.variable)
+    records: list[dict[str, Cell]] = []
+    for k, ((row, column, _), own) in enumerate(zip(named, figures, strict=True)):
+        printed = _published(asked.printed, *divmod(k, len(columns)))
+        records.append(
+            {
+                "row": labels.quantity(row, found.units(asked.rows)),
+                "column": labels.valued(asked.columns, column, found.units(asked.columns))
+                if asked.columns else "all",
+                "points": own.number, "mean": own.mean, "median": own.median,
+                "lowest": own.least, "highest": own.largest, "printed": printed,
+                "printed_over_mean": printed / own.mean if own.mean else math.nan,
+            }
+        )  # fmt: skip
     names = list(dict.fromkeys(str(r["column"]) for r in records))
     of = f"of {labels.with_brackets(asked.variable, units)}"
     blocks = [
@@ -139,28 +142,12 @@ def mean_page(found: Points, spec: Spec, asked: Asked, units: str, title: str) -
     return Page(title, blocks, [], records)
 
 
-def _column(found: Points, name: str, value: object) -> str:
-    return labels.valued(name, value, found.units(name)) if name else "all"
-
-
 def _published(printed: Any, row: int, column: int) -> float:
     """Return the printed figure of a row and column; of one row of numbers, that of the row."""
     if row >= len(printed):
         return math.nan
     values = printed[row] if isinstance(printed[row], tuple | list) else (printed[row],)
     return float(values[column]) if column < len(values) else math.nan
-
-
-def _figures(own: Statistics, printed: float) -> dict[str, Cell]:
-    return {
-        "points": own.number,
-        "mean": own.mean,
-        "median": own.median,
-        "lowest": own.least,
-        "highest": own.largest,
-        "printed": printed,
-        "printed_over_mean": printed / own.mean if own.mean else math.nan,
-    }
 
 
 def _matrix(
@@ -204,33 +191,24 @@ def leakage(groups: Sequence[Points]) -> list[dict[str, Cell]]:
     return found
 
 
-@dataclass(frozen=True)
-class Reference:
-    """Noise alone at one setting of the instrument."""
+def reference(spec: Spec, setting: dict[str, Any]) -> tuple[dict[str, Cell], float]:
+    """Noise alone, in closed form and by the model with a target that reflects nothing.
 
-    tnr: float
-    bins: float
-    closed_form: float
-    model: float
-    model_bin: float
-
-
-def reference(spec: Spec, setting: dict[str, Any]) -> Reference:
-    """Noise alone, in closed form and by the model with a target that reflects nothing."""
+    Of a shot at a setting of the instrument, a part of a record; and of a bin, by the model.
+    """
     first = parameters_at(spec, dict.fromkeys((axis.name for axis in spec.axes), 0))
     parameters = first | setting | {"target.reflectance": 0.0}
     tnr = float(tnr_of(parameters))
     in_a_bin = noise_only.bin_probability(tnr, Looks.of(parameters))
     both = [noise_only.bins_counted(parameters, in_a_bin, s) for s in ("up", "down")]
-    bins = float(both[0])
+    closed_form = noise_only.segment_probability(np.asarray(in_a_bin), both).prod()
     found = evaluate(parameters)
-    return Reference(
-        tnr=tnr,
-        bins=bins,
-        closed_form=float(noise_only.segment_probability(np.asarray(in_a_bin), both).prod()),
-        model=float(found["pfa_both_chirps"].item()),
-        model_bin=float(found["pfa_bin"].item()),
-    )
+    return {
+        "tnr": tnr,
+        "bins": float(both[0]),
+        "closed_form": float(closed_form),
+        "noise_only": float(found["pfa_both_chirps"].item()),
+    }, float(found["pfa_bin"].item())
 
 
 def settings(found: Points, spec: Spec, by: str) -> list[tuple[str, dict[str, Any], Points]]:
@@ -251,7 +229,7 @@ def false_alarms(
 ) -> list[dict[str, Cell]]:
     """Make a record of false alarms of each setting of the instrument in each cut."""
     settled = settings(found, spec, by)
-    alone = [reference(spec, setting) for _, setting, _ in settled]
+    alone = [reference(spec, setting)[0] for _, setting, _ in settled]
     groups = [
         (i, j, cut.name, beyond(cut.of(part), spec, NEAREST))
         for i, (_, _, part) in enumerate(settled)
@@ -263,15 +241,14 @@ def false_alarms(
     for (i, j, cut, points), both, leak in zip(groups, alarms, leaked, strict=True):
         noise, figure = alone[i], _published(printed, i, j)
         mean_excess, excess = (
-            noise_only.variance_excess_of_shot(p, noise.tnr, noise.bins)
+            noise_only.variance_excess_of_shot(p, float(noise["tnr"]), float(noise["bins"]))
             for p in (both.mean, figure)
         )
         records.append(
             {
-                "setting": settled[i][0], "cut": cut, "points": points.size, "tnr": noise.tnr,
-                "bins": noise.bins, "closed_form": noise.closed_form, "noise_only": noise.model,
+                "setting": settled[i][0], "cut": cut, "points": points.size, **noise,
                 "study_mean": both.mean, "study_variance_excess": mean_excess,
-                "printed": figure, "printed_over_closed_form": figure / noise.closed_form,
+                "printed": figure, "printed_over_closed_form": figure / float(noise["closed_form"]),
                 "printed_variance_excess": excess, **leak,
             }
         )  # fmt: skip
@@ -332,19 +309,20 @@ def threshold_page(found: Points, spec: Spec, *, by: str, printed: Any = (), tit
     settled = settings(found, spec, by)
     means = statistics([beyond(part, spec, NEAREST) for _, _, part in settled], "pfa_bin")
     for i, (name, setting, _) in enumerate(settled):
-        alone = reference(spec, setting)
-        closed = noise_only.bin_probability(alone.tnr)
+        noise, of_bin = reference(spec, setting)
+        tnr = float(noise["tnr"])
+        closed = noise_only.bin_probability(tnr)
         published = _published(printed, i, 0)
         records.append(
             {
                 "setting": name,
-                "tnr": alone.tnr,
+                "tnr": tnr,
                 "closed_form": closed,
-                "noise_only": alone.model_bin,
+                "noise_only": of_bin,
                 "study_mean": means[i].mean,
                 "printed": published,
                 "printed_over_closed_form": published / closed,
-                "printed_variance_excess": noise_only.variance_excess_of_bin(published, alone.tnr),
+                "printed_variance_excess": noise_only.variance_excess_of_bin(published, tnr),
             }
         )
     heading = "Probability that a bin of noise crosses the threshold"

@@ -29,7 +29,6 @@ from sweep.model.looks import COMBINE, NUMBER, VOTES, Looks
 from sweep.model.shot import prepare
 from sweep.model.threshold import WAYS, tnr_of
 from sweep.report.page import Table
-from sweep.spec import Spec
 
 MOST_PARTS = 6
 """Values that a chart offers to choose from, at the most."""
@@ -94,18 +93,16 @@ class Track:
         return np.ravel(self.part.dataset[variable].isel(self.position(places)).values)
 
 
-def main_coordinate(spec: Spec) -> str:
-    """Range where it varies, else the longest of the numeric coordinates; empty where none is."""
-    if member := coordinate_of(spec, RANGE):
-        return member.name
-    numeric = [m for axis in spec.axes for m in axis.members if not isinstance(m.values, tuple)]
-    longest = max(numeric, key=lambda m: np.unique(m.display).size, default=None)
-    return longest.name if longest else ""
-
-
 def tracks(study: Study) -> tuple[list[Track], int]:
-    """Tracks along the main coordinate, and how many are left out."""
-    name = main_coordinate(study.spec)
+    """Tracks along the main coordinate, and how many are left out.
+
+    The main coordinate is range where it varies, else the longest one of numbers.
+    """
+    every = [member for axis in study.spec.axes for member in axis.members]
+    numeric = [member for member in every if not isinstance(member.values, tuple)]
+    longest = max(numeric, key=lambda m: np.unique(m.display).size, default=None)
+    main = coordinate_of(study.spec, RANGE) or longest
+    name = main.name if main else ""
     found, fewer = charts.facets_of(study.points, [name] if name else [], MOST_PARTS)
     return [Track(words, p, name, p.side(name) if name else None) for words, p in found], fewer
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
@@ -26,7 +26,6 @@ from sweep.analysis.scenes.recording import (
     Cloud,
     Place,
     Recording,
-    eyepoints_of,
     gathered,
     kinds,
     label,
@@ -121,7 +120,7 @@ def solid(study: SceneStudy, found: Sequence[Seen], fewer: int) -> Plot | None:
     return Plot(
         heading="Points, flight path and terrain",
         alt=(
-            f"Point cloud in three dimensions of {first.total:,} points, heights in metres: "
+            f"Point cloud in three dimensions of {first.rows.total:,} points, heights in metres: "
             f"{labels.extent(first.points['z'])}; ranges: {labels.extent(first.points['range'])}; "
             f"with the flight path{' over the terrain' if ground else ''}."
         ),
@@ -221,9 +220,9 @@ def _longest(sides: np.ndarray) -> float:
     """Longest side at which all of a box is seen from every view, in the library's lengths."""
     corners = np.array(list(product((-0.5, 0.5), repeat=3))) * sides
     eyes = [np.array([view[axis] for axis in AXES]) for view in VIEWS.values()]
-    sizes = np.linspace(2.0, 0.1, 191)
-    fits = np.all([[_seen(size * corners, eye) for eye in eyes] for size in sizes], axis=1)
-    return float(sizes[np.argmax(fits)])
+    sizes = np.linspace(2.0, 0.1, 191).tolist()
+    fitting = (size for size in sizes if all(_seen(size * corners, eye) for eye in eyes))
+    return next(fitting, sizes[0])
 
 
 def _seen(corners: np.ndarray, eye: np.ndarray) -> bool:
@@ -280,53 +279,61 @@ BINS = 20
 
 def along(found: Sequence[Seen]) -> Chart | None:
     """Quantities of shots over time; none where none is computed."""
-    panels: list[Panel] = []
-    every = 1
     quantities = [name for name in SHOTS if name in found[0].recording.dataset]
-    for seen in found:
-        rows = seen.recording.rows([*quantities, "beam"], MOST_SHOTS // len(found))
-        every = max(every, rows.every)
-        table = rows.rows()
-        for name in quantities if table else ():
+
+    def drawn(table: dict[str, np.ndarray]) -> Iterator[Drawn]:
+        for name in quantities:
             up = Axis(label(name), limits=CHANCE if name == "pd_shot" else None)
-            panels.append(_over_time(seen, label(name), up, _by_beam(table, name)))
+            yield label(name), up, _by_beam(table, name)
+
+    panels, reduced = _over_time(found, "shot", [*quantities, "beam"], drawn)
     told = [
         f"{panel.y.words}: {labels.extent(np.concatenate([line.y for line in panel.lines]))}"
         for panel in panels[: len(quantities)]
     ]
     alt = f"Marks of a quantity of each shot over time. {'; '.join(told)}."
-    return _times("Shots over time", alt, [_reduced("shot", every)], panels)
+    return _times("Shots over time", alt, [reduced], panels)
 
 
 def errors(found: Sequence[Seen]) -> Chart | None:
     """Errors of range and velocity of true points against truth; none where there are none."""
-    panels: list[Panel] = []
-    every = 1
-    names = ["time", "beam", "flags", *MEASURED, *(f"true_{name}" for name in MEASURED)]
-    for seen in found:
-        rows = seen.recording.rows(names, MOST_SHOTS // len(found), ranges=INTERPOLATED)
-        every = max(every, rows.every)
-        table = rows.rows()
-        true = (table["flags"].astype(int) & TRUE) > 0 if table else np.zeros(0, bool)
+
+    def drawn(table: dict[str, np.ndarray]) -> Iterator[Drawn]:
+        true = (table["flags"].astype(int) & TRUE) > 0
         for name in MEASURED if true.any() else ():
             error = {"error": table[name] - table[f"true_{name}"]}
             own = {key: values[true] for key, values in (table | error).items()}
             words = label(name).replace(" (", " error (")
             spread = labels.number(float(f"{np.sqrt(np.mean(own['error'] ** 2)):.3g}"))
-            lines = _by_beam(own, "error")
-            panels.append(_over_time(seen, f"{words}, rms {spread}", Axis(words), lines))
+            yield f"{words}, rms {spread}", Axis(words), _by_beam(own, "error")
+
+    names = ["time", "beam", "flags", *MEASURED, *(f"true_{name}" for name in MEASURED)]
+    panels, reduced = _over_time(found, "point", names, drawn)
     told = "; ".join(panel.when["quantity"] for panel in panels[: len(MEASURED)])
     alt = f"Marks of the error of each true point over time. {told}."
     how = "Measured less true, of true points, interpolated between bins"
-    return _times("Errors against truth", alt, [how, _reduced("point", every)], panels)
+    return _times("Errors against truth", alt, [how, reduced], panels)
 
 
-def _over_time(seen: Seen, quantity: str, up: Axis, lines: Sequence[Line]) -> Panel:
-    return Panel({"cloud": seen.words, "quantity": quantity}, Axis("time (s)"), up, lines)
+Drawn = tuple[str, Axis, list[Line]]
+"""Words for a quantity, its axis, and its lines over time."""
 
 
-def _reduced(thing: str, every: int) -> str:
-    return f"One {thing} in {every} shown: reduced for this page" if every > 1 else ""
+def _over_time(
+    found: Sequence[Seen], thing: str, names: Sequence[str],
+    drawn: Callable[[dict[str, np.ndarray]], Iterator[Drawn]],
+) -> tuple[list[Panel], str]:  # fmt: skip
+    """Panels of what is drawn of shots or points, and a remark where some are left out."""
+    panels: list[Panel] = []
+    every = 1
+    for seen in found:
+        rows = seen.recording.rows(names, MOST_SHOTS // len(found), ranges=INTERPOLATED)
+        every = max(every, rows.every)
+        table = rows.rows()
+        for words, up, lines in drawn(table) if table else ():
+            choice = {"cloud": seen.words, "quantity": words}
+            panels.append(Panel(choice, Axis("time (s)"), up, lines))
+    return panels, f"One {thing} in {every} shown: reduced for this page" * (every > 1)
 
 
 def _times(heading: str, alt: str, caption: list[str], panels: list[Panel]) -> Chart | None:
@@ -429,7 +436,7 @@ def _budget(study: SceneStudy, seen: Seen) -> Panel:
     recording = seen.recording
     number = recording.shots
     shots = np.unique(np.linspace(0, number - 1, min(PLACES, number)).round().astype(int))
-    eyepoints = read_eyepoints(eyepoints_of(study.path, recording.dataset), shots)
+    eyepoints = read_eyepoints(study.path, recording.dataset, shots)
     place = np.flatnonzero(eyepoints.seen)
     flags = np.asarray(recording.dataset["effects"].isel(shot=shots[place]).values)
     parameters, surfaces = parameters_at(study.spec, seen.at.index), study.spec.surfaces()

@@ -108,7 +108,7 @@ def plot(chart: Chart) -> Plot:
         further["hovermode"] = "x unified" if areas[0].x.size > 1 else "closest"
     if chart.scale is not None:
         further |= {"margin": {"l": 10, "r": 16, "t": 88, "b": 55}}
-        further |= {"title": title(_words(chart.scale))}
+        further |= {"title": title("log10 of " * chart.scale.decades + chart.scale.words)}
     return Plot(
         chart.heading,
         chart.alt,
@@ -127,17 +127,13 @@ def _control(panels: Sequence[Panel], name: str, label: str) -> Control:
     axes: dict[str, set[Axis]] = {}
     for panel in panels:
         axes.setdefault(panel.when[name], set()).add(panel.y)
-    relayout = {}
+    relayout: dict[str, dict[str, Any]] = {}
     if all(len(own) == 1 for own in axes.values()) and len(set().union(*axes.values())) > 1:
-        relayout = {option: _relaid(*own) for option, own in axes.items()}
+        for option, (axis,) in axes.items():
+            kept = {k: v for k, v in _axis(axis).items() if k in ("type", "range", "rangemode")}
+            relayout[option] = {f"yaxis.{key}": value for key, value in kept.items()}
+            relayout[option]["yaxis.title.text"] = broken(axis.words, 36)
     return Control(name, label, list(axes), relayout)
-
-
-def _relaid(axis: Axis) -> dict[str, Any]:
-    """Return changes of a layout for another upright axis."""
-    made = _axis(axis)
-    changes = {f"yaxis.{key}": made[key] for key in ("type", "range", "rangemode") if key in made}
-    return changes | {"yaxis.title.text": broken(axis.words, 36)}
 
 
 def _traces(panel: Panel, scale: Scale | None) -> Iterator[Any]:
@@ -154,10 +150,6 @@ def _traces(panel: Panel, scale: Scale | None) -> Iterator[Any]:
         colorscale="Viridis", colorbar=COLOUR_BAR, name=panel.when["part"],
         meta=when(None, **panel.when),
     )  # fmt: skip
-
-
-def _words(scale: Scale) -> str:
-    return f"log10 of {scale.words}" if scale.decades else scale.words
 
 
 def _short(values: np.ndarray) -> np.ndarray:
@@ -232,22 +224,17 @@ def _band(
 
 def themes() -> dict[str, Any]:
     """Palette, scales and template of each colour scheme, for the page's script."""
+    stops, colours = np.linspace(0, 1, 11), colormaps[canvas.SCALE]
     return {
         scheme: {
             "lines": LINES[scheme],
-            "scale": _sampled(*_ENDS[scheme]),
+            "scale": [[float(s), to_hex(colours(low + (high - low) * s))] for s in stops],
             "ground": [[0, _GROUND[scheme][0]], [1, _GROUND[scheme][1]]],
             "template": plotly.io.templates[template].to_plotly_json(),
         }
         for scheme, template in (("light", "plotly_white"), ("dark", "plotly_dark"))
+        for low, high in [_ENDS[scheme]]
     }
-
-
-def _sampled(low: float, high: float) -> list[list[Any]]:
-    """Part of the colour scale as stops."""
-    stops = np.linspace(0, 1, 11)
-    colours = colormaps[canvas.SCALE](low + (high - low) * stops)
-    return [[float(s), to_hex(c)] for s, c in zip(stops, colours, strict=True)]
 
 
 def layout(**further: Any) -> dict[str, Any]:
@@ -354,11 +341,6 @@ def rendered(page: Page) -> str:
     )
     environment.globals |= {"packed": _packed, "table_json": _table_json, "download": _download}
     environment.globals |= {"chart_json": _chart_json}
-    environment.tests |= {
-        "chart": lambda item: isinstance(item, Plot),
-        "sheet": lambda item: isinstance(item, Table),
-        "text": lambda item: isinstance(item, Text),
-    }
     tables = Path(itables.options.dt_bundle)
     return environment.get_template("report.html").render(
         page=page,
@@ -384,23 +366,17 @@ def _chart_json(plot: Plot) -> str:
 def _table_json(table: Table) -> str:
     """JSON of a table for the page's script, with its sorting, searching and downloading."""
     csv = {"extend": "csvHtml5", "text": "Download CSV", "filename": table.file}
+    widths = table.frame.map(lambda cell: len(str(cell))).max()
     with pandas.option_context("display.float_format", "{:.6g}".format):
         made = get_itable_arguments(
             table.frame, showIndex=False, maxBytes=0, maxColumns=0, pageLength=ROWS,
-            columnDefs=[{"targets": _long(table.frame), "className": "long"}],
+            columnDefs=[{"targets": np.flatnonzero(widths > LONG).tolist(), "className": "long"}],
             buttons=[csv, "copyHtml5"],
         )  # fmt: skip
-    # As words the library refuses them here; the template has the class.
-    return json.dumps({k: v for k, v in made.items() if k not in ("classes", "style")})
-
-
-def _long(frame: pandas.DataFrame) -> list[int]:
-    """Columns of sentences, which need some width."""
-    return [
-        i
-        for i, name in enumerate(frame.columns)
-        if frame[name].map(lambda cell: len(str(cell))).max() > LONG
-    ]
+    # As words the library refuses them here; the template has the class. It lists its options
+    # in another order from run to run.
+    options = {k: v for k, v in made.items() if k not in ("classes", "style")}
+    return json.dumps(options, sort_keys=True)
 
 
 def _download(text: Text) -> str:

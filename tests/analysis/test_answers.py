@@ -209,6 +209,10 @@ def test_the_summary_is_that_of_the_computed_points(surface):
     assert 0 < values.size < surface.snr_up.size
 
 
+def test_the_summary_of_a_single_point_is_that_point():
+    assert xr.Dataset({"v": 0.25}).sweep.summary().v.values.tolist() == [0.25, 0.25, 0.25, 1.0]
+
+
 def test_studies_are_compared_where_they_meet_whatever_their_units_and_order(tmp_path):
     (tmp_path / "a").mkdir()
     one = {"target.range": ["1 km", "2 km", "9 km"], "target.grazing_angle": ["30 deg", "60 deg"]}

@@ -11,7 +11,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.colors import LogNorm
 
 from sweep.analysis import canvas, charts
-from sweep.analysis.selection import HIGHEST, LOWEST, MEAN, Points, Side, coarsened, confined
+from sweep.analysis.selection import HIGHEST, LOWEST, MEAN, Points, Side, confined
 
 BY_HAND = {MEAN: np.mean, LOWEST: np.min, HIGHEST: np.max}
 
@@ -89,7 +89,8 @@ def test_cells_hold_their_points_whatever_the_chunks(shape, most, chunks, kind, 
     values = np.where(rng.random(shape) < 0.2, np.nan, rng.random(shape))
     array = xr.DataArray(dask.array.from_array(values, chunks=chunks), dims=["y", "x"])
     sides = [Side(d, np.arange(n), np.arange(n) / 7) for d, n in zip("yx", shape, strict=True)]
-    found = coarsened(array, list(zip(sides, most, strict=True)), {}, kind).values
+    points = Points.of(xr.Dataset({"v": array}))
+    found = points.cells("v", list(zip(sides, most, strict=True)), kind).values
     up, across = (side.together(number) for side, number in zip(sides, most, strict=True))
     assert found.shape == tuple(side.middles(m).size for side, m in zip(sides, most, strict=True))
     assert all(size <= number for size, number in zip(found.shape, most, strict=True))

@@ -9,7 +9,7 @@ from drawn_studies import POWERS, SURFACE, stored, study
 import sweep
 from sweep.analysis.opening import NotAStoreError, merged, open_scene, stretches
 from sweep.analysis.opening import open as open_store
-from sweep.analysis.scenes.recording import eyepoints_of, read_eyepoints
+from sweep.analysis.scenes.recording import read_eyepoints
 from sweep.model.eyepoints import observe
 from sweep.model.outputs import CYCLES, NAVIGATION, OUTPUTS, POINTS, SHOTS, SIMULATED, STATISTICS
 
@@ -153,7 +153,7 @@ def test_eyepoints_read_back_are_those_cast_anew_bit_for_bit(scene_store, spec):
     world, tree = spec.world(), open_scene(scene_store)
     index = np.array([3, 77, 130, 311])
     for name in spec.scanners:
-        found = read_eyepoints(eyepoints_of(scene_store, tree[name].to_dataset()), index)
+        found = read_eyepoints(scene_store, tree[name].to_dataset(), index)
         cast = observe(
             index,
             flight=spec.flight(),
@@ -171,4 +171,4 @@ def test_eyepoints_read_back_are_those_cast_anew_bit_for_bit(scene_store, spec):
 
 def test_eyepoints_that_are_gone_are_told_with_a_remedy(tmp_path):
     with pytest.raises(NotAStoreError, match="running the study again casts them anew"):
-        read_eyepoints(tmp_path / "none.zarr", np.array([0]))
+        read_eyepoints(tmp_path, xr.Dataset(attrs={"geometry_id": "none"}), np.array([0]))

@@ -10,7 +10,7 @@ from sweep.analysis import canvas
 from sweep.analysis.opening import opened
 from sweep.analysis.scenes import colours, pictures, recording
 from sweep.analysis.scenes.pictures import Ground
-from sweep.analysis.scenes.recording import AXES, Cloud, Interval, gathered, place
+from sweep.analysis.scenes.recording import AXES, Cloud, Thinned, gathered, place
 from sweep.model.pairing import TRUE
 
 
@@ -46,9 +46,10 @@ def small_cloud(points, **changes):
     table |= {"range": np.arange(number, dtype=float), "flags": np.full(number, TRUE, np.uint8)}
     box = {axis: (float(table[axis].min()) - 1, float(table[axis].max()) + 1) for axis in AXES}
     parts = {
-        "points": table, "dropouts": {}, "path": {}, "total": number, "total_dropouts": 0,
-        "outside": 0, "every": 1, "every_dropout": 1, "box": box,
+        "points": table, "path": {}, "rows": Thinned(number), "lost": Thinned(0), "outside": 0,
+        "box": box,
     }  # fmt: skip
+    parts["rows"].add(table)
     return Cloud(**(parts | changes))
 
 
@@ -56,8 +57,8 @@ def test_dropouts_are_the_computed_shots_without_a_point_in_the_draw(weak, array
     found = gathered(weak, ["range"], ranges="quantised", draw=1, dropouts=True)
     none = (arrays.flags.values == 0).all(axis=-1)
     assert 20 < none.sum() < none.size - 20
-    assert found.total_dropouts == none.sum()
-    assert found.total == (arrays.flags.values > 0).sum()
+    assert found.lost.total == none.sum()
+    assert found.rows.total == (arrays.flags.values > 0).sum()
     aimed = (
         arrays.platform_position.values
         + arrays.beam_range.values[:, None] * arrays.beam_direction.values
@@ -72,7 +73,7 @@ def test_shots_that_are_not_computed_are_no_dropouts(scene_store, spec, tmp_path
     weak = place(spec, {"power": "0.3 mW"}).recording(short, "pair")
     found = gathered(weak, ["range"], ranges="quantised", draw=1, dropouts=True)
     none = (arrays.flags.values == 0).all(axis=-1)
-    assert found.total_dropouts == none[:256].sum() > 0
+    assert found.lost.total == none[:256].sum() > 0
 
 
 @pytest.mark.parametrize(("power", "has_false"), [("0.3 mW", False), ("1 W", True)])
@@ -95,28 +96,28 @@ def test_the_box_holds_true_points_dropouts_and_path_and_counts_false_points_bey
     others = position[(arrays.flags.values > 0) & ~true]
     beyond = ((others < box[:, 0]) | (others > box[:, 1])).any(axis=1).sum()
     assert found.outside == beyond and (beyond > 0) == has_false
-    assert found.points["x"].size == found.total - beyond
+    assert found.points["x"].size == found.rows.total - beyond
     assert np.array_equal(found.path["z"], arrays.platform_position.values[:, 2])
 
 
 def test_crops_cut_points_and_dropouts_and_the_picture(weak):
-    crops = {"x": Interval(-30.0, 25.0), "time": Interval(1.0, 5.0)}
+    crops = {"x": (-30.0, 25.0), "time": (1.0, 5.0)}
     found = gathered(weak, ["range"], ranges="quantised", crops=crops, dropouts=True)
     every = gathered(weak, ["range"], ranges="quantised", dropouts=True)
-    assert 0 < found.total < every.total and 0 < found.total_dropouts < every.total_dropouts
+    assert 0 < found.rows.total < every.rows.total and 0 < found.lost.total < every.lost.total
     for table in (found.points, found.dropouts):
         assert table["x"].min() >= -30 and table["x"].max() <= 25
     room = max(high - low for low, high in found.box.values()) * recording.MARGIN
     assert found.box["x"][0] >= -30 - room and found.box["x"][1] <= 25 + room
-    assert gathered(weak, ["range"], ranges="quantised", crops={"x": Interval(1e5)}) is None
+    assert gathered(weak, ["range"], ranges="quantised", crops={"x": (1e5, np.inf)}) is None
 
 
 def test_many_points_are_thinned_and_the_foot_says_so(weak, tree):
     whole = gathered(weak, ["shot"], ranges="quantised")
     found = gathered(weak, ["shot"], ranges="quantised", most=50)
-    assert found.every == 2 ** int(np.ceil(np.log2(whole.total / 50)))
+    assert found.rows.every == 2 ** int(np.ceil(np.log2(whole.rows.total / 50)))
     said = drawn(found, tree, quantity="shot").get_supxlabel()
-    assert f"{whole.total:,} points, one in {found.every} of them shown" in said
+    assert f"{whole.rows.total:,} points, one in {found.rows.every} of them shown" in said
 
 
 @pytest.mark.parametrize(

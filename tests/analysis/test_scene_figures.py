@@ -9,7 +9,7 @@ from sweep.analysis import figures
 from sweep.analysis.figures import SceneStudy, default_scene_figures, draw
 from sweep.analysis.opening import NotAStoreError, opened
 from sweep.analysis.scenes import pictures
-from sweep.analysis.scenes.recording import Interval, place
+from sweep.analysis.scenes.recording import place
 from sweep.model.pairing import TRUE
 
 
@@ -57,7 +57,7 @@ def test_a_quantity_of_shots_is_shown_for_every_shot_and_one_of_points_for_every
     less = place(spec, {"power": "0.3 mW"}).recording(short, "pair")
     shots = less.rows(["time", "pd_shot", "beam"], 10**6, **options)
     assert np.array_equal(shots.rows()["pd_shot"], arrays.pd_shot.values[:256])
-    interval = Interval(2.0, 3.0)
+    interval = 2.0, 3.0
     some = weak.rows(["time", "pd_shot", "beam"], 10**6, **(options | {"time": interval}))
     inside = (arrays.time.values >= 2) & (arrays.time.values <= 3)
     assert np.array_equal(some.rows()["pd_shot"], arrays.pd_shot.values[inside])

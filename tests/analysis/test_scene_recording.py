@@ -11,7 +11,7 @@ from sweep.analysis.opening import opened
 from sweep.analysis.scenes.recording import (
     KINDS,
     QUANTITIES,
-    Interval,
+    UNLIMITED,
     Thinned,
     confined,
     kinds,
@@ -105,14 +105,14 @@ def test_stretches_outside_of_an_interval_of_time_are_not_read(weak, monkeypatch
     monkeypatch.setattr(module, "stretches", lambda array, dim: every(array, dim, 64))
     assert [part.start for part in weak.stretches()] == [0, 128, 256]
     time = weak.read("time", slice(0, weak.shots))
-    asked = Interval(float(time[130]), float(time[200]))
+    asked = float(time[130]), float(time[200])
     assert [part.start for part in weak.stretches(asked)] == [128]
 
 
 def test_rows_within_limits_are_kept_and_those_without_a_value_are_not():
     table = {"x": np.array([0.0, 1.0, np.nan, 3.0]), "y": np.arange(4.0)}
-    assert confined(table, {"x": Interval(0.5)})["y"].tolist() == [1, 3]
-    assert confined(table, {"x": Interval(), "y": Interval(high=2)})["y"].tolist() == [0, 1]
+    assert confined(table, {"x": (0.5, np.inf)})["y"].tolist() == [1, 3]
+    assert confined(table, {"x": UNLIMITED, "y": (-np.inf, 2)})["y"].tolist() == [0, 1]
     assert confined(table, {}) is table
 
 

@@ -6,7 +6,7 @@ import xarray as xr
 
 from sweep.analysis import shot_figure
 from sweep.analysis.opening import opened
-from sweep.analysis.scenes.recording import eyepoints_of, place, read_eyepoints, several_surfaces
+from sweep.analysis.scenes.recording import place, read_eyepoints, several_surfaces
 from sweep.analysis.selection import parameters_at
 from sweep.analysis.shot_figure import Group, Segment, simulated_shot
 from sweep.model.constants import SPEED_OF_LIGHT
@@ -26,7 +26,7 @@ def arrays(scene_store):
 
 
 def one(scene_store, spec, recording, number, seed=None):
-    eyepoints = read_eyepoints(eyepoints_of(scene_store, recording.dataset), np.array([number]))
+    eyepoints = read_eyepoints(scene_store, recording.dataset, np.array([number]))
     parameters = parameters_at(spec, place(spec, {"power": "1 W"}).index)
     effects = names_of(int(recording.read("effects", slice(number, number + 1))[0]))
     prepared = prepare_eyepoints(eyepoints, parameters, spec.surfaces(), effects)

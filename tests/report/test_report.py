@@ -51,6 +51,13 @@ def test_the_page_says_that_it_is_reduced_and_asks_nothing_of_a_network(grid_pag
     assert 1e6 < grid_page.stat().st_size < 2.5e6
 
 
+def test_the_options_of_a_table_are_in_one_order_from_run_to_run(grid_page):
+    packed = r'compact"></table><script type="application/gzip">(.*?)</script>'
+    for each in re.findall(packed, grid_page.read_text()):
+        options = json.loads(gzip.decompress(base64.b64decode(each)))
+        assert list(options) == sorted(options) and len(options) > 5
+
+
 def test_figures_without_points_are_told_and_whole_spectra_have_no_threshold_to_move(tmp_path):
     figures = [{"kind": "slices", "variable": "pd_shot", "x": "range", "title": "Elsewhere",
                 "where": {"range": "7 km"}}]  # fmt: skip

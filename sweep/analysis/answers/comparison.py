@@ -210,7 +210,8 @@ def _scanner(ours: xr.DataTree, other: xr.DataTree, scanner: str) -> xr.Dataset:
     left, right = (tree.children[scanner].to_dataset(inherit=False) for tree in (ours, other))
     shots, matching = _pairs(left, right, scanner)
     when = {name: left[name].isel(shot=shots).compute() for name in ("time", "beam")}
-    drawn = all(_complete(tree) for tree in (ours, other))
+    # a store is complete where no draw is left to compute; a missing point would not tell
+    drawn = all(t.attrs["points_committed"] >= t.attrs["points"] for t in (ours, other))
     sides = [
         _quantities(group.isel(shot=index), tree, drawn=drawn)
         for group, tree, index in ((left, ours, shots), (right, other, matching))
@@ -256,11 +257,6 @@ def _known(group: xr.Dataset) -> pandas.DataFrame:
     """Time, beam and number of the shots that are computed, by time."""
     frame = pandas.DataFrame({name: group[name].values for name in ("time", "beam")})
     return frame.assign(number=frame.index).dropna().sort_values("time")
-
-
-def _complete(tree: xr.DataTree) -> bool:
-    """Tell whether no draw is left to compute; a missing point would not."""
-    return bool(tree.attrs["points_committed"] >= tree.attrs["points"])
 
 
 def _quantities(group: xr.Dataset, tree: xr.DataTree, *, drawn: bool) -> xr.Dataset:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
+import pandas
 import xarray as xr
 from scipy.interpolate import CubicSpline
 
@@ -28,6 +28,8 @@ _PARAMETERS = {
     "delay": "processing.acquisition_delay", "line_width": "laser.line_width",
     "line_shape": "laser.line_shape", "looks": "looks.number", "combine": "looks.combine",
 }  # fmt: skip
+_ALIKE = ("architecture", "segments", "window", "fft_size", "duration", "delay", "sample_rate")
+"""Parameters that points have in common whose bounds are worked out together."""
 
 
 def range_error(dataset: xr.Dataset) -> xr.Dataset:
@@ -43,7 +45,7 @@ def range_error(dataset: xr.Dataset) -> xr.Dataset:
         threshold noise is taken for signal, and no estimate comes near the bound. A study that
         draws whole spectra has instead what it stores: `bias`, `rmse` and `bound`.
     """
-    return _errors(dataset, "range", "range_error", lambda found: found.range)
+    return _errors(dataset, "range")
 
 
 def velocity_error(dataset: xr.Dataset) -> xr.Dataset:
@@ -51,18 +53,10 @@ def velocity_error(dataset: xr.Dataset) -> xr.Dataset:
 
     Parameters and results as of :func:`range_error`, in m/s.
     """
-    return _errors(
-        dataset, "radial velocity", "radial_velocity_error", lambda found: found.radial_velocity
-    )
+    return _errors(dataset, "radial_velocity")
 
 
-def _errors(
-    dataset: xr.Dataset,
-    words: str,
-    stored: str,
-    which: Callable[[estimators.Deviation], np.ndarray],
-) -> xr.Dataset:
-    quantity = stored.removesuffix("_error")
+def _errors(dataset: xr.Dataset, quantity: str) -> xr.Dataset:
     if f"{quantity}_rmse" in dataset:
         kinds = {kind: dataset[f"{quantity}_{kind}"] for kind in ("bias", "rmse", "bound")}
         return xr.Dataset(kinds).assign_attrs(dataset.attrs)
@@ -77,7 +71,8 @@ def _errors(
 
     def bound(*arrays: np.ndarray) -> np.ndarray:
         names = dict(zip(values, arrays[3:], strict=True))
-        return which(_bounds(arrays[:3], names))
+        found: np.ndarray = getattr(_bounds(arrays[:3], names), quantity)
+        return found
 
     bounds = xr.apply_ufunc(
         bound, *snr, *values.values(), dask="parallelized", output_dtypes=[float]
@@ -85,16 +80,16 @@ def _errors(
     width = values["sample_rate"] / values["fft_size"]
     bins = (
         SPEED_OF_LIGHT / 2 * values["duration"] / values["bandwidth"] * width
-        if stored == "range_error"
+        if quantity == "range"
         else values["wavelength"] / 2 * width
     )
     # Half sum and half difference of two peaks, each off by a bin over sqrt(12).
     result = xr.Dataset({
-        "reported": dataset[stored],
+        "reported": dataset[f"{quantity}_error"],
         "resolution": bins / np.sqrt(24.0) + xr.zeros_like(bounds),
         "bound": bounds,
     })  # fmt: skip
-    units = str(dataset[stored].attrs.get("units", ""))
+    units, words = str(result["reported"].attrs.get("units", "")), quantity.replace("_", " ")
     for name, text in (
         ("resolution", f"standard deviation that whole bins give to the {words}"),
         ("bound", f"Cramer-Rao bound on the standard deviation of the {words}"),
@@ -108,14 +103,11 @@ def _bounds(snr: tuple[np.ndarray, ...], p: dict[str, np.ndarray]) -> estimators
     shape = np.broadcast_shapes(*(np.shape(a) for a in (*snr, *p.values())))
     flat = {name: np.broadcast_to(a, shape).ravel() for name, a in p.items()}
     seen = [np.broadcast_to(a, shape).ravel() for a in snr]
-    kinds = list(zip(flat["architecture"], flat["segments"], flat["window"], flat["fft_size"],
-                     flat["duration"], flat["delay"], flat["sample_rate"],
-                     strict=True))  # fmt: skip
+    kinds = pandas.DataFrame({name: flat[name] for name in _ALIKE})
     spread = np.empty((2, len(kinds)))
-    for kind in dict.fromkeys(kinds):
-        mask = np.fromiter((other == kind for other in kinds), bool, len(kinds))
-        part = {name: a[mask] for name, a in flat.items()}
-        spread[:, mask] = _alike([s[mask] for s in seen], part)
+    for places in kinds.groupby(list(kinds), sort=False).indices.values():
+        part = {name: a[places] for name, a in flat.items()}
+        spread[:, places] = _alike([s[places] for s in seen], part)
     return estimators.Deviation(*spread.reshape(2, *shape))
 
 

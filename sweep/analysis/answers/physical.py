@@ -117,10 +117,9 @@ def select(
         raise ValueError(f"method '{method}' is unknown: take 'nearest', or none")
     for name, written in wanted.items():
         array = coordinate(dataset, name)
+        chosen = _places(array, written, method)
         if not array.dims:
-            _places(array, np.atleast_1d(array.values), written, method)
             continue
-        chosen = _places(array, array.values, written, method)
         single = not isinstance(written, list | tuple | slice | np.ndarray)
         if single and array.name in array.dims:
             dataset = dataset.isel({array.dims[0]: int(chosen[0])})
@@ -129,15 +128,12 @@ def select(
     return dataset
 
 
-def _places(
-    array: xr.DataArray, values: np.ndarray, written: Any, method: str | None
-) -> np.ndarray:
+def _places(array: xr.DataArray, written: Any, method: str | None) -> np.ndarray:
     """Return indices of the values that are wanted, in the order of the coordinate for slices."""
+    values = np.atleast_1d(array.values)
     if isinstance(written, slice):
-        ends = [
-            None if e is None else float(shown(array, e)) for e in (written.start, written.stop)
-        ]
-        low, high = -np.inf if ends[0] is None else ends[0], np.inf if ends[1] is None else ends[1]
+        low = -np.inf if written.start is None else float(shown(array, written.start))
+        high = np.inf if written.stop is None else float(shown(array, written.stop))
         room = CLOSE * np.abs(values)
         return np.flatnonzero((values >= low - room) & (values <= high + room))
     several = written if isinstance(written, list | tuple | np.ndarray) else [written]

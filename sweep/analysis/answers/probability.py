@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import dask
 import dask.array
 import numpy as np
 import xarray as xr
@@ -191,29 +192,24 @@ def summary(dataset: xr.Dataset) -> xr.Dataset:
 
 def _reduced(array: xr.DataArray) -> dask.array.Array:
     """Return the statistics of an array, (4,)."""
-    data = array.chunk().data if array.chunks is None else array.data
-    axis = data.ndim
-    parts = data.map_blocks(
-        _of_block, dtype=float, new_axis=axis, chunks=(*((1,) * n for n in data.numblocks), (4,))
-    )
-    return parts.reshape(-1, 4).rechunk(-1).map_blocks(
-        _of_all, dtype=float, drop_axis=0, chunks=((4,),)
-    )  # fmt: skip
+    blocks = dask.array.asarray(array.chunk().data).to_delayed().ravel()
+    parts = [dask.delayed(_of_block)(block) for block in blocks]
+    return dask.array.from_delayed(dask.delayed(_of_all)(parts), (4,), float)
 
 
 def _of_block(block: np.ndarray) -> np.ndarray:
-    """Sum, extremes and number of the finite values of a block, (1, .., 1, 4)."""
+    """Sum, extremes and number of the finite values of a block, (4,)."""
     known = block[np.isfinite(block)]
     least, largest = (known.min(), known.max()) if known.size else (np.inf, -np.inf)
-    return np.array([known.sum(), least, largest, known.size]).reshape((1,) * block.ndim + (4,))
+    return np.array([known.sum(), least, largest, known.size])
 
 
-def _of_all(parts: np.ndarray) -> np.ndarray:
-    """Return the statistics of all blocks together, from (blocks, 4)."""
-    number = parts[:, 3].sum()
-    if not number:
+def _of_all(parts: list[np.ndarray]) -> np.ndarray:
+    """Return the statistics of all blocks together."""
+    total, least, largest, number = np.array(parts).T
+    if not number.sum():
         return np.array([np.nan, np.nan, np.nan, 0.0])
-    return np.array([parts[:, 0].sum() / number, parts[:, 1].min(), parts[:, 2].max(), number])
+    return np.array([total.sum() / number.sum(), least.min(), largest.max(), number.sum()])
 
 
 # Receiver operating characteristics. The magnitude of a segment's strongest bin does not depend on

@@ -153,24 +153,20 @@ def _tallies(dataset: xr.Dataset, quantity: str, edges: np.ndarray) -> Iterator[
     cycles = stretches(status, "cycle", max(1, STRETCH // draws_a_chunk))
     for cycle, draw in product(cycles, draws):
         part = dataset.isel(cycle=cycle, draw=draw)
-        solved, error, variance = _errors(part, quantity)
-        altitude = np.broadcast_to(np.asarray(part["true_altitude"].values)[:, None], solved.shape)
-        computed = np.asarray(part[f"{quantity}_status"].values).ravel() >= SOLVED
+        state, found = part[f"{quantity}_status"].values, part[quantity].values
+        altitude = np.broadcast_to(part["true_altitude"].values[:, None], state.shape)
         cell = np.digitize(np.nan_to_num(altitude.ravel(), nan=-np.inf), edges) - 1
-        cell = np.where(computed, cell, -1)
-        yield tally(error, variance, solved.ravel(), cell, edges.size - 1)
-
-
-def _errors(part: xr.Dataset, quantity: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mask of solutions (cycles, draws), their errors and variances (n, m)."""
-    status = np.asarray(part[f"{quantity}_status"].values)
-    solved = (status >= SOLVED) & (status <= EXCLUDED)
-    found, true = (np.asarray(part[n].values) for n in (quantity, f"true_{quantity}"))
-    error = found - true[:, None]
-    if quantity == ALTITUDE:
-        return solved, error.reshape(-1, 1), np.asarray(part["altitude_variance"]).reshape(-1, 1)
-    variance = np.diagonal(np.asarray(part["velocity_covariance"]), axis1=-2, axis2=-1)
-    return solved, error.reshape(-1, 3), variance.reshape(-1, 3)
+        cell = np.where(state.ravel() >= SOLVED, cell, -1)
+        if quantity == ALTITUDE:
+            variance = part["altitude_variance"].values
+        else:
+            variance = np.diagonal(part["velocity_covariance"].values, axis1=-2, axis2=-1)
+        error = found - part[f"true_{quantity}"].values[:, None]
+        components = -1, len(COMPONENTS[quantity])
+        yield tally(
+            error.reshape(components), variance.reshape(components),
+            (state.ravel() >= SOLVED) & (state.ravel() <= EXCLUDED), cell, edges.size - 1,
+        )  # fmt: skip
 
 
 def tally(

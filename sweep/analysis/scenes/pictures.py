@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
-from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import xarray as xr
@@ -27,11 +26,11 @@ from sweep.analysis.scenes.recording import (
     SIGNED,
     WIDE,
     Cloud,
-    Interval,
     Table,
     Thinned,
     label,
     shown,
+    within,
 )
 from sweep.model.pairing import TRUE
 
@@ -109,7 +108,7 @@ _UNIT = 10.0
 class Solid:
     """A picture at an angle: azimuth of the eye from x towards y, elevation above it [deg]."""
 
-    marks: Mapping[str, Any] = MappingProxyType({"depthshade": False})
+    marks: ClassVar[dict[str, Any]] = {"depthshade": False}
 
     def __init__(
         self, cloud: Cloud, azimuth: float, elevation: float, *, title: str, note: str
@@ -209,7 +208,7 @@ class Flat:
     `nearest` is 1 where the eye is at the upper end of the last, -1 at its lower one.
     """
 
-    marks: Mapping[str, Any] = MappingProxyType({})
+    marks: ClassVar[dict[str, Any]] = {}
 
     def __init__(
         self, cloud: Cloud, along: tuple[str, str, str], nearest: int, *, title: str, note: str
@@ -306,9 +305,7 @@ def _draw(picture: Flat | Solid, colour: np.ndarray) -> None:
 def _within(cloud: Cloud, table: Table) -> np.ndarray:
     """Places (3, n), nan outside of the box."""
     columns = np.array([table[axis] for axis in AXES])
-    low, high = np.array([cloud.box[axis] for axis in AXES]).T
-    inside = ((columns >= low[:, None]) & (columns <= high[:, None])).all(axis=0)
-    return np.where(inside, columns, np.nan)
+    return np.where(within(table, cloud.box), columns, np.nan)
 
 
 def _paper(ground: Ground) -> np.ndarray:
@@ -391,9 +388,8 @@ def scatter_sheet(
     scale = colours.chosen(colour, values, trusted=true, surfaces=surfaces)
     columns = {name: shown(name, table[name]) for name in (x, y)}
     limits = {name: _limits(name, columns[name], true) for name in (x, y)}
-    inside = np.logical_and.reduce([Interval(*limits[n]).holds(columns[n]) for n in (x, y)])
-    what = labels.counted(found.total, "point" if "flags" in table else "shot")
-    said = [what + f", one in {found.every} of them shown" * (found.every > 1)]
+    inside = within(columns, limits)
+    said = [found.counted("point" if "flags" in table else "shot")]
     if outside := int((~inside & ~true).sum()) * found.every:
         said.append(f"{labels.counted(outside, 'false point')} outside of the picture")
     stage = Stage(

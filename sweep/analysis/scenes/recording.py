@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -62,7 +62,6 @@ KINDS = {name: bit for name, bit in FLAGS.items() if name != "unconfirmed"}
 class Quantity:
     """A quantity of each shot or of each point."""
 
-    name: str
     words: str
     units: str
     of_points: bool
@@ -73,18 +72,17 @@ def _listed() -> dict[str, Quantity]:
     for table, of_points in ((SHOTS, False), (STATISTICS, False), (POINTS, True)):
         for name, output in table.items():
             if XYZ not in output.dims:
-                found[name] = Quantity(name, output.long_name, output.units, of_points)
+                found[name] = Quantity(output.long_name, output.units, of_points)
     plain = {
         "range": "range", "radial_velocity": "radial velocity", "snr": "signal-to-noise ratio",
         "pd": "probability of detection", "time": "time", "beam": "beam", "surface": "surface",
     }  # fmt: skip
     for name, words in plain.items():
-        found[name] = Quantity(name, words, found[name].units, found[name].of_points)
+        found[name] = replace(found[name], words=words)
     altitude = CYCLES["true_altitude"]
-    derived = [Quantity("altitude", "altitude above ground", altitude.units, False)]
-    derived += [Quantity(axis, axis, "m", True) for axis in "xyz"]
-    derived += [Quantity("shot", "number of the shot", "1", False)]
-    return found | {quantity.name: quantity for quantity in derived}
+    found["altitude"] = Quantity("altitude above ground", altitude.units, False)
+    found |= {axis: Quantity(axis, "m", True) for axis in AXES}
+    return found | {"shot": Quantity("number of the shot", "1", False)}
 
 
 QUANTITIES = _listed()
@@ -119,16 +117,16 @@ def kinds(flags: np.ndarray) -> np.ndarray:
 Table = dict[str, np.ndarray]
 
 
-@dataclass(frozen=True)
-class Interval:
-    """Limits of a quantity, either of them none."""
+Limits = tuple[float, ...]
+"""Lowest and highest value of a quantity."""
 
-    low: float = -np.inf
-    high: float = np.inf
+UNLIMITED: Limits = (-np.inf, np.inf)
 
-    def holds(self, values: np.ndarray) -> np.ndarray:
-        """Mask of the values within; nan is not."""
-        return (values >= self.low) & (values <= self.high)
+
+def within(table: Table, limits: Mapping[str, Limits]) -> np.ndarray:
+    """Mask of the rows in which all quantities that have limits lie within them; nan does not."""
+    inside = [(table[n] >= low) & (table[n] <= high) for n, (low, high) in limits.items()]
+    return np.asarray(np.logical_and.reduce(inside))
 
 
 @dataclass(frozen=True)
@@ -144,11 +142,10 @@ class Recording:
         """Number of shots."""
         return int(self.dataset.sizes["shot"])
 
-    def stretches(self, time: Interval | None = None) -> Iterator[slice]:
-        """Ranges of shots, without those that are not computed or lie outside of an interval."""
+    def stretches(self, time: Limits = UNLIMITED) -> Iterator[slice]:
+        """Ranges of shots, without those that are not computed or lie outside of limits."""
         for part in stretches(self.dataset["flags"], "shot"):
-            at = self.read("time", part)
-            if np.isfinite(at).any() and (time is None or time.holds(at).any()):
+            if within({"time": self.read("time", part)}, {"time": time}).any():
                 yield part
 
     def computed(self, part: slice, draw: int = 0) -> np.ndarray:
@@ -206,13 +203,13 @@ class Recording:
         *,
         draw: int = 0,
         ranges: str = QUANTISED,
-        time: Interval | None = None,
+        time: Limits | None = None,
     ) -> Thinned:
         """Quantities of every point, or of every computed shot if all are a shot's; thinned."""
         of_points = any(QUANTITIES[name].of_points for name in names)
-        crops = {"time": time} if time else {}
+        limits = {"time": time} if time else {}
         found = Thinned(most)
-        for part in self.stretches(time):
+        for part in self.stretches(time or UNLIMITED):
             if of_points:
                 every = list(dict.fromkeys([*names, "flags", "time"]))
                 table = self.points(every, part, draw, ranges)
@@ -220,7 +217,7 @@ class Recording:
                 known = self.computed(part)
                 every = list(dict.fromkeys([*names, "time"]))
                 table = {name: self.of_shots(name, part)[known] for name in every}
-            found.add(confined(table, crops))
+            found.add(confined(table, limits))
         return found
 
     def _positions(
@@ -272,12 +269,12 @@ def several_surfaces(recording: Recording, draw: int = 0) -> int | None:
     return fallback
 
 
-def confined(tables: Table, crops: Mapping[str, Interval]) -> Table:
-    """Rows of a table in which every quantity lies within its interval."""
-    if not crops:
-        return tables
-    inside = np.logical_and.reduce([crop.holds(tables[name]) for name, crop in crops.items()])
-    return {name: values[inside] for name, values in tables.items()}
+def confined(table: Table, limits: Mapping[str, Limits]) -> Table:
+    """Rows of a table that lie within limits."""
+    if not limits:
+        return table
+    inside = within(table, limits)
+    return {name: values[inside] for name, values in table.items()}
 
 
 class Thinned:
@@ -286,23 +283,20 @@ class Thinned:
     def __init__(self, most: int) -> None:
         self.most, self.every, self.total = most, 1, 0
         self._parts: list[Table] = []
-        self._kept = 0
 
     def add(self, table: Table) -> None:
         """Rows that follow."""
-        size = len(next(iter(table.values())))
-        number = np.arange(self.total, self.total + size)
-        self.total += size
-        self._append(table, number % self.every == 0)
-        while self._kept > self.most:
+        first = -self.total % self.every
+        self.total += len(next(iter(table.values())))
+        self._parts.append({n: values[first :: self.every].copy() for n, values in table.items()})
+        while self.total > self.most * self.every:
             self.every *= 2
-            whole = self.rows()
-            self._parts, self._kept = [], 0
-            self._append(whole, np.arange(len(next(iter(whole.values())))) % 2 == 0)
+            self._parts = [{n: values[::2].copy() for n, values in self.rows().items()}]
 
-    def _append(self, table: Table, chosen: np.ndarray) -> None:
-        self._parts.append({name: values[chosen] for name, values in table.items()})
-        self._kept += int(chosen.sum())
+    def counted(self, thing: str, what: str = "") -> str:
+        """Return the number of all rows in words, and how many of them are kept."""
+        kept = f", one in {self.every} of them shown" if self.every > 1 else ""
+        return labels.counted(self.total, thing) + what + kept
 
     def rows(self) -> Table:
         """Return the rows kept; empty where none were added."""
@@ -345,10 +339,10 @@ def place(spec: SceneSpec, where: Mapping[str, object]) -> Place:
     for name, written in where.items():
         several = list(written) if isinstance(written, tuple | list) else [written]
         try:
-            axis, found = _fitting(spec, name, several)
+            axis, found, there = _fitting(spec, name, several)
             fits[axis] &= found
             if not fits[axis].any():
-                raise QuantityError("is no value of this study", _values(spec, name))
+                raise QuantityError("is no value of this study", there)
         except QuantityError as error:
             mistakes.append(Mistake(f"where.{name}", error.rule, f"{written}", error.suggestion))
     if mistakes:
@@ -364,29 +358,23 @@ def place_at(spec: SceneSpec, numbers: Sequence[int]) -> Place:
     return Place(index, _words(spec, index), ())
 
 
-def _fitting(spec: SceneSpec, name: str, several: list[object]) -> tuple[str, np.ndarray]:
-    """Return the axis of a coordinate, and which of its values are among those asked for."""
+def _fitting(spec: SceneSpec, name: str, several: list[object]) -> tuple[str, np.ndarray, str]:
+    """Return the axis of a coordinate, which of its values are asked for, and them in words."""
     for axis in spec.axes:
-        if name in [member.name for member in axis.members]:
-            wanted: list[object] = [spec.coordinate_value(name, value) for value in several]
-            return axis.name, is_any(np.asarray(spec.member(name).display), wanted)
+        for member in axis.members:
+            if name == member.name:
+                wanted: list[object] = [spec.coordinate_value(name, value) for value in several]
+                shown = [labels.quantity(value, member.units) for value in member.display[:8]]
+                there = f"it has {', '.join(shown)}" + (", ..." if axis.size > 8 else "")
+                return axis.name, is_any(np.asarray(member.display), wanted), there
         if name == axis.name:
-            return axis.name, np.isin(np.arange(axis.size), [int(str(v)) for v in several])
+            numbers = np.isin(np.arange(axis.size), [int(str(v)) for v in several])
+            return axis.name, numbers, f"they are numbered 0 to {axis.size - 1}"
     known = [member.name for axis in spec.axes for member in axis.members]
     otherwise = f"the coordinates are {', '.join(known)}" if known else "it has no axes"
     raise QuantityError(
         "is no coordinate of this study", near_miss(name, known, otherwise=otherwise)
     )
-
-
-def _values(spec: SceneSpec, name: str) -> str:
-    """Return the values that there are, in words."""
-    for axis in spec.axes:
-        for member in axis.members:
-            if name == member.name:
-                shown = [labels.quantity(value, member.units) for value in member.display[:8]]
-                return f"it has {', '.join(shown)}" + (", ..." if axis.size > 8 else "")
-    return f"they are numbered 0 to {next(a.size for a in spec.axes if a.name == name) - 1}"
 
 
 def _words(spec: SceneSpec, index: Mapping[str, int]) -> str:
@@ -412,19 +400,21 @@ Box = dict[str, tuple[float, float]]
 class Cloud:
     """Points of a picture, and what else is in it.
 
-    Dropouts are what shots without a point aimed at. Totals are those within the limits, one of
-    `every` is shown; false points `outside` of the box of the picture [m] are left out.
+    Of the rows within the limits, false points `outside` of the box of the picture [m] are left
+    out. Lost are shots without a point, and dropouts what they aimed at.
     """
 
     points: Table
-    dropouts: Table
     path: Table
-    total: int
-    total_dropouts: int
+    rows: Thinned
+    lost: Thinned
     outside: int
-    every: int
-    every_dropout: int
     box: Box
+
+    @property
+    def dropouts(self) -> Table:
+        """Places that shots without a point aimed at; empty where none were looked for."""
+        return self.lost.rows()
 
     @property
     def true(self) -> np.ndarray:
@@ -434,17 +424,12 @@ class Cloud:
     @property
     def remarks(self) -> list[str]:
         """Numbers of points, dropouts and false points outside, and how many of them are shown."""
-        said = [labels.counted(self.total, "point") + _one_in(self.every)]
+        said = [self.rows.counted("point")]
         if self.dropouts:
-            lost = labels.counted(self.total_dropouts, "shot")
-            said.append(f"{lost} without a point{_one_in(self.every_dropout)}")
+            said.append(self.lost.counted("shot", " without a point"))
         if self.outside:
             said.append(f"{labels.counted(self.outside, 'false point')} outside of the picture")
         return said
-
-
-def _one_in(every: int) -> str:
-    return f", one in {every} of them shown" if every > 1 else ""
 
 
 def gathered(
@@ -453,7 +438,7 @@ def gathered(
     *,
     ranges: str,
     draw: int = 0,
-    crops: Mapping[str, Interval] | None = None,
+    crops: Mapping[str, Limits] | None = None,
     dropouts: bool = False,
     path: bool = False,
     most: int = MOST_POINTS,
@@ -463,12 +448,13 @@ def gathered(
     places = {name: crop for name, crop in crops.items() if name in AXES}
     kept = list(dict.fromkeys([*AXES, "flags", *names]))
     found, lost, track = Thinned(most), Thinned(MOST_DROPOUTS), Thinned(MOST_PATH)
-    for part in recording.stretches(crops.get("time")):
+    asked = crops.get("time", UNLIMITED)
+    for part in recording.stretches(asked):
         every = recording.points(list(dict.fromkeys([*kept, *crops])), part, draw, ranges)
         inside = confined(every, crops)
         found.add({name: inside[name] for name in kept})
         time = recording.read("time", part)
-        chosen = crops.get("time", Interval()).holds(time)
+        chosen = within({"time": time}, {"time": asked})
         if dropouts:
             none = ~(recording.read("flags", part, draw) > 0).any(axis=-1)
             none &= recording.computed(part, draw) & (chosen | ("time" not in crops))
@@ -482,42 +468,35 @@ def gathered(
         return None
     rows = found.rows()
     box = _box(rows, lost.rows(), track.rows(), places)
-    inside_box = np.logical_and.reduce([Interval(*box[axis]).holds(rows[axis]) for axis in AXES])
+    inside_box = within(rows, box)
     return Cloud(
         points={name: values[inside_box] for name, values in rows.items()},
-        dropouts=lost.rows(),
         path=track.rows(),
-        total=found.total,
-        total_dropouts=lost.total,
+        rows=found,
+        lost=lost,
         outside=int((~inside_box).sum()) * found.every,
-        every=found.every,
-        every_dropout=lost.every,
         box=box,
     )
 
 
-def _box(rows: Table, lost: Table, track: Table, places: Mapping[str, Interval]) -> Box:
+def _box(rows: Table, lost: Table, track: Table, places: Mapping[str, Limits]) -> Box:
     """Box around what a figure shows: asked limits, else true points, dropouts and the path."""
     true = (rows["flags"] & TRUE) > 0
     box: Box = {}
     for axis in AXES:
         values = rows[axis][true] if true.any() else rows[axis]
         every = [values, *(t[axis] for t in (lost, track) if t)]
-        crop = places.get(axis, Interval())
+        lowest, highest = places.get(axis, UNLIMITED)
         low = min(float(v.min()) for v in every if v.size)
         high = max(float(v.max()) for v in every if v.size)
-        box[axis] = (max(low, crop.low), min(high, crop.high))
+        box[axis] = (max(low, lowest), min(high, highest))
     room = MARGIN * max(max(high - low for low, high in box.values()), 1.0)
     return {axis: (low - room, high + room) for axis, (low, high) in box.items()}
 
 
-def eyepoints_of(store_path: Location, scanner: xr.Dataset) -> Location:
-    """Store of the eyepoints that a scanner's clouds were made of."""
-    return eyepoints_path(store_path, str(scanner.attrs["geometry_id"]))
-
-
-def read_eyepoints(path: Location, index: np.ndarray) -> Eyepoints:
-    """Eyepoints of some shots."""
+def read_eyepoints(store_path: Location, scanner: xr.Dataset, index: np.ndarray) -> Eyepoints:
+    """Eyepoints of some shots that a scanner's clouds in a store were made of."""
+    path = eyepoints_path(store_path, str(scanner.attrs["geometry_id"]))
     if not path.exists():
         raise NotAStoreError(
             f"the eyepoints of the study are not at {path}: they are kept beside its store; "
