@@ -330,7 +330,7 @@ def _over_time(
         rows = seen.recording.rows(names, MOST_SHOTS // len(found), ranges=INTERPOLATED)
         every = max(every, rows.every)
         table = rows.rows()
-        for words, up, lines in drawn(table) if table else ():
+        for words, up, lines in drawn(table) if table and table["time"].size else ():
             choice = {"cloud": seen.words, "quantity": words}
             panels.append(Panel(choice, Axis("time (s)"), up, lines))
     return panels, f"One {thing} in {every} shown: reduced for this page" * (every > 1)
