@@ -45,6 +45,7 @@ from sweep.tasks.session import Outcome, Pool, RunOptions, Session
 from sweep.tasks.store import (
     create,
     refuse_altered,
+    refuse_damaged,
     refuse_other_study,
     refuse_other_versions,
     refuse_to_replace,
@@ -54,7 +55,6 @@ from sweep.tasks.store import (
 )
 from sweep.tasks.studies import Declared, changed, refuse_unlike, what_is_there
 from sweep.tasks.study import own_functions
-from sweep.tasks.verify import refuse_damaged
 
 #: Seconds between looks at rays that another run casts.
 WAITING = 0.5

@@ -47,7 +47,7 @@ from sweep.storage.locations import (
     Tag,
     put_whole,
 )
-from sweep.storage.logs import (
+from sweep.storage.opening import (
     RECEIPTS,
     body_of,
     damaged_lines,
@@ -87,7 +87,7 @@ class Receipt:
     block: int
     points: int
     bytes: int  # as stored
-    digest: str  # of the bytes stored, `logs.digest`
+    digest: str  # of the bytes stored, `opening.digest`
     seconds: float  # evaluating and writing
     write_seconds: float
     host: str

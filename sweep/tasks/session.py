@@ -30,7 +30,7 @@ from sweep.spec.clusters import (
 )
 from sweep.spec.sections import Execution
 from sweep.storage.locations import Location, ObjectStoreError
-from sweep.storage.logs import read_receipts
+from sweep.storage.opening import read_receipts
 from sweep.tasks import journal, store
 from sweep.tasks.journal import Failure, Journal, Lock, Look, Receipt, given_up
 from sweep.tasks.progress import (

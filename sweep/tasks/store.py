@@ -2,7 +2,7 @@
 
 No two blocks share a chunk, so writers need no locks between them. Only `.sweep/`, the journal,
 knows hosts and times: every other byte follows from the study, and from the versions of the
-software.
+software. All that a store held before there were results is listed there with digests.
 """
 
 from __future__ import annotations
@@ -44,8 +44,16 @@ from sweep.storage.locations import (
     settle,
     successor,
 )
-from sweep.storage.logs import digest, digest_of, read_lines, sealed
-from sweep.storage.opening import LAYOUT, MANIFEST, ZSTD_LEVEL
+from sweep.storage.opening import (
+    LAYOUT,
+    MANIFEST,
+    ZSTD_LEVEL,
+    digest,
+    digest_of,
+    read_lines,
+    read_sealed,
+    sealed,
+)
 from sweep.tasks.journal import LOCK, LOGS, REPLACES, Lock, read_recipe, write_recipe
 from sweep.tasks.progress import BusyError, StoreError
 from sweep.tasks.study import CONVENTIONS, ArrayLayout, Content, Study
@@ -54,6 +62,8 @@ if TYPE_CHECKING:
     from zarr.core.array_spec import ArrayConfigLike
 
 ROOT = "zarr.json"
+
+LIST = f"{JOURNAL}/{MANIFEST}"
 
 #: Object that says that what lies at a place in an object store is a store half made or removed.
 UNFINISHED = "partial"
@@ -316,6 +326,70 @@ def refuse_links(path: Location) -> None:
         for entry in _entries(str(path)):
             if not entry.is_file(follow_symlinks=False):
                 raise StoreError(f"{entry.path} is no plain file: sweep made none such, remove it")
+
+
+class Damage(NamedTuple):
+    """An object of a store that is not as it was written."""
+
+    object: str  # path inside the store; a line of a log by its number
+    what: str  # what is wrong with it
+    block: int = -1  # that it belongs to
+    mended_by: str = "resume"  # "repair" what was there before results, "hand" what is surplus
+
+
+def digests(path: Location) -> dict[str, str]:
+    """Digests of what a store was made of, by object, as far as its list is undamaged."""
+    return {r["object"]: r["digest"] for r in read_lines(path / LIST) if "object" in r}
+
+
+def damages(path: Location) -> list[Damage]:
+    """Objects that a store was made of, and lines of their list, that are not as they were."""
+    lines = [record for _, record in read_sealed(path / LIST)]
+    if not lines:
+        return [Damage(LIST, "is missing or empty", mended_by="repair")]
+    found = [
+        Damage(f"{LIST} line {n}", "is damaged", mended_by="repair")
+        for n, each in enumerate(lines, 1)
+        if each is None
+    ]
+    whole = [record for record in lines if record]
+    if not found and whole[0].get("objects") != len(whole) - 1:
+        found.append(Damage(LIST, "lacks lines", mended_by="repair"))
+    return found + [
+        Damage(name, what, mended_by="repair")
+        for name, known in digests(path).items()
+        if (what := altered(path, name, known))
+    ]
+
+
+def altered(path: Location, name: str, known: str) -> str:
+    """Damage of an object of the template, whose digest is known."""
+
+    def damage_of(content: bytes) -> str:
+        return "" if digest_of([(name, content)]) == known else "is not as it was made"
+
+    return wrong_with(path / name, damage_of)
+
+
+def refuse_damaged(path: Location) -> None:
+    """Refuse a store whose template is not as it was made: what is added might not fit it."""
+    refuse_links(path)
+    if found := damages(path):
+        listed = "\n".join(f"  {damage.object} {damage.what}" for damage in found)
+        raise StoreError(
+            f"{path} is not as it was made:\n{listed}\n"
+            f"`sweep verify {path} --repair` puts back what was there."
+        )
+
+
+def wrong_with(place: Location, damage_of: Callable[[bytes], str]) -> str:
+    """Damage of an object in words, by what it holds; empty where there is none."""
+    try:
+        return damage_of(place.read_bytes())
+    except (FileNotFoundError, NotADirectoryError):
+        return "is missing"
+    except OSError as error:
+        return f"can't be read: {error.strerror}"
 
 
 def _entries(folder: str) -> Iterator[os.DirEntry[str]]:

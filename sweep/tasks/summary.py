@@ -17,8 +17,7 @@ from sweep.model.accuracy import Accuracy
 from sweep.model.outputs import PROMISED
 from sweep.model.unsupported import UnsupportedShot
 from sweep.storage.locations import PACKED, Location, files_below, located
-from sweep.storage.logs import read_receipts
-from sweep.storage.opening import open_group
+from sweep.storage.opening import open_group, read_receipts
 from sweep.tasks import journal, studies
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.grid_study import GridStudy, evaluate_points, select, with_few_draws

@@ -3,7 +3,14 @@ import os
 import pytest
 
 from sweep.storage.locations import JOURNAL
-from sweep.storage.logs import RECEIPTS, damaged_lines, read_lines, read_receipts, sealed, unsealed
+from sweep.storage.opening import (
+    RECEIPTS,
+    damaged_lines,
+    read_lines,
+    read_receipts,
+    sealed,
+    unsealed,
+)
 from sweep.tasks import journal
 from sweep.tasks.journal import Failure, Journal, Receipt
 
