@@ -399,11 +399,6 @@ def read_lines(path: Location) -> Iterator[dict[str, Any]]:
     return (record for _, record in read_sealed(path) if record is not None)
 
 
-def damaged_lines(path: Location) -> list[int]:
-    """Numbers, from 1, of the lines of a log that are damaged or cut short."""
-    return [n for n, (_, record) in enumerate(read_sealed(path), start=1) if record is None]
-
-
 def digest(path: Location, objects: list[str]) -> str:
     """blake2b-128 of names and bytes of stored objects, in hex."""
     contents = each(path, lambda name: (path / name).read_bytes(), objects)

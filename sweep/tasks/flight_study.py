@@ -271,7 +271,15 @@ class FlightStudy(GrowingStudy):
 
     def planned(self, part: Part, eyepoints: Eyepoints, tiles: np.ndarray) -> ShotsPlan | None:
         """Plans of shots whose tiles have these numbers, (n,), rising."""
-        return self._plan(eyepoints, tiles, self.parameters_at(part))
+        return plan_shots(
+            eyepoints,
+            tiles,
+            self.parameters_at(part),
+            self.surfaces,
+            modes=self.spec.modes(),
+            rotating=self.spec.rotating,
+            rays_by_tolerance=self.spec.rays_by_tolerance,
+        )
 
     def look(
         self,
@@ -466,16 +474,6 @@ class FlightStudy(GrowingStudy):
     def rays_accuracy(self) -> Accuracy | None:
         """Says how many rays a shot needs; None where their number is given."""
         return Accuracy.of(self.spec.parameters()) if self.spec.rays_by_tolerance else None
-
-    @cached_property
-    def _plan(self) -> Callable[..., ShotsPlan | None]:
-        return partial(
-            plan_shots,
-            surfaces=self.surfaces,
-            modes=self.spec.modes(),
-            rotating=self.spec.rotating,
-            rays_by_tolerance=self.spec.rays_by_tolerance,
-        )
 
     def _open_eyepoints(self, scanner: str) -> Mapping[str, Any]:
         """Arrays of a scanner's eyepoints by name, opened once; their weights read."""

@@ -12,22 +12,13 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sweep.spec import Spec
-from sweep.spec.clusters import (
-    Address,
-    AnyCluster,
-    Bounds,
-    Cluster,
-    Local,
-    LocalWorker,
-    cluster_of,
-    load_cluster,
-)
 from sweep.spec.sections import Execution
 from sweep.storage.locations import Location, ObjectStoreError
 from sweep.storage.opening import read_receipts
@@ -50,6 +41,7 @@ if TYPE_CHECKING:
     from distributed import Client
 
     from sweep.spec import SceneSpec
+    from sweep.spec.clusters import AnyCluster
     from sweep.tasks.cluster import Reached
 
 #: Scheduler "address" of the plain loop.
@@ -140,21 +132,29 @@ class RunOptions:
         ours to start.
         """
         if self.cluster is not None:
-            if self.scheduler is not None:
-                raise ClusterError("a scheduler and a cluster are both named: leave out one")
-            given = self.cluster
-            if not isinstance(given, Cluster):
-                given = cluster_of(given) if isinstance(given, Mapping) else load_cluster(given)
-            return _of_workers(given, self.workers)
+            return self._named()
         scheduler, execution = self.scheduler, spec.execution
         if scheduler is None and self.workers is None:
             scheduler = execution.scheduler or None
         if scheduler == NONE or (scheduler is None and self._leaves_it_open(spec)):
             return None
+        from sweep.spec.clusters import Address, Local, LocalWorker  # a plain loop needs none
+
         if scheduler is not None:
             return Address.model_construct(kind="scheduler", address=scheduler, security=None)
         here = Local(kind="local", worker=LocalWorker(threads=execution.threads))
         return _of_workers(here, self.workers or execution.workers or None)
+
+    def _named(self) -> AnyCluster:
+        """Return the cluster that is given, or that a file describes."""
+        from sweep.spec.clusters import Cluster, cluster_of, load_cluster
+
+        if self.scheduler is not None:
+            raise ClusterError("a scheduler and a cluster are both named: leave out one")
+        given: Any = self.cluster
+        if not isinstance(given, Cluster):
+            given = cluster_of(given) if isinstance(given, Mapping) else load_cluster(given)
+        return _of_workers(given, self.workers)
 
     def _leaves_it_open(self, spec: Spec | SceneSpec) -> bool:
         """Tell whether nothing is said that takes workers, and the work takes none."""
@@ -166,6 +166,8 @@ class RunOptions:
 
 def _of_workers(cluster: AnyCluster, workers: int | None) -> AnyCluster:
     """Fix the number of workers of a cluster, if one is given and they are ours."""
+    from sweep.spec.clusters import Address, Bounds
+
     if workers is None:
         return cluster
     if isinstance(cluster, Address):
@@ -398,9 +400,8 @@ class Session:
                 what = "loading the model" + ("" if self._pool.is_plain else ", reaching workers")
                 with working(what, self._told):
                     compiling.start()  # beside the workers' start, which is mostly waiting
-                    answers = self._pool.answers(
-                        str(self._path), self._study.id, blocks, self._is_seen
-                    )
+                    seen = partial(store.is_seen, self._path, self._study)
+                    answers = self._pool.answers(str(self._path), self._study.id, blocks, seen)
                     while compiling.is_alive() and not self._interrupts.stopping:
                         compiling.join(TICK)
                 self._told.begin(
@@ -426,11 +427,6 @@ class Session:
             return
         with suppress(Exception):  # what raises here is a block's failure, recorded as one
             self._study.compile()
-
-    def _is_seen(self, receipt: Receipt, read: bool) -> bool:
-        objects = store.block_objects(self._study, receipt.block)
-        wanted = store.Written(receipt.digest, receipt.bytes)
-        return store.is_seen(self._path, objects, wanted, read=read)
 
     def _take(self, answers: Iterator[Answer], blocks: BlockQueue) -> str:
         told, absence = False, Absence()

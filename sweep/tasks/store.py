@@ -54,7 +54,7 @@ from sweep.storage.opening import (
     read_sealed,
     sealed,
 )
-from sweep.tasks.journal import LOCK, LOGS, REPLACES, Lock, read_recipe, write_recipe
+from sweep.tasks.journal import LOCK, LOGS, REPLACES, Lock, Receipt, read_recipe, write_recipe
 from sweep.tasks.progress import BusyError, StoreError
 from sweep.tasks.study import CONVENTIONS, ArrayLayout, Content, Study
 
@@ -402,13 +402,14 @@ def _entries(folder: str) -> Iterator[os.DirEntry[str]]:
                 yield entry
 
 
-def is_seen(path: Location, objects: list[str], wanted: Written, *, read: bool) -> bool:
+def is_seen(path: Location, study: Study, receipt: Receipt, read: bool) -> bool:
     """Tell whether a block that a worker has written is here: by size, or digest where `read`."""
+    objects = block_objects(study, receipt.block)
     try:
         if read:
-            return digest(path, objects) == wanted.digest
+            return digest(path, objects) == receipt.digest
         if isinstance(path, Path):
-            return sum(os.stat(f"{path}/{name}").st_size for name in objects) == wanted.bytes
+            return sum(os.stat(f"{path}/{name}").st_size for name in objects) == receipt.bytes
     except (FileNotFoundError, NotADirectoryError):
         return False
     return (path / objects[-1]).size() > 0

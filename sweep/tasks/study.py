@@ -345,19 +345,14 @@ class Grid(LatticeGrid):
 
     def parameters(self, block: int) -> dict[str, Value]:
         """Parameters of a block's points by path: scalars, or arrays (n,) in C order over it."""
-        slices = self.block(block)
-        index = [along.ravel() for along in np.indices(self.extent(block))]
-        return self._select([s.start + along for s, along in zip(slices, index, strict=True)])
+        return self.parameters_at(self.numbers(block, np.arange(self.block_size(block))))
 
     def parameters_at(self, points: np.ndarray) -> dict[str, Value]:
         """Parameters of points given by their numbers in C order over the whole grid, (n,)."""
-        return self._select(list(np.unravel_index(points, self.shape)) if self.shape else [])
-
-    def _select(self, indices: list[np.ndarray]) -> dict[str, Value]:
         selected: dict[str, Value] = dict(self.fixed)
+        indices = np.unravel_index(points, self.shape) if self.shape else ()
         for values, along in zip(self.values, indices, strict=True):
-            for path, array in values.items():
-                selected[path] = array[along]
+            selected |= {path: array[along] for path, array in values.items()}
         return selected
 
     def geometry_order(self, block: int) -> np.ndarray:
@@ -385,7 +380,8 @@ class Content(Protocol):
         """Attributes of its store, but for versions; the same wherever it is made."""
 
     def groups(self) -> dict[str, dict[str, Any]]:
-        """Return groups of its store and their attributes."""
+        """Return groups of its store and their attributes; none but the root."""
+        return {}
 
     def arrays(self) -> list[ArrayLayout]:
         """Every array of its store."""
@@ -396,10 +392,6 @@ class Study(Content, ABC):
 
     unit = "points"
     """Name of its points, in the plural."""
-
-    def groups(self) -> dict[str, dict[str, Any]]:
-        """Return groups of its store and their attributes; none but the root."""
-        return {}
 
     @property
     @abstractmethod
