@@ -39,7 +39,6 @@ from sweep.tasks.study import (
     BlockGrid,
     GrowingStudy,
     Lattice,
-    LatticeGrid,
     Results,
 )
 
@@ -91,7 +90,7 @@ class Part(NamedTuple):
     cycles: range
 
 
-class ScannerBlocks(LatticeGrid):
+class ScannerBlocks(Lattice, BlockGrid):
     """The blocks of one scanner: along the axes, draws and cycles, the last fastest."""
 
     def __init__(self, spec: SceneSpec, scanner: str) -> None:

@@ -328,11 +328,7 @@ class Lattice:
         """Values along each dimension by the parameters that they set."""
 
 
-class LatticeGrid(Lattice, BlockGrid):
-    """Points along axes, and perhaps further dimensions, cut into blocks."""
-
-
-class Grid(LatticeGrid):
+class Grid(Lattice, BlockGrid):
     """Points of a study over a grid, their parameters, and the blocks they are computed in."""
 
     def __init__(self, spec: Spec) -> None:

@@ -77,7 +77,8 @@ def summary(store: str | Location) -> tuple[str, list[Row], float]:
     blocks = _some(done, int(np.prod(study.grid.block_shape)))
     share = len(blocks) / max(len(done), 1)
     axis = study.spec.axes[0] if study.spec.axes else None
-    edges = _edges(axis) if axis else np.array([0, 1])
+    size = axis.size if axis else 1  # in parts of a value each, or of several where there are many
+    edges = np.linspace(0, size, min(size, MOST_ROWS) + 1).astype(int)
     found: list[list[np.ndarray]] = [[np.empty((2, 0))] for _ in edges[1:]]
     for place, values in pieces(path, study, ("pd_shot", "pd_doppler"), blocks):
         both = np.stack(values).reshape(2, -1, *values[0].shape[1:])
@@ -127,11 +128,6 @@ def _some(done: np.ndarray, block_points: int) -> np.ndarray:
     if len(done) <= most:
         return done
     return np.sort(np.random.default_rng(0).choice(done, most, replace=False))
-
-
-def _edges(axis: Axis) -> np.ndarray:
-    """Edges of the parts of an axis: its values, or stretches of them where there are many."""
-    return np.linspace(0, axis.size, min(axis.size, MOST_ROWS) + 1).astype(int)
 
 
 def _name(axis: Axis, start: int, stop: int) -> str:

@@ -13,7 +13,7 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from functools import partial
+from functools import lru_cache, partial
 from itertools import islice
 from typing import TypeVar
 
@@ -78,20 +78,13 @@ class Answer:
     workers: int = 1  # that there were as it arrived
 
 
-_studies: dict[tuple[str, str], store.Arrays] = {}
-_stamps: dict[str, tuple[tuple[int, ...], str]] = {}
 _opening = threading.Lock()
 
 
 def study(path: str, study_id: str) -> store.Arrays:
     """Return the study of a store, opened for writing once a process; StoreError for another."""
     with _opening:
-        if (path, study_id) not in _studies:
-            if len(_studies) >= STUDIES_OPEN:
-                _studies.clear()
-                _stamps.clear()
-            _studies[path, study_id] = _open(path, study_id)
-        return _studies[path, study_id]
+        return _opened(path, study_id)
 
 
 def _open(path: str, study_id: str) -> store.Arrays:
@@ -101,17 +94,21 @@ def _open(path: str, study_id: str) -> store.Arrays:
     return store.Arrays(path, held)
 
 
+_opened = lru_cache(maxsize=STUDIES_OPEN)(_open)
+
+
 def _refuse_another(path: str, study_id: str) -> None:
     """Refuse a store that was put in the place of the one that a task was sent for."""
-    found, known = stamp(located(path)), _stamps.get(path)
-    if known and found and known[0] == found:
-        held = known[1]
-    else:
-        held = str(read_attributes(located(path))["study_id"])
-        if found:
-            _stamps[path] = found, held
+    found = stamp(located(path))
+    held = _held(path, found) if found else _held.__wrapped__(path, found)
     if held != study_id:
         raise StoreError(f"{path} now holds study {held}, not {study_id}")
+
+
+@lru_cache(maxsize=STUDIES_OPEN)
+def _held(path: str, found: tuple[int, ...] | None) -> str:
+    """Id of the study in a store, which has a stamp."""
+    return str(read_attributes(located(path))["study_id"])
 
 
 def work(job: Job, blocks: list[int]) -> Answer:
@@ -264,7 +261,7 @@ class BlockQueue:
 
     def __init__(self, done: np.ndarray) -> None:
         self.left = int(done.size - np.count_nonzero(done))  # not yet handed out
-        self._fresh = _numbers(done)
+        self._fresh = map(int, np.flatnonzero(~done))
         self._suspects: deque[int] = deque()
         self._returned: deque[int] = deque()
         self.failed: set[int] = set()
@@ -294,11 +291,6 @@ class BlockQueue:
         """
         for block in blocks:
             (self._suspects if block in self.failed else self._returned).append(block)
-
-
-def _numbers(done: np.ndarray, stretch: int = 1 << 16) -> Iterator[int]:
-    for start in range(0, done.size, stretch):
-        yield from (start + np.flatnonzero(~done[start : start + stretch])).tolist()
 
 
 def plain(
