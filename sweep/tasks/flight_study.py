@@ -243,10 +243,6 @@ class FlightStudy(GrowingStudy):
             selected = self.select(part, eyepoints, numbers)
             self.look(part, shots, eyepoints, selected, numbers)
 
-    def selected(self, block: int) -> Selected:
-        """Effects simulated at a block's shots."""
-        return self._looked_at(*self.part(block))[-1]
-
     def _looked_at(
         self, blocks: ScannerBlocks, part: Part
     ) -> tuple[np.ndarray, Results, Eyepoints, Selected]:

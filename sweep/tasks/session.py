@@ -237,15 +237,12 @@ class Pool(ExitStack):
         if self.is_plain:
             if options.performance_report is not None:
                 self.told.say("no performance report: a plain loop has no scheduler to tell of it")
-            return plain(job, queue, self._stopping, seen)
+            return plain(job, queue, lambda: self.interrupts.stopping, seen)
         from sweep.tasks.scheduler import Scheduler
 
         client, slots, _ = self.connect()
         scheduler = Scheduler(client, slots, job, queue, seen=seen, say=self.told.say)
-        return scheduler.answers(self._stopping)
-
-    def _stopping(self) -> bool:
-        return self.interrupts.stopping
+        return scheduler.answers(lambda: self.interrupts.stopping)
 
     def revive(self) -> None:
         """Start workers of this machine again that are gone."""

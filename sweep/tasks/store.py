@@ -18,7 +18,7 @@ from contextlib import contextmanager, suppress
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import google_crc32c
 import numpy as np
@@ -58,9 +58,6 @@ from sweep.tasks.journal import LOCK, LOGS, REPLACES, Lock, Receipt, read_recipe
 from sweep.tasks.progress import BusyError, StoreError
 from sweep.tasks.study import CONVENTIONS, ArrayLayout, Content, Study
 
-if TYPE_CHECKING:
-    from zarr.core.array_spec import ArrayConfigLike
-
 ROOT = "zarr.json"
 
 LIST = f"{JOURNAL}/{MANIFEST}"
@@ -74,10 +71,6 @@ CODECS = [ZstdCodec(level=ZSTD_LEVEL), Crc32cCodec()]
 _ZSTD = Zstd(level=ZSTD_LEVEL)
 
 _libc = ctypes.CDLL(None, use_errno=True)
-
-WRITTEN_WHOLE: ArrayConfigLike = {
-    "write_empty_chunks": True
-}  # else a chunk equal to the fill looks undone
 
 
 def create(

@@ -361,7 +361,8 @@ def _pack(path: Location, output: Location, study: Study, shown: Progress) -> No
 
 def _pack_array(source: Any, output: Location) -> None:
     """Copy an array, shard by shard, and read each back."""
-    target = zarr.open_array(zarr_store(output), mode="r+").with_config(store.WRITTEN_WHOLE)
+    target = zarr.open_array(zarr_store(output), mode="r+")
+    target = target.with_config({"write_empty_chunks": True})  # else one of fill values is lost
     dims = tuple(map(str, range(target.ndim)))
     files = BlockGrid(dims, target.shape, target.shards or target.chunks)
     with ThreadPoolExecutor(THREADS) as pool:
