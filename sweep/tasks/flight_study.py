@@ -150,7 +150,6 @@ class FlightStudy(GrowingStudy):
         self.caster = cache(partial(EyepointStudy, spec, world=world))
         self.scanners = {scanner: ScannerBlocks(spec, scanner) for scanner in spec.scanners}
         self._eyepoints = cache(self._open_eyepoints)
-        self._parameters = cache(self._parameters_along)
 
     @property
     def grids(self) -> list[ScannerBlocks]:
@@ -441,14 +440,12 @@ class FlightStudy(GrowingStudy):
 
     def parameters_at(self, part: Part) -> Mapping[str, Any]:
         """SI values of all parameters at a block's place along the axes."""
-        return self._parameters(part.axes)
-
-    def _parameters_along(self, place: tuple[int, ...]) -> Mapping[str, Any]:
-        parameters: dict[str, Any] = dict(self.spec.parameters())
-        for axis, index in zip(self.spec.axes, place, strict=True):
-            for member in axis.members:
-                parameters[member.path] = np.asarray(member.values)[index].item()
-        return parameters
+        blocks = self.scanners[part.scanner]
+        return blocks.fixed | {
+            path: along[index].item()
+            for values, index in zip(blocks.values, part.axes, strict=False)  # nor draw nor cycle
+            for path, along in values.items()
+        }
 
     @cached_property
     def error_floor(self) -> ErrorFloor:

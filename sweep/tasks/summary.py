@@ -23,10 +23,10 @@ from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.grid_study import GridStudy, evaluate_points, select, with_few_draws
 from sweep.tasks.journal import begun_points, receipted
 from sweep.tasks.progress import StoreError
-from sweep.tasks.study import Study
+from sweep.tasks.study import TOLERANCE, Study
 
 if TYPE_CHECKING:
-    from sweep.spec import Axis, Spec
+    from sweep.spec import Axis
 
 #: Probability of detection above which a point counts as detected.
 DETECTED = 0.9
@@ -291,9 +291,7 @@ def accuracy_table(store: str | Location) -> list[ErrorRow]:
     if not isinstance(study, GridStudy) or not study.spec.draws.any:
         return []
     errors = {name: f"{name}_half_width" for name in PROMISED}
-    return [
-        row for row in _rows(path, study, errors, "n_draws", _tolerance(study.spec)) if row.points
-    ]
+    return [row for row in _rows(path, study, errors, "n_draws", _tolerance(study)) if row.points]
 
 
 def rays_table(store: str | Location) -> list[ErrorRow]:
@@ -301,7 +299,7 @@ def rays_table(store: str | Location) -> list[ErrorRow]:
     path = located(store)
     _, study = studies.read(path)
     if isinstance(study, GridStudy):
-        tolerance = Accuracy(_tolerance(study.spec)).for_beamlets
+        tolerance = Accuracy(_tolerance(study)).for_beamlets
         tolerance = np.maximum(tolerance, Accuracy.least_rays_tolerance)
         rows = _rows(path, study, {"": "beamlets_error"}, "beamlets", tolerance)
         return [row for row in rows if row.missed]
@@ -340,13 +338,12 @@ def _rows(
     return found
 
 
-def _tolerance(spec: Spec) -> np.ndarray:
+def _tolerance(study: GridStudy) -> np.ndarray:
     """Tolerances that broadcast over the grid."""
-    for k, axis in enumerate(spec.axes):
-        for member in axis.members:
-            if member.path == "accuracy.tolerance":
-                return np.asarray(member.values).reshape(-1, *(1,) * (len(spec.axes) - k - 1))
-    return np.asarray(spec.accuracy.tolerance)
+    for further, values in enumerate(reversed(study.grid.values)):
+        if TOLERANCE in values:
+            return values[TOLERANCE].reshape(-1, *(1,) * further)
+    return np.asarray(study.spec.accuracy.tolerance)
 
 
 @dataclass(frozen=True, kw_only=True)
