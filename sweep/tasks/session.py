@@ -19,6 +19,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sweep.spec import Spec
+from sweep.spec.clusters import (
+    Address,
+    AnyCluster,
+    Bounds,
+    Cluster,
+    Local,
+    LocalWorker,
+    cluster_of,
+    load_cluster,
+)
 from sweep.spec.sections import Execution
 from sweep.storage.locations import Location, ObjectStoreError
 from sweep.storage.opening import read_receipts
@@ -41,7 +51,6 @@ if TYPE_CHECKING:
     from distributed import Client
 
     from sweep.spec import SceneSpec
-    from sweep.spec.clusters import AnyCluster
     from sweep.tasks.cluster import Reached
 
 #: Scheduler "address" of the plain loop.
@@ -132,29 +141,21 @@ class RunOptions:
         ours to start.
         """
         if self.cluster is not None:
-            return self._named()
+            if self.scheduler is not None:
+                raise ClusterError("a scheduler and a cluster are both named: leave out one")
+            given = self.cluster
+            if not isinstance(given, Cluster):
+                given = cluster_of(given) if isinstance(given, Mapping) else load_cluster(given)
+            return _of_workers(given, self.workers)
         scheduler, execution = self.scheduler, spec.execution
         if scheduler is None and self.workers is None:
             scheduler = execution.scheduler or None
         if scheduler == NONE or (scheduler is None and self._leaves_it_open(spec)):
             return None
-        from sweep.spec.clusters import Address, Local, LocalWorker  # a plain loop needs none
-
         if scheduler is not None:
             return Address.model_construct(kind="scheduler", address=scheduler, security=None)
         here = Local(kind="local", worker=LocalWorker(threads=execution.threads))
         return _of_workers(here, self.workers or execution.workers or None)
-
-    def _named(self) -> AnyCluster:
-        """Return the cluster that is given, or that a file describes."""
-        from sweep.spec.clusters import Cluster, cluster_of, load_cluster
-
-        if self.scheduler is not None:
-            raise ClusterError("a scheduler and a cluster are both named: leave out one")
-        given: Any = self.cluster
-        if not isinstance(given, Cluster):
-            given = cluster_of(given) if isinstance(given, Mapping) else load_cluster(given)
-        return _of_workers(given, self.workers)
 
     def _leaves_it_open(self, spec: Spec | SceneSpec) -> bool:
         """Tell whether nothing is said that takes workers, and the work takes none."""
@@ -166,8 +167,6 @@ class RunOptions:
 
 def _of_workers(cluster: AnyCluster, workers: int | None) -> AnyCluster:
     """Fix the number of workers of a cluster, if one is given and they are ours."""
-    from sweep.spec.clusters import Address, Bounds
-
     if workers is None:
         return cluster
     if isinstance(cluster, Address):
