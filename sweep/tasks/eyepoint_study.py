@@ -267,7 +267,12 @@ def scene_map(spec: SceneSpec) -> list[ArrayLayout]:
     low, high = seen[:, :2].min(axis=0), seen[:, :2].max(axis=0)
     room = MARGIN * max(*(high - low), 1.0)
     x, y = _nodes(low - room, high + room)
-    top = max(mesh_top(world), seen[:, 2].max()) + ABOVE
+    tops = [
+        float(mesh.vertices[:, 2].max() + mesh.origin[2])
+        for mesh, body in zip(world.caster.meshes, world.bodies, strict=True)
+        if body is None
+    ]
+    top = max(max(tops, default=0.0), seen[:, 2].max()) + ABOVE
     grid = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), top)], axis=-1).reshape(-1, 3)
     depth = altitude(world, grid, spec.flight().start)
     height = np.where(np.isfinite(depth), top - depth, np.nan).reshape(len(y), len(x))
@@ -296,16 +301,6 @@ def _passed(spec: SceneSpec, world: World, scanner: str) -> np.ndarray:
     hit = np.isfinite(hits.range)
     ground = state.position[hit] + direction[hit] * hits.range[hit, None]
     return np.concatenate([state.position, ground])
-
-
-def mesh_top(world: World) -> float:
-    """Height of the highest vertex of the bodies at rest [m]."""
-    tops = [
-        float(mesh.vertices[:, 2].max() + mesh.origin[2])
-        for mesh, body in zip(world.caster.meshes, world.bodies, strict=True)
-        if body is None
-    ]
-    return max(tops, default=0.0)
 
 
 def _nodes(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -219,9 +219,16 @@ class FlightStudy(GrowingStudy):
         return found
 
     def evaluate(self, block: int) -> Results:
-        """Point cloud, statistics and navigation of a block."""
+        """Point cloud, statistics and navigation of a block; effects are chosen by whole tiles."""
         blocks, part = self.part(block)
-        numbers, shots, eyepoints, selected = self._looked_at(blocks, part)
+        first, stop = (i * blocks.shots_a_cycle for i in (part.cycles.start, part.cycles.stop))
+        begin, end = first // TILE_SHOTS * TILE_SHOTS, -(-stop // TILE_SHOTS) * TILE_SHOTS
+        end = min(end, blocks.total_cycles * blocks.shots_a_cycle)
+        shots, eyepoints = self._seen(part.scanner, range(begin, end))
+        own, numbers = slice(first - begin, stop - begin), np.arange(first, stop)
+        selected = self.select(part, eyepoints, np.arange(begin, end)).some(own)
+        shots = {name: values[own] for name, values in shots.items()}
+        eyepoints = eyepoints.some(own)
         results = shots | self._read(part.scanner, CYCLES, part.cycles)
         results |= {EFFECTS: selected.flags, ERROR: selected.error}
         known = self._known(block, selected) if self.earlier else None
@@ -241,20 +248,6 @@ class FlightStudy(GrowingStudy):
             numbers = np.array(cycle)
             selected = self.select(part, eyepoints, numbers)
             self.look(part, shots, eyepoints, selected, numbers)
-
-    def _looked_at(
-        self, blocks: ScannerBlocks, part: Part
-    ) -> tuple[np.ndarray, Results, Eyepoints, Selected]:
-        """Numbers of a block's shots, what they see, and what is simulated, by whole tiles."""
-        first, stop = (i * blocks.shots_a_cycle for i in (part.cycles.start, part.cycles.stop))
-        begin = first // TILE_SHOTS * TILE_SHOTS
-        end = -(-stop // TILE_SHOTS) * TILE_SHOTS
-        end = min(end, blocks.total_cycles * blocks.shots_a_cycle)
-        shots, eyepoints = self._seen(part.scanner, range(begin, end))
-        own = slice(first - begin, stop - begin)
-        selected = self.select(part, eyepoints, np.arange(begin, end)).some(own)
-        shots = {name: values[own] for name, values in shots.items()}
-        return np.arange(first, stop), shots, eyepoints.some(own), selected
 
     def select(self, part: Part, eyepoints: Eyepoints, numbers: np.ndarray) -> Selected:
         """Effects simulated at shots of these numbers, rising."""

@@ -253,27 +253,24 @@ class Arrays:
             raise ValueError(f"results don't match the block's arrays: {', '.join(odd)}")
 
         def put(name: str) -> tuple[str, bytes]:
-            return self._put(name, positions[name], results[name])
+            """Write a chunk; its path inside the store, and its bytes."""
+            layout, position, values = self.study.layouts[name], positions[name], results[name]
+            whole = tuple(s.stop - s.start for s in layout.region(position))
+            if values.shape != whole:
+                raise ValueError(
+                    f"{name} has shape {values.shape} for its chunk {whole} at {position}: "
+                    "blocks write whole chunks only"
+                )
+            stored, content = chunk_object(name, position), encoded(layout, values)
+            if isinstance(self.path, Path):
+                locations.put(f"{self.path}/{stored}", content)
+            else:
+                (self.path / stored).write_bytes(content)
+            return stored, content
 
         with in_words(self.path):
             stored = each(self.path, put, positions)
         return Written(digest_of(stored), sum(len(content) for _, content in stored))
-
-    def _put(self, name: str, position: tuple[int, ...], values: np.ndarray) -> tuple[str, bytes]:
-        """Write a chunk; its path inside the store, and its bytes."""
-        layout = self.study.layouts[name]
-        whole = tuple(s.stop - s.start for s in layout.region(position))
-        if values.shape != whole:
-            raise ValueError(
-                f"{name} has shape {values.shape} for its chunk {whole} at {position}: "
-                "blocks write whole chunks only"
-            )
-        stored, content = chunk_object(name, position), encoded(layout, values)
-        if isinstance(self.path, Path):
-            locations.put(f"{self.path}/{stored}", content)
-        else:
-            (self.path / stored).write_bytes(content)
-        return stored, content
 
 
 def block_objects(study: Study, block: int) -> list[str]:

@@ -261,7 +261,7 @@ class BlockQueue:
 
     def __init__(self, done: np.ndarray) -> None:
         self.left = int(done.size - np.count_nonzero(done))  # not yet handed out
-        self._fresh = map(int, np.flatnonzero(~done))
+        self._fresh = _numbers(done)
         self._suspects: deque[int] = deque()
         self._returned: deque[int] = deque()
         self.failed: set[int] = set()
@@ -291,6 +291,11 @@ class BlockQueue:
         """
         for block in blocks:
             (self._suspects if block in self.failed else self._returned).append(block)
+
+
+def _numbers(done: np.ndarray, stretch: int = 1 << 16) -> Iterator[int]:
+    for start in range(0, done.size, stretch):
+        yield from (start + np.flatnonzero(~done[start : start + stretch])).tolist()
 
 
 def plain(
