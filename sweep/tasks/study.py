@@ -28,7 +28,7 @@ import numpy as np
 
 if TYPE_CHECKING:
     from sweep.model.outputs import Output
-    from sweep.spec import Axis, SceneSpec, Spec
+    from sweep.spec import SceneSpec, Spec
 
 Results = dict[str, np.ndarray]
 
@@ -264,14 +264,6 @@ BLOCK_POINTS = 1 << 16
 MOST_BLOCKS = 1 << 14
 
 
-def is_geometric(axis: Axis) -> bool:
-    """Tell whether any member of an axis changes where the beamlets fall."""
-    return any(
-        member.path in GEOMETRIC or member.path.startswith(GEOMETRIC_PREFIXES)
-        for member in axis.members
-    )
-
-
 def seconds_a_point(spec: Spec) -> float:
     """Time of the dearest point of a study on one core, by the study alone [s].
 
@@ -322,9 +314,8 @@ class Lattice:
 
     def __init__(self, spec: Spec | SceneSpec) -> None:
         self.fixed: dict[str, float | int | str] = dict(spec.parameters())
-        self._axes = tuple(spec.axes)
-        self.shape = tuple(int(axis.size) for axis in self._axes)
-        self.values = [{m.path: np.asarray(m.values) for m in axis.members} for axis in self._axes]
+        self.shape = tuple(int(axis.size) for axis in spec.axes)
+        self.values = [{m.path: np.asarray(m.values) for m in axis.members} for axis in spec.axes]
         """Values along each dimension by the parameters that they set."""
 
 
@@ -334,9 +325,12 @@ class Grid(Lattice, BlockGrid):
     def __init__(self, spec: Spec) -> None:
         Lattice.__init__(self, spec)
         self.spec = spec
-        self.geometric = tuple(is_geometric(axis) for axis in self._axes)
+        self.geometric = tuple(
+            any(path in GEOMETRIC or path.startswith(GEOMETRIC_PREFIXES) for path in values)
+            for values in self.values
+        )
         most = most_points(spec, math.prod(self.shape))
-        dims = tuple(axis.name for axis in self._axes)
+        dims = tuple(axis.name for axis in spec.axes)
         BlockGrid.__init__(self, dims, self.shape, block_shape(self.shape, self.geometric, most))
 
     def parameters(self, block: int) -> dict[str, Value]:
@@ -358,7 +352,7 @@ class Grid(Lattice, BlockGrid):
         record follows them.
         """
         numbers = np.arange(self.block_size(block)).reshape(self.extent(block))
-        moving = ["target.radial_velocity" in {m.path for m in axis.members} for axis in self._axes]
+        moving = ["target.radial_velocity" in values for values in self.values]
         axes = sorted(
             range(len(self.shape)), key=lambda k: (not self.geometric[k], not moving[k], k)
         )
