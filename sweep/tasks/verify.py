@@ -1,7 +1,7 @@
 """Every byte of a store held against its digests; a finished store copied into few large files.
 
-What a store held before there were results follows from the study, so that any of it can be made
-again, to the same bytes. A copy is checked value by value as it is made.
+Everything that a store held before there were results follows from the study, so that any of it can
+be made again, to the same bytes. A copy is checked value by value as it is made.
 """
 
 from __future__ import annotations
