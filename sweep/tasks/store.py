@@ -486,12 +486,3 @@ def refuse_other_versions(path: str | Location, attributes: dict[str, Any], *, w
             "Its results could not be told apart from new ones. Install those versions to resume "
             "it, or run the study anew into another store."
         )
-
-
-def refuse_altered(path: Location, attributes: dict[str, Any], held: Spec | SceneSpec) -> None:
-    """Refuse a store whose spec no longer is the one that its id was made from."""
-    if held.id != attributes["study_id"]:
-        raise StoreError(
-            f"{path} holds a spec with id {held.id} but says {attributes['study_id']}: "
-            "its attributes were changed after it was made"
-        )
