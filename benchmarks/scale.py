@@ -74,7 +74,7 @@ def filled(directory, n_blocks):
 
 def receipt_lines(n_blocks, points=65_536):
     """Lines of a log, of so many blocks all done."""
-    from sweep.storage.logs import closed
+    from sweep.storage.opening import closed
 
     record = {**vars(receipt(0, points)), "time": round(time.time(), 3)}
     rest = json.dumps(record, separators=(",", ":")).partition(",")[2][:-1]
@@ -89,7 +89,7 @@ def timed(what):
 
 def blocks(n_blocks, store):
     """Seconds of processor time, and memory, that so many blocks take; printed for the parent."""
-    from sweep.storage.logs import read_receipts
+    from sweep.storage.opening import read_receipts
     from sweep.tasks.journal import Journal, listed
     from sweep.tasks.study import Grid
     from sweep.tasks.worker import BlockQueue

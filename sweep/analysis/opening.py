@@ -15,10 +15,9 @@ import xarray as xr
 from sweep.analysis.answers import comparison, errors, limits, physical, probability
 from sweep.model.outputs import RUNNING
 from sweep.spec import SceneSpec, Spec
-from sweep.storage import logs, opening
+from sweep.storage import opening
 from sweep.storage.locations import JOURNAL, Location, located
-from sweep.storage.logs import read_lines, read_receipts
-from sweep.storage.opening import CHECKED, NotAStoreError, readable
+from sweep.storage.opening import CHECKED, NotAStoreError, read_lines, read_receipts, readable
 
 BATCH = "batch"
 PIECE = 2**20
@@ -152,7 +151,7 @@ def refuse_lost(path: Location) -> None:
         name = record.get("object", "")
         if f"{name}/".partition("/c/")[0] in names:
             with suppress(OSError):
-                if logs.digest(path, [name]) == record["digest"]:
+                if opening.digest(path, [name]) == record["digest"]:
                     continue
             raise NotAStoreError(
                 f"{path} has lost {name}, of a coordinate: `sweep verify {path} --repair` puts "

@@ -36,9 +36,7 @@ from sweep.cli.terminal import (
     tell,
     tell_effects,
     warn_before,
-    warn_of_alarms,
-    warn_of_beam,
-    warn_of_path,
+    warn_of,
 )
 from sweep.storage.locations import Location
 
@@ -218,9 +216,7 @@ def plan(spec: Path, workers: int | None) -> None:
     for name, text in lines:
         click.echo(folded(f"{name:>12}  {text}", 2 + len(name)))
     tell_effects(effects)
-    warn_of_beam(study)
-    warn_of_path(study)
-    warn_of_alarms(study)
+    warn_of(study)
 
 
 @main.command()

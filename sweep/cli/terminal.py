@@ -508,10 +508,17 @@ def alarms_told(study: Spec | SceneSpec) -> str:
     return f"in either chirp with probability {any_}, in both chirps {both}"
 
 
-def warn_of_alarms(study: Spec | SceneSpec) -> None:
-    """Say where noise alone raises alarms in more than one shot of a hundred."""
+def warn_of(study: Spec | SceneSpec) -> None:
+    """Warn of a beam too narrow for its aperture, a path beneath the ground, many false alarms."""
     from sweep.analysis.noise_only import alarms_of_study
+    from sweep.spec import SceneSpec
+    from sweep.spec.grid_rules import too_narrow
+    from sweep.tasks.eyepoint_study import beneath
 
+    if narrow := too_narrow(study.parameters_off_axes(), study.axes):
+        tell(f"warning: {narrow}", err=True)
+    if isinstance(study, SceneSpec) and (path := beneath(study)):
+        click.echo(f"warning: {path}", err=True)
     most = max((any_ for any_, _ in alarms_of_study(study)), default=0.0)
     if most > MANY_ALARMS:
         tell(
@@ -521,28 +528,9 @@ def warn_of_alarms(study: Spec | SceneSpec) -> None:
         )
 
 
-def warn_of_beam(study: Spec | SceneSpec) -> None:
-    """Say where a beam is narrower than its aperture makes it."""
-    from sweep.spec.grid_rules import too_narrow
-
-    if told := too_narrow(study.parameters_off_axes(), study.axes):
-        tell(f"warning: {told}", err=True)
-
-
-def warn_of_path(study: Spec | SceneSpec) -> None:
-    """Say where a flight is beneath its ground."""
-    from sweep.spec import SceneSpec
-    from sweep.tasks.eyepoint_study import beneath
-
-    if told := isinstance(study, SceneSpec) and beneath(study):
-        click.echo(f"warning: {told}", err=True)
-
-
 def warn_before(study: Spec | SceneSpec, store: Location) -> None:
-    """Before a run: beam, path, false alarms in many shots, effects forced off that matter."""
-    warn_of_beam(study)
-    warn_of_path(study)
-    warn_of_alarms(study)
+    """Before a run: what :func:`warn_of` has, and effects forced off that matter."""
+    warn_of(study)
     if "off" in study.modes().values():
         warn(effects_of(study, store, costs=False))
 

@@ -44,7 +44,7 @@ from sweep.tasks.progress import BusyError, ClusterError, StoreError, told, work
 from sweep.tasks.session import Outcome, Pool, RunOptions, Session
 from sweep.tasks.store import (
     create,
-    refuse_altered,
+    refuse_damaged,
     refuse_other_study,
     refuse_other_versions,
     refuse_to_replace,
@@ -54,7 +54,6 @@ from sweep.tasks.store import (
 )
 from sweep.tasks.studies import Declared, changed, refuse_unlike, what_is_there
 from sweep.tasks.study import own_functions
-from sweep.tasks.verify import refuse_damaged
 
 #: Seconds between looks at rays that another run casts.
 WAITING = 0.5
@@ -211,7 +210,11 @@ def _refuse_unsound(
 ) -> None:
     """Refuse a store of other versions, or one that is not as it was made."""
     refuse_other_versions(path, attributes, where="this machine")
-    refuse_altered(path, attributes, study.spec)
+    if study.id != attributes["study_id"]:
+        raise StoreError(
+            f"{path} holds a spec with id {study.id} but says {attributes['study_id']}: "
+            "its attributes were changed after it was made"
+        )
     refuse_damaged(path)
 
 

@@ -205,7 +205,7 @@ def world_of(spec: SceneSpec) -> World:
     return spec.world()
 
 
-def altitude(world: World, position: np.ndarray, time: np.ndarray) -> np.ndarray:
+def altitude(world: World, position: np.ndarray, time: float | np.ndarray) -> np.ndarray:
     """Height above what lies straight below positions (n, 3) at times (n,) [m]; inf for nothing."""
     down = np.broadcast_to([0.0, 0.0, -1.0], (len(position), 1, 3))
     return np.asarray(world.caster.bundle(position, down, poses=_poses(world, time)).range)
@@ -232,12 +232,12 @@ def beneath(spec: SceneSpec) -> str:
     )
 
 
-def _poses(world: World, time: float | np.ndarray, at: int | slice = slice(None)) -> list[Any]:
-    """Place and attitude of each body at some times; None of those at rest."""
+def _poses(world: World, time: float | np.ndarray) -> list[Any]:
+    """Place and attitude of each body at a time, or at one for each ray; None of those at rest."""
     from sweep.model.geometry.rays import Pose
 
     states = [None if body is None else body.state(np.atleast_1d(time)) for body in world.bodies]
-    return [None if s is None else Pose(s.position[at], s.attitude[at]) for s in states]
+    return [None if s is None else Pose(s.position, s.attitude) for s in states]
 
 
 def refine(
@@ -267,11 +267,14 @@ def scene_map(spec: SceneSpec) -> list[ArrayLayout]:
     low, high = seen[:, :2].min(axis=0), seen[:, :2].max(axis=0)
     room = MARGIN * max(*(high - low), 1.0)
     x, y = _nodes(low - room, high + room)
-    top = max(mesh_top(world), seen[:, 2].max()) + ABOVE
+    tops = [
+        float(mesh.vertices[:, 2].max() + mesh.origin[2])
+        for mesh, body in zip(world.caster.meshes, world.bodies, strict=True)
+        if body is None
+    ]
+    top = max(max(tops, default=0.0), seen[:, 2].max()) + ABOVE
     grid = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), top)], axis=-1).reshape(-1, 3)
-    down = np.broadcast_to([0.0, 0.0, -1.0], (len(grid), 1, 3))
-    poses = _poses(world, spec.flight().start, 0)
-    depth = world.caster.bundle(grid, down, poses=poses).range
+    depth = altitude(world, grid, spec.flight().start)
     height = np.where(np.isfinite(depth), top - depth, np.nan).reshape(len(y), len(x))
     return [
         ArrayLayout.known(name, dims, values, described("m", long_name), fill=FILLS["f"])
@@ -293,22 +296,11 @@ def _passed(spec: SceneSpec, world: World, scanner: str) -> np.ndarray:
     state = flight.state(flight.start + scan.time)
     direction = rotate(state.attitude, scan.direction)
     # Bodies that move are looked at where they are as the flight begins: it is only a map.
-    hits = world.caster.bundle(
-        state.position, direction[:, None], poses=_poses(world, flight.start, 0)
-    )
+    poses = _poses(world, flight.start)
+    hits = world.caster.bundle(state.position, direction[:, None], poses=poses)
     hit = np.isfinite(hits.range)
     ground = state.position[hit] + direction[hit] * hits.range[hit, None]
     return np.concatenate([state.position, ground])
-
-
-def mesh_top(world: World) -> float:
-    """Height of the highest vertex of the bodies at rest [m]."""
-    tops = [
-        float(mesh.vertices[:, 2].max() + mesh.origin[2])
-        for mesh, body in zip(world.caster.meshes, world.bodies, strict=True)
-        if body is None
-    ]
-    return max(tops, default=0.0)
 
 
 def _nodes(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -39,7 +39,6 @@ from sweep.tasks.study import (
     BlockGrid,
     GrowingStudy,
     Lattice,
-    LatticeGrid,
     Results,
 )
 
@@ -91,7 +90,7 @@ class Part(NamedTuple):
     cycles: range
 
 
-class ScannerBlocks(LatticeGrid):
+class ScannerBlocks(Lattice, BlockGrid):
     """The blocks of one scanner: along the axes, draws and cycles, the last fastest."""
 
     def __init__(self, spec: SceneSpec, scanner: str) -> None:
@@ -151,7 +150,6 @@ class FlightStudy(GrowingStudy):
         self.caster = cache(partial(EyepointStudy, spec, world=world))
         self.scanners = {scanner: ScannerBlocks(spec, scanner) for scanner in spec.scanners}
         self._eyepoints = cache(self._open_eyepoints)
-        self._parameters = cache(self._parameters_along)
 
     @property
     def grids(self) -> list[ScannerBlocks]:
@@ -221,9 +219,16 @@ class FlightStudy(GrowingStudy):
         return found
 
     def evaluate(self, block: int) -> Results:
-        """Point cloud, statistics and navigation of a block."""
+        """Point cloud, statistics and navigation of a block; effects are chosen by whole tiles."""
         blocks, part = self.part(block)
-        numbers, shots, eyepoints, selected = self._looked_at(blocks, part)
+        first, stop = (i * blocks.shots_a_cycle for i in (part.cycles.start, part.cycles.stop))
+        begin, end = first // TILE_SHOTS * TILE_SHOTS, -(-stop // TILE_SHOTS) * TILE_SHOTS
+        end = min(end, blocks.total_cycles * blocks.shots_a_cycle)
+        shots, eyepoints = self._seen(part.scanner, range(begin, end))
+        own, numbers = slice(first - begin, stop - begin), np.arange(first, stop)
+        selected = self.select(part, eyepoints, np.arange(begin, end)).some(own)
+        shots = {name: values[own] for name, values in shots.items()}
+        eyepoints = eyepoints.some(own)
         results = shots | self._read(part.scanner, CYCLES, part.cycles)
         results |= {EFFECTS: selected.flags, ERROR: selected.error}
         known = self._known(block, selected) if self.earlier else None
@@ -244,24 +249,6 @@ class FlightStudy(GrowingStudy):
             selected = self.select(part, eyepoints, numbers)
             self.look(part, shots, eyepoints, selected, numbers)
 
-    def selected(self, block: int) -> Selected:
-        """Effects simulated at a block's shots."""
-        return self._looked_at(*self.part(block))[-1]
-
-    def _looked_at(
-        self, blocks: ScannerBlocks, part: Part
-    ) -> tuple[np.ndarray, Results, Eyepoints, Selected]:
-        """Numbers of a block's shots, what they see, and what is simulated, by whole tiles."""
-        first, stop = (i * blocks.shots_a_cycle for i in (part.cycles.start, part.cycles.stop))
-        begin = first // TILE_SHOTS * TILE_SHOTS
-        end = -(-stop // TILE_SHOTS) * TILE_SHOTS
-        end = min(end, blocks.total_cycles * blocks.shots_a_cycle)
-        shots, eyepoints = self._seen(part.scanner, range(begin, end))
-        own = slice(first - begin, stop - begin)
-        selected = self.select(part, eyepoints, np.arange(begin, end)).some(own)
-        shots = {name: values[own] for name, values in shots.items()}
-        return np.arange(first, stop), shots, eyepoints.some(own), selected
-
     def select(self, part: Part, eyepoints: Eyepoints, numbers: np.ndarray) -> Selected:
         """Effects simulated at shots of these numbers, rising."""
         number = len(numbers)
@@ -271,7 +258,15 @@ class FlightStudy(GrowingStudy):
 
     def planned(self, part: Part, eyepoints: Eyepoints, tiles: np.ndarray) -> ShotsPlan | None:
         """Plans of shots whose tiles have these numbers, (n,), rising."""
-        return self._plan(eyepoints, tiles, self.parameters_at(part))
+        return plan_shots(
+            eyepoints,
+            tiles,
+            self.parameters_at(part),
+            self.surfaces,
+            modes=self.spec.modes(),
+            rotating=self.spec.rotating,
+            rays_by_tolerance=self.spec.rays_by_tolerance,
+        )
 
     def look(
         self,
@@ -438,14 +433,12 @@ class FlightStudy(GrowingStudy):
 
     def parameters_at(self, part: Part) -> Mapping[str, Any]:
         """SI values of all parameters at a block's place along the axes."""
-        return self._parameters(part.axes)
-
-    def _parameters_along(self, place: tuple[int, ...]) -> Mapping[str, Any]:
-        parameters: dict[str, Any] = dict(self.spec.parameters())
-        for axis, index in zip(self.spec.axes, place, strict=True):
-            for member in axis.members:
-                parameters[member.path] = np.asarray(member.values)[index].item()
-        return parameters
+        blocks = self.scanners[part.scanner]
+        return blocks.fixed | {
+            path: along[index].item()
+            for values, index in zip(blocks.values, part.axes, strict=False)  # nor draw nor cycle
+            for path, along in values.items()
+        }
 
     @cached_property
     def error_floor(self) -> ErrorFloor:
@@ -466,16 +459,6 @@ class FlightStudy(GrowingStudy):
     def rays_accuracy(self) -> Accuracy | None:
         """Says how many rays a shot needs; None where their number is given."""
         return Accuracy.of(self.spec.parameters()) if self.spec.rays_by_tolerance else None
-
-    @cached_property
-    def _plan(self) -> Callable[..., ShotsPlan | None]:
-        return partial(
-            plan_shots,
-            surfaces=self.surfaces,
-            modes=self.spec.modes(),
-            rotating=self.spec.rotating,
-            rays_by_tolerance=self.spec.rays_by_tolerance,
-        )
 
     def _open_eyepoints(self, scanner: str) -> Mapping[str, Any]:
         """Arrays of a scanner's eyepoints by name, opened once; their weights read."""

@@ -362,6 +362,12 @@ class GridStudy(GrowingStudy):
     def outputs(self) -> list[ArrayLayout]:
         """Return an array for each output of the model, and for the effects simulated."""
         sizes = {BATCH: len(batch_sizes(self.spec)), "sum": RUNNING_COLUMNS}
+        off_axes = self.spec.parameters_off_axes()
+        promise = {  # that half-widths are held against
+            name: float(off_axes[f"accuracy.{name}"])
+            for name in ("tolerance", "confidence")
+            if f"accuracy.{name}" in off_axes
+        }
         found = []
         for name, output in outputs_of(self.spec).items():
             layout = self.grid.array(name, output, self.grid.dims + output.dims, sizes)
@@ -369,15 +375,9 @@ class GridStudy(GrowingStudy):
             if name == EFFECTS:
                 about |= flag_attributes()
             elif name in ACCURACY_OUTPUTS and output.dtype != "int64":
-                about |= self._promise()
+                about |= promise
             found.append(replace(layout, attributes=about))
         return found
-
-    def _promise(self) -> dict[str, float]:
-        """Tolerance and confidence that half-widths are held against, but for those on axes."""
-        promised = {f"accuracy.{name}": name for name in ("tolerance", "confidence")}
-        off_axes = self.spec.parameters_off_axes()
-        return {n: float(off_axes[path]) for path, n in promised.items() if path in off_axes}
 
     def evaluate(
         self,

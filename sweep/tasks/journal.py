@@ -47,10 +47,9 @@ from sweep.storage.locations import (
     Tag,
     put_whole,
 )
-from sweep.storage.logs import (
+from sweep.storage.opening import (
     RECEIPTS,
     body_of,
-    damaged_lines,
     open_log,
     read_lines,
     read_receipts,
@@ -87,7 +86,7 @@ class Receipt:
     block: int
     points: int
     bytes: int  # as stored
-    digest: str  # of the bytes stored, `logs.digest`
+    digest: str  # of the bytes stored, `opening.digest`
     seconds: float  # evaluating and writing
     write_seconds: float
     host: str
@@ -210,7 +209,7 @@ def forget_older(store_path: Path) -> None:
 def refuse_damaged_recipe(store_path: Location) -> None:
     """Refuse a store that no longer says where the files of its study are."""
     path = store_path / JOURNAL / RECIPE
-    if damaged_lines(path):
+    if any(record is None for _, record in read_sealed(path)):
         raise StoreError(
             f"{path} is damaged, and with it where the files of the study are: "
             f"`sweep resume {store_path} --spec FILE` puts it down anew"

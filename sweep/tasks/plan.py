@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import compress
@@ -287,7 +287,6 @@ class EffectRow:
     """An effect in a study."""
 
     name: str
-    about: str
     mode: str
     share: float  # of the points at which it is simulated
     where: str  # the part of the study that holds these
@@ -405,7 +404,6 @@ def _table(
     rows = tuple(
         EffectRow(
             name=effect.name,
-            about=effect.about,
             mode=modes[effect.name],
             share=float(simulated.sum() / points),
             where=where(simulated > 0) if simulated.any() else "",
@@ -487,18 +485,25 @@ def _seconds_of(
 
 def _cost(spec: Spec, sample: Callable[[int], _Sample], tiles: np.ndarray, name: str) -> float:
     """Share of the time of points that an effect takes, from points with it and without."""
+
+    def measured(tile: int) -> tuple[float, float]:
+        parameters, number, effects = sample(tile)
+        without = tuple(n for n in effects if n != name)
+        with_it = _seconds_of(spec, parameters, number, effects)
+        return with_it, _seconds_of(spec, parameters, number, without)
+
+    return _share(map(measured, _spread(tiles.tolist(), COST_TILES)))
+
+
+def _share(times: Iterable[tuple[float, float]]) -> float:
+    """Share of the time that an effect takes, from times with it and without, few if these tell."""
     spent = total = 0.0
-    for tile in _spread(tiles, COST_TILES):
-        parameters, number, effects = sample(int(tile))
-        with_it, without = (
-            _seconds_of(spec, parameters, number, some)
-            for some in (effects, tuple(n for n in effects if n != name))
-        )
+    for with_it, without in times:
         spent += max(with_it - without, 0.0)
         total += with_it
         if total > COST_SECONDS:
             break
-    return spent / total
+    return spent / total if total else math.nan
 
 
 class _Look(NamedTuple):
@@ -537,9 +542,8 @@ def _looks(study: FlightStudy) -> list[_Look]:
 def _flight_cost(study: FlightStudy, looks: Sequence[_Look], name: str) -> float:
     """Share of the time of shots that an effect takes, from cycles with it and without."""
     nothing, flag = np.uint32(0), np.uint32(1 << NAMES.index(name))
-    spent = total = 0.0
-    there = [look for look in looks if (look.selected.flags & flag).any()]
-    for look in _spread(there, COST_LOOKS):
+
+    def measured(look: _Look) -> tuple[float, float]:
         each = study.scanners[look.part.scanner].shots_a_cycle
         having = np.flatnonzero((look.selected.flags & flag).reshape(-1, each).any(axis=1))
         for number in (1, -(-COST_POINTS // each)):
@@ -547,12 +551,10 @@ def _flight_cost(study: FlightStudy, looks: Sequence[_Look], name: str) -> float
             with_it = _seconds(study, look, cycles, less=nothing)
             if with_it > COST_SECONDS / 2:  # so few tell enough
                 break
-        without = _seconds(study, look, cycles, less=flag)
-        spent += max(with_it - without, 0.0)
-        total += with_it
-        if total > COST_SECONDS:
-            break
-    return spent / total if total else math.nan
+        return with_it, _seconds(study, look, cycles, less=flag)
+
+    there = [look for look in looks if (look.selected.flags & flag).any()]
+    return _share(map(measured, _spread(there, COST_LOOKS)))
 
 
 def _spread(items: Sequence[Any] | np.ndarray, most: int) -> list[Any]:

@@ -132,10 +132,15 @@ class _Counting(Progress):
     def begin(self, *, points: int, done: float, unit: str) -> None:
         self._points, self._done, self._before, self._unit = points, done, done, unit
         self._begun = time.monotonic()
+        self._show(begun=True)
 
     def advance(self, *, points: float, failed: int) -> None:
         self._done += points
         self._failed += failed
+        self._show()
+
+    def _show(self, *, begun: bool = False) -> None:
+        """Show how far it is."""
 
     def at_work(self, *, workers: int, stored: int) -> None:
         from rich.filesize import decimal
@@ -166,26 +171,16 @@ class Lines(_Counting):
         super().__init__()
         self._said = time.monotonic()
 
-    def begin(self, *, points: int, done: float, unit: str) -> None:
-        """First line."""
-        super().begin(points=points, done=done, unit=unit)
-        self._line()
-
-    def advance(self, *, points: float, failed: int) -> None:
-        """Another line where it is time for one."""
-        super().advance(points=points, failed=failed)
-        if time.monotonic() - self._said >= LINE_EVERY:
-            self._line()
+    def _show(self, *, begun: bool = False) -> None:
+        if begun or time.monotonic() - self._said >= LINE_EVERY:
+            self.end()
 
     def say(self, text: str) -> None:
         """Print a line of its own."""
         print(text, file=sys.stderr, flush=True)
 
     def end(self) -> None:
-        """Last line."""
-        self._line()
-
-    def _line(self) -> None:
+        """Say how far it is."""
         self._said = time.monotonic()
         done, rate, work, failures = self._words.values()
         left = (self._points - self._done) / self._rate if self._rate > 0 else 0.0
@@ -221,23 +216,14 @@ class Bar(_Counting):
         )
         self._task: TaskID | None = None
 
-    def begin(self, *, points: int, done: float, unit: str) -> None:
-        """Show the bar."""
-        super().begin(points=points, done=done, unit=unit)
-        self._task = self._bar.add_task(unit, total=points, completed=int(done), **self._words)
-        self._bar.start()
-
-    def advance(self, *, points: float, failed: int) -> None:
-        """Move the bar."""
-        super().advance(points=points, failed=failed)
-        if self._task is not None and (points or failed):
-            self._bar.update(self._task, completed=self._done, **self._words)
-
-    def at_work(self, *, workers: int, stored: int) -> None:
-        """Shown next to the rate."""
-        super().at_work(workers=workers, stored=stored)
+    def _show(self, *, begun: bool = False) -> None:
+        if begun:
+            self._task = self._bar.add_task(
+                self._unit, total=self._points, completed=int(self._done), **self._words
+            )
+            self._bar.start()
         if self._task is not None:
-            self._bar.update(self._task, **self._words)
+            self._bar.update(self._task, completed=self._done, **self._words)
 
     def say(self, text: str) -> None:
         """Print a line above the bar."""

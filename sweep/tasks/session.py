@@ -12,6 +12,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +31,7 @@ from sweep.spec.clusters import (
 )
 from sweep.spec.sections import Execution
 from sweep.storage.locations import Location, ObjectStoreError
-from sweep.storage.logs import read_receipts
+from sweep.storage.opening import read_receipts
 from sweep.tasks import journal, store
 from sweep.tasks.journal import Failure, Journal, Lock, Look, Receipt, given_up
 from sweep.tasks.progress import (
@@ -235,15 +236,12 @@ class Pool(ExitStack):
         if self.is_plain:
             if options.performance_report is not None:
                 self.told.say("no performance report: a plain loop has no scheduler to tell of it")
-            return plain(job, queue, self._stopping, seen)
+            return plain(job, queue, lambda: self.interrupts.stopping, seen)
         from sweep.tasks.scheduler import Scheduler
 
         client, slots, _ = self.connect()
         scheduler = Scheduler(client, slots, job, queue, seen=seen, say=self.told.say)
-        return scheduler.answers(self._stopping)
-
-    def _stopping(self) -> bool:
-        return self.interrupts.stopping
+        return scheduler.answers(lambda: self.interrupts.stopping)
 
     def revive(self) -> None:
         """Start workers of this machine again that are gone."""
@@ -398,9 +396,8 @@ class Session:
                 what = "loading the model" + ("" if self._pool.is_plain else ", reaching workers")
                 with working(what, self._told):
                     compiling.start()  # beside the workers' start, which is mostly waiting
-                    answers = self._pool.answers(
-                        str(self._path), self._study.id, blocks, self._is_seen
-                    )
+                    seen = partial(store.is_seen, self._path, self._study)
+                    answers = self._pool.answers(str(self._path), self._study.id, blocks, seen)
                     while compiling.is_alive() and not self._interrupts.stopping:
                         compiling.join(TICK)
                 self._told.begin(
@@ -426,11 +423,6 @@ class Session:
             return
         with suppress(Exception):  # what raises here is a block's failure, recorded as one
             self._study.compile()
-
-    def _is_seen(self, receipt: Receipt, read: bool) -> bool:
-        objects = store.block_objects(self._study, receipt.block)
-        wanted = store.Written(receipt.digest, receipt.bytes)
-        return store.is_seen(self._path, objects, wanted, read=read)
 
     def _take(self, answers: Iterator[Answer], blocks: BlockQueue) -> str:
         told, absence = False, Absence()

@@ -2,7 +2,7 @@
 
 No two blocks share a chunk, so writers need no locks between them. Only `.sweep/`, the journal,
 knows hosts and times: every other byte follows from the study, and from the versions of the
-software.
+software. All that a store held before there were results is listed there with digests.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from contextlib import contextmanager, suppress
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import google_crc32c
 import numpy as np
@@ -44,16 +44,23 @@ from sweep.storage.locations import (
     settle,
     successor,
 )
-from sweep.storage.logs import digest, digest_of, read_lines, sealed
-from sweep.storage.opening import LAYOUT, MANIFEST, ZSTD_LEVEL
-from sweep.tasks.journal import LOCK, LOGS, REPLACES, Lock, read_recipe, write_recipe
+from sweep.storage.opening import (
+    LAYOUT,
+    MANIFEST,
+    ZSTD_LEVEL,
+    digest,
+    digest_of,
+    read_lines,
+    read_sealed,
+    sealed,
+)
+from sweep.tasks.journal import LOCK, LOGS, REPLACES, Lock, Receipt, read_recipe, write_recipe
 from sweep.tasks.progress import BusyError, StoreError
 from sweep.tasks.study import CONVENTIONS, ArrayLayout, Content, Study
 
-if TYPE_CHECKING:
-    from zarr.core.array_spec import ArrayConfigLike
-
 ROOT = "zarr.json"
+
+LIST = f"{JOURNAL}/{MANIFEST}"
 
 #: Object that says that what lies at a place in an object store is a store half made or removed.
 UNFINISHED = "partial"
@@ -64,10 +71,6 @@ CODECS = [ZstdCodec(level=ZSTD_LEVEL), Crc32cCodec()]
 _ZSTD = Zstd(level=ZSTD_LEVEL)
 
 _libc = ctypes.CDLL(None, use_errno=True)
-
-WRITTEN_WHOLE: ArrayConfigLike = {
-    "write_empty_chunks": True
-}  # else a chunk equal to the fill looks undone
 
 
 def create(
@@ -250,27 +253,24 @@ class Arrays:
             raise ValueError(f"results don't match the block's arrays: {', '.join(odd)}")
 
         def put(name: str) -> tuple[str, bytes]:
-            return self._put(name, positions[name], results[name])
+            """Write a chunk; its path inside the store, and its bytes."""
+            layout, position, values = self.study.layouts[name], positions[name], results[name]
+            whole = tuple(s.stop - s.start for s in layout.region(position))
+            if values.shape != whole:
+                raise ValueError(
+                    f"{name} has shape {values.shape} for its chunk {whole} at {position}: "
+                    "blocks write whole chunks only"
+                )
+            stored, content = chunk_object(name, position), encoded(layout, values)
+            if isinstance(self.path, Path):
+                locations.put(f"{self.path}/{stored}", content)
+            else:
+                (self.path / stored).write_bytes(content)
+            return stored, content
 
         with in_words(self.path):
             stored = each(self.path, put, positions)
         return Written(digest_of(stored), sum(len(content) for _, content in stored))
-
-    def _put(self, name: str, position: tuple[int, ...], values: np.ndarray) -> tuple[str, bytes]:
-        """Write a chunk; its path inside the store, and its bytes."""
-        layout = self.study.layouts[name]
-        whole = tuple(s.stop - s.start for s in layout.region(position))
-        if values.shape != whole:
-            raise ValueError(
-                f"{name} has shape {values.shape} for its chunk {whole} at {position}: "
-                "blocks write whole chunks only"
-            )
-        stored, content = chunk_object(name, position), encoded(layout, values)
-        if isinstance(self.path, Path):
-            locations.put(f"{self.path}/{stored}", content)
-        else:
-            (self.path / stored).write_bytes(content)
-        return stored, content
 
 
 def block_objects(study: Study, block: int) -> list[str]:
@@ -318,6 +318,70 @@ def refuse_links(path: Location) -> None:
                 raise StoreError(f"{entry.path} is no plain file: sweep made none such, remove it")
 
 
+class Damage(NamedTuple):
+    """An object of a store that is not as it was written."""
+
+    object: str  # path inside the store; a line of a log by its number
+    what: str  # what is wrong with it
+    block: int = -1  # that it belongs to
+    mended_by: str = "resume"  # "repair" what was there before results, "hand" what is surplus
+
+
+def digests(path: Location) -> dict[str, str]:
+    """Digests of what a store was made of, by object, as far as its list is undamaged."""
+    return {r["object"]: r["digest"] for r in read_lines(path / LIST) if "object" in r}
+
+
+def damages(path: Location) -> list[Damage]:
+    """Objects that a store was made of, and lines of their list, that are not as they were."""
+    lines = [record for _, record in read_sealed(path / LIST)]
+    if not lines:
+        return [Damage(LIST, "is missing or empty", mended_by="repair")]
+    found = [
+        Damage(f"{LIST} line {n}", "is damaged", mended_by="repair")
+        for n, each in enumerate(lines, 1)
+        if each is None
+    ]
+    whole = [record for record in lines if record]
+    if not found and whole[0].get("objects") != len(whole) - 1:
+        found.append(Damage(LIST, "lacks lines", mended_by="repair"))
+    return found + [
+        Damage(name, what, mended_by="repair")
+        for name, known in digests(path).items()
+        if (what := altered(path, name, known))
+    ]
+
+
+def altered(path: Location, name: str, known: str) -> str:
+    """Damage of an object of the template, whose digest is known."""
+
+    def damage_of(content: bytes) -> str:
+        return "" if digest_of([(name, content)]) == known else "is not as it was made"
+
+    return wrong_with(path / name, damage_of)
+
+
+def refuse_damaged(path: Location) -> None:
+    """Refuse a store whose template is not as it was made: what is added might not fit it."""
+    refuse_links(path)
+    if found := damages(path):
+        listed = "\n".join(f"  {damage.object} {damage.what}" for damage in found)
+        raise StoreError(
+            f"{path} is not as it was made:\n{listed}\n"
+            f"`sweep verify {path} --repair` puts back what was there."
+        )
+
+
+def wrong_with(place: Location, damage_of: Callable[[bytes], str]) -> str:
+    """Damage of an object in words, by what it holds; empty where there is none."""
+    try:
+        return damage_of(place.read_bytes())
+    except (FileNotFoundError, NotADirectoryError):
+        return "is missing"
+    except OSError as error:
+        return f"can't be read: {error.strerror}"
+
+
 def _entries(folder: str) -> Iterator[os.DirEntry[str]]:
     """Everything below a folder but folders."""
     with os.scandir(folder) as entries:
@@ -328,13 +392,14 @@ def _entries(folder: str) -> Iterator[os.DirEntry[str]]:
                 yield entry
 
 
-def is_seen(path: Location, objects: list[str], wanted: Written, *, read: bool) -> bool:
+def is_seen(path: Location, study: Study, receipt: Receipt, read: bool) -> bool:
     """Tell whether a block that a worker has written is here: by size, or digest where `read`."""
+    objects = block_objects(study, receipt.block)
     try:
         if read:
-            return digest(path, objects) == wanted.digest
+            return digest(path, objects) == receipt.digest
         if isinstance(path, Path):
-            return sum(os.stat(f"{path}/{name}").st_size for name in objects) == wanted.bytes
+            return sum(os.stat(f"{path}/{name}").st_size for name in objects) == receipt.bytes
     except (FileNotFoundError, NotADirectoryError):
         return False
     return (path / objects[-1]).size() > 0
@@ -420,13 +485,4 @@ def refuse_other_versions(path: str | Location, attributes: dict[str, Any], *, w
             f"{path} was begun with other versions than {where} has:\n{listed}\n"
             "Its results could not be told apart from new ones. Install those versions to resume "
             "it, or run the study anew into another store."
-        )
-
-
-def refuse_altered(path: Location, attributes: dict[str, Any], held: Spec | SceneSpec) -> None:
-    """Refuse a store whose spec no longer is the one that its id was made from."""
-    if held.id != attributes["study_id"]:
-        raise StoreError(
-            f"{path} holds a spec with id {held.id} but says {attributes['study_id']}: "
-            "its attributes were changed after it was made"
         )

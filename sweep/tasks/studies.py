@@ -20,7 +20,7 @@ from sweep.spec import SceneSpec, Spec, SpecError, difference, from_stored
 from sweep.spec.grid_rules import is_method
 from sweep.spec.rules import Mistake
 from sweep.spec.sections import parameter_rules
-from sweep.storage import logs, opening
+from sweep.storage import opening
 from sweep.storage.locations import Location, located, real
 from sweep.storage.opening import open_group
 from sweep.tasks import store
@@ -157,7 +157,7 @@ class Reuse:
         """Results of an older block, each with its chunk's shape; None where damaged or lost."""
         try:
             objects = store.block_objects(self.older, block)
-            if logs.digest(self._path, objects).encode() != self._digests[block]:
+            if opening.digest(self._path, objects).encode() != self._digests[block]:
                 return None
             return {name: self.chunk(name, block) for name in self.older.chunks(block)}
         except DAMAGED:

@@ -28,7 +28,7 @@ import numpy as np
 
 if TYPE_CHECKING:
     from sweep.model.outputs import Output
-    from sweep.spec import Axis, SceneSpec, Spec
+    from sweep.spec import SceneSpec, Spec
 
 Results = dict[str, np.ndarray]
 
@@ -264,14 +264,6 @@ BLOCK_POINTS = 1 << 16
 MOST_BLOCKS = 1 << 14
 
 
-def is_geometric(axis: Axis) -> bool:
-    """Tell whether any member of an axis changes where the beamlets fall."""
-    return any(
-        member.path in GEOMETRIC or member.path.startswith(GEOMETRIC_PREFIXES)
-        for member in axis.members
-    )
-
-
 def seconds_a_point(spec: Spec) -> float:
     """Time of the dearest point of a study on one core, by the study alone [s].
 
@@ -322,42 +314,35 @@ class Lattice:
 
     def __init__(self, spec: Spec | SceneSpec) -> None:
         self.fixed: dict[str, float | int | str] = dict(spec.parameters())
-        self._axes = tuple(spec.axes)
-        self.shape = tuple(int(axis.size) for axis in self._axes)
-        self.values = [{m.path: np.asarray(m.values) for m in axis.members} for axis in self._axes]
+        self.shape = tuple(int(axis.size) for axis in spec.axes)
+        self.values = [{m.path: np.asarray(m.values) for m in axis.members} for axis in spec.axes]
         """Values along each dimension by the parameters that they set."""
 
 
-class LatticeGrid(Lattice, BlockGrid):
-    """Points along axes, and perhaps further dimensions, cut into blocks."""
-
-
-class Grid(LatticeGrid):
+class Grid(Lattice, BlockGrid):
     """Points of a study over a grid, their parameters, and the blocks they are computed in."""
 
     def __init__(self, spec: Spec) -> None:
         Lattice.__init__(self, spec)
         self.spec = spec
-        self.geometric = tuple(is_geometric(axis) for axis in self._axes)
+        self.geometric = tuple(
+            any(path in GEOMETRIC or path.startswith(GEOMETRIC_PREFIXES) for path in values)
+            for values in self.values
+        )
         most = most_points(spec, math.prod(self.shape))
-        dims = tuple(axis.name for axis in self._axes)
+        dims = tuple(axis.name for axis in spec.axes)
         BlockGrid.__init__(self, dims, self.shape, block_shape(self.shape, self.geometric, most))
 
     def parameters(self, block: int) -> dict[str, Value]:
         """Parameters of a block's points by path: scalars, or arrays (n,) in C order over it."""
-        slices = self.block(block)
-        index = [along.ravel() for along in np.indices(self.extent(block))]
-        return self._select([s.start + along for s, along in zip(slices, index, strict=True)])
+        return self.parameters_at(self.numbers(block, np.arange(self.block_size(block))))
 
     def parameters_at(self, points: np.ndarray) -> dict[str, Value]:
         """Parameters of points given by their numbers in C order over the whole grid, (n,)."""
-        return self._select(list(np.unravel_index(points, self.shape)) if self.shape else [])
-
-    def _select(self, indices: list[np.ndarray]) -> dict[str, Value]:
         selected: dict[str, Value] = dict(self.fixed)
+        indices = np.unravel_index(points, self.shape) if self.shape else ()
         for values, along in zip(self.values, indices, strict=True):
-            for path, array in values.items():
-                selected[path] = array[along]
+            selected |= {path: array[along] for path, array in values.items()}
         return selected
 
     def geometry_order(self, block: int) -> np.ndarray:
@@ -367,7 +352,7 @@ class Grid(LatticeGrid):
         record follows them.
         """
         numbers = np.arange(self.block_size(block)).reshape(self.extent(block))
-        moving = ["target.radial_velocity" in {m.path for m in axis.members} for axis in self._axes]
+        moving = ["target.radial_velocity" in values for values in self.values]
         axes = sorted(
             range(len(self.shape)), key=lambda k: (not self.geometric[k], not moving[k], k)
         )
@@ -385,7 +370,8 @@ class Content(Protocol):
         """Attributes of its store, but for versions; the same wherever it is made."""
 
     def groups(self) -> dict[str, dict[str, Any]]:
-        """Return groups of its store and their attributes."""
+        """Return groups of its store and their attributes; none but the root."""
+        return {}
 
     def arrays(self) -> list[ArrayLayout]:
         """Every array of its store."""
@@ -396,10 +382,6 @@ class Study(Content, ABC):
 
     unit = "points"
     """Name of its points, in the plural."""
-
-    def groups(self) -> dict[str, dict[str, Any]]:
-        """Return groups of its store and their attributes; none but the root."""
-        return {}
 
     @property
     @abstractmethod

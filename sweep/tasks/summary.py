@@ -17,17 +17,16 @@ from sweep.model.accuracy import Accuracy
 from sweep.model.outputs import PROMISED
 from sweep.model.unsupported import UnsupportedShot
 from sweep.storage.locations import PACKED, Location, files_below, located
-from sweep.storage.logs import read_receipts
-from sweep.storage.opening import open_group
+from sweep.storage.opening import open_group, read_receipts
 from sweep.tasks import journal, studies
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.grid_study import GridStudy, evaluate_points, select, with_few_draws
 from sweep.tasks.journal import begun_points, receipted
 from sweep.tasks.progress import StoreError
-from sweep.tasks.study import Study
+from sweep.tasks.study import TOLERANCE, Study
 
 if TYPE_CHECKING:
-    from sweep.spec import Axis, Spec
+    from sweep.spec import Axis
 
 #: Probability of detection above which a point counts as detected.
 DETECTED = 0.9
@@ -78,7 +77,8 @@ def summary(store: str | Location) -> tuple[str, list[Row], float]:
     blocks = _some(done, int(np.prod(study.grid.block_shape)))
     share = len(blocks) / max(len(done), 1)
     axis = study.spec.axes[0] if study.spec.axes else None
-    edges = _edges(axis) if axis else np.array([0, 1])
+    size = axis.size if axis else 1  # in parts of a value each, or of several where there are many
+    edges = np.linspace(0, size, min(size, MOST_ROWS) + 1).astype(int)
     found: list[list[np.ndarray]] = [[np.empty((2, 0))] for _ in edges[1:]]
     for place, values in pieces(path, study, ("pd_shot", "pd_doppler"), blocks):
         both = np.stack(values).reshape(2, -1, *values[0].shape[1:])
@@ -128,11 +128,6 @@ def _some(done: np.ndarray, block_points: int) -> np.ndarray:
     if len(done) <= most:
         return done
     return np.sort(np.random.default_rng(0).choice(done, most, replace=False))
-
-
-def _edges(axis: Axis) -> np.ndarray:
-    """Edges of the parts of an axis: its values, or stretches of them where there are many."""
-    return np.linspace(0, axis.size, min(axis.size, MOST_ROWS) + 1).astype(int)
 
 
 def _name(axis: Axis, start: int, stop: int) -> str:
@@ -296,9 +291,7 @@ def accuracy_table(store: str | Location) -> list[ErrorRow]:
     if not isinstance(study, GridStudy) or not study.spec.draws.any:
         return []
     errors = {name: f"{name}_half_width" for name in PROMISED}
-    return [
-        row for row in _rows(path, study, errors, "n_draws", _tolerance(study.spec)) if row.points
-    ]
+    return [row for row in _rows(path, study, errors, "n_draws", _tolerance(study)) if row.points]
 
 
 def rays_table(store: str | Location) -> list[ErrorRow]:
@@ -306,7 +299,7 @@ def rays_table(store: str | Location) -> list[ErrorRow]:
     path = located(store)
     _, study = studies.read(path)
     if isinstance(study, GridStudy):
-        tolerance = Accuracy(_tolerance(study.spec)).for_beamlets
+        tolerance = Accuracy(_tolerance(study)).for_beamlets
         tolerance = np.maximum(tolerance, Accuracy.least_rays_tolerance)
         rows = _rows(path, study, {"": "beamlets_error"}, "beamlets", tolerance)
         return [row for row in rows if row.missed]
@@ -345,13 +338,12 @@ def _rows(
     return found
 
 
-def _tolerance(spec: Spec) -> np.ndarray:
+def _tolerance(study: GridStudy) -> np.ndarray:
     """Tolerances that broadcast over the grid."""
-    for k, axis in enumerate(spec.axes):
-        for member in axis.members:
-            if member.path == "accuracy.tolerance":
-                return np.asarray(member.values).reshape(-1, *(1,) * (len(spec.axes) - k - 1))
-    return np.asarray(spec.accuracy.tolerance)
+    for further, values in enumerate(reversed(study.grid.values)):
+        if TOLERANCE in values:
+            return values[TOLERANCE].reshape(-1, *(1,) * further)
+    return np.asarray(study.spec.accuracy.tolerance)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,8 +1,7 @@
 """Every byte of a store held against its digests; a finished store copied into few large files.
 
-All that a store held before there were results is listed with digests in the journal's directory.
-It follows from the study, so that any of it can be made again, to the same bytes. A copy is checked
-value by value as it is made.
+Everything that a store held before there were results follows from the study, so that any of it can
+be made again, to the same bytes. A copy is checked value by value as it is made.
 """
 
 from __future__ import annotations
@@ -10,11 +9,11 @@ from __future__ import annotations
 import math
 import re
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import google_crc32c
 import numpy as np
@@ -36,19 +35,17 @@ from sweep.storage.locations import (
     settle,
     zarr_store,
 )
-from sweep.storage.logs import digest, digest_of, read_lines, read_sealed, sealed
-from sweep.storage.opening import MANIFEST, open_group
+from sweep.storage.opening import digest, digest_of, open_group, read_lines, read_sealed, sealed
 from sweep.tasks import journal, store, studies
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.journal import LOGS, RECIPE, committed, read_recipe
 from sweep.tasks.progress import Progress, StoreError, chosen, told
+from sweep.tasks.store import Damage, altered, wrong_with
 from sweep.tasks.studies import AnyStudy
 from sweep.tasks.study import ArrayLayout, BlockGrid, Study
 
 if TYPE_CHECKING:
     from sweep.spec import SceneSpec, Spec
-
-LIST = f"{JOURNAL}/{MANIFEST}"
 
 #: Blocks that are read at a time, and by how many threads: reading is waiting.
 BATCH = 256
@@ -125,14 +122,14 @@ def _study(path: Location, spec: Spec | SceneSpec | None) -> AnyStudy | None:
 
 
 def _verify(path: Location, study: AnyStudy | None, repair: bool, shown: Progress) -> Report:
-    found, restored = damages(path), []
+    found, restored = store.damages(path), []
     if found and study and repair:
         store.refuse_foreign(path)  # a lock would be the first thing of ours in it
         with journal.Lock(path):
             found, restored = [], restore(path, study)
     logs = _of_logs(path)
     blocks = list(_of_blocks(path, study, shown)) if study else []
-    surplus = [] if damages(path) else _surplus(path, study)
+    surplus = [] if store.damages(path) else _surplus(path, study)
     return Report(
         store=path,
         blocks=study.n_blocks if study else 0,
@@ -163,7 +160,7 @@ def _of_logs(path: Location) -> list[Damage]:
 
 def _surplus(path: Location, study: AnyStudy | None) -> Iterator[Damage]:
     """Files of a store that are no part of it; drafts of writers that were killed are not told."""
-    listed = digests(path)
+    listed = store.digests(path)
     grids = {name: owner.shape for name, owner in study.owners().items()} if study else {}
     for name in names_below(path):
         if name in listed or name.startswith(f"{JOURNAL}/") or name.endswith(PARTIAL):
@@ -204,7 +201,9 @@ def _of_block(path: Location, study: Study, block: int, known: bytes) -> list[Da
     except OSError:
         pass  # told below, object by object
     found = [
-        Damage(name, what, block) for name in objects if (what := _wrong(path / name, _of_chunk))
+        Damage(name, what, block)
+        for name in objects
+        if (what := wrong_with(path / name, _of_chunk))
     ]
     count = f"one of its {len(objects)} chunks"
     return found or [Damage(count, "is whole but not the one that was committed", block)]
@@ -216,16 +215,6 @@ def _of_chunk(content: bytes) -> str:
         return "is empty"
     checksum = google_crc32c.value(content[:-4]).to_bytes(4, "little")
     return "" if content[-4:] == checksum else "fails its checksum"
-
-
-def _wrong(place: Location, damage_of: Callable[[bytes], str]) -> str:
-    """Damage of an object in words, by what it holds; empty where there is none."""
-    try:
-        return damage_of(place.read_bytes())
-    except (FileNotFoundError, NotADirectoryError):
-        return "is missing"
-    except OSError as error:
-        return f"can't be read: {error.strerror}"
 
 
 def _mark(path: Location, damages: list[Damage]) -> str:
@@ -242,68 +231,14 @@ def _mark(path: Location, damages: list[Damage]) -> str:
     return ""
 
 
-class Damage(NamedTuple):
-    """An object of a store that is not as it was written."""
-
-    object: str  # path inside the store; a line of a log by its number
-    what: str  # what is wrong with it
-    block: int = -1  # that it belongs to
-    mended_by: str = "resume"  # "repair" what was there before results, "hand" what is surplus
-
-
 def _made_with(path: Location) -> dict[str, Any]:
     """Attributes that a store was made with, from its list, else from its group, if undamaged."""
     if listed := opening.listed_attributes(path):
         return opening.recognised(path, listed)
     found = opening.read_attributes(path)
-    if (known := digests(path).get("zarr.json")) and _altered(path, "zarr.json", known):
+    if (known := store.digests(path).get("zarr.json")) and altered(path, "zarr.json", known):
         raise StoreError(f"{path / 'zarr.json'} is damaged{opening.remedy(path)}")
     return found
-
-
-def digests(path: Location) -> dict[str, str]:
-    """Digests of what a store was made of, by object, as far as its list is undamaged."""
-    return {r["object"]: r["digest"] for r in read_lines(path / LIST) if "object" in r}
-
-
-def damages(path: Location) -> list[Damage]:
-    """Objects that a store was made of, and lines of their list, that are not as they were."""
-    lines = [record for _, record in read_sealed(path / LIST)]
-    if not lines:
-        return [Damage(LIST, "is missing or empty", mended_by="repair")]
-    found = [
-        Damage(f"{LIST} line {n}", "is damaged", mended_by="repair")
-        for n, each in enumerate(lines, 1)
-        if each is None
-    ]
-    whole = [record for record in lines if record]
-    if not found and whole[0].get("objects") != len(whole) - 1:
-        found.append(Damage(LIST, "lacks lines", mended_by="repair"))
-    return found + [
-        Damage(name, what, mended_by="repair")
-        for name, known in digests(path).items()
-        if (what := _altered(path, name, known))
-    ]
-
-
-def _altered(path: Location, name: str, known: str) -> str:
-    """Damage of an object of the template, whose digest is known."""
-
-    def damage_of(content: bytes) -> str:
-        return "" if digest_of([(name, content)]) == known else "is not as it was made"
-
-    return _wrong(path / name, damage_of)
-
-
-def refuse_damaged(path: Location) -> None:
-    """Refuse a store whose template is not as it was made: what is added might not fit it."""
-    store.refuse_links(path)
-    if found := damages(path):
-        listed = "\n".join(f"  {damage.object} {damage.what}" for damage in found)
-        raise StoreError(
-            f"{path} is not as it was made:\n{listed}\n"
-            f"`sweep verify {path} --repair` puts back what was there."
-        )
 
 
 def restore(path: Location, study: Study) -> list[str]:
@@ -325,8 +260,8 @@ def restore(path: Location, study: Study) -> list[str]:
         store.build(aside, study, written or store.new_attributes(study))
         _refuse_different(path, aside)
         made = {name: digest(aside, [name]) for name in sorted(names_below(aside))}
-        wrong = [name for name, known in made.items() if _altered(path, name, known)]
-        if not (written or "zarr.json" in digests(path)):
+        wrong = [name for name, known in made.items() if altered(path, name, known)]
+        if not (written or "zarr.json" in store.digests(path)):
             _refuse_unproven(path, study, aside, wrong)
         for name in wrong:
             put_whole(path / name, (aside / name).read_bytes())
@@ -335,8 +270,8 @@ def restore(path: Location, study: Study) -> list[str]:
 
 def _refuse_different(path: Location, aside: Path) -> None:
     """Refuse to put back what an undamaged line of the list says is not what was there."""
-    for name, known in digests(path).items():
-        if _altered(aside, name, known):
+    for name, known in store.digests(path).items():
+        if altered(aside, name, known):
             raise StoreError(
                 f"{name} of {path} can't be made again as it was on this machine, or from this "
                 "spec: put it back from a copy, or run the study anew into another store"
@@ -345,7 +280,7 @@ def _refuse_different(path: Location, aside: Path) -> None:
 
 def _refuse_unproven(path: Location, study: Study, aside: Path, wrong: list[str]) -> None:
     """Refuse a spec that makes other arrays or results, where all else that could tell is lost."""
-    if others := set(wrong) - {"zarr.json", LIST}:
+    if others := set(wrong) - {"zarr.json", store.LIST}:
         raise StoreError(
             f"{path} holds another study, or too little is left: {min(others)} differs"
         )
@@ -398,7 +333,7 @@ def _pack(path: Location, output: Location, study: Study, shown: Progress) -> No
         template = Path(directory) / "template"
         store.build(template, study, attributes, shards=shard_shape)
         root = (template / "zarr.json").read_bytes()
-        for name in files_below(template).keys() - {"zarr.json", f"{JOURNAL}/{MANIFEST}"}:
+        for name in files_below(template).keys() - {"zarr.json", store.LIST}:
             put_whole(output / name, (template / name).read_bytes())
     names, arrays = sorted(study.owners()), open_group(path)
     shown.begin(points=len(names), done=0, unit="arrays")
@@ -426,7 +361,8 @@ def _pack(path: Location, output: Location, study: Study, shown: Progress) -> No
 
 def _pack_array(source: Any, output: Location) -> None:
     """Copy an array, shard by shard, and read each back."""
-    target = zarr.open_array(zarr_store(output), mode="r+").with_config(store.WRITTEN_WHOLE)
+    target = zarr.open_array(zarr_store(output), mode="r+")
+    target = target.with_config({"write_empty_chunks": True})  # else one of fill values is lost
     dims = tuple(map(str, range(target.ndim)))
     files = BlockGrid(dims, target.shape, target.shards or target.chunks)
     with ThreadPoolExecutor(THREADS) as pool:

@@ -13,7 +13,7 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from functools import partial
+from functools import lru_cache, partial
 from itertools import islice
 from typing import TypeVar
 
@@ -78,20 +78,13 @@ class Answer:
     workers: int = 1  # that there were as it arrived
 
 
-_studies: dict[tuple[str, str], store.Arrays] = {}
-_stamps: dict[str, tuple[tuple[int, ...], str]] = {}
 _opening = threading.Lock()
 
 
 def study(path: str, study_id: str) -> store.Arrays:
     """Return the study of a store, opened for writing once a process; StoreError for another."""
     with _opening:
-        if (path, study_id) not in _studies:
-            if len(_studies) >= STUDIES_OPEN:
-                _studies.clear()
-                _stamps.clear()
-            _studies[path, study_id] = _open(path, study_id)
-        return _studies[path, study_id]
+        return _opened(path, study_id)
 
 
 def _open(path: str, study_id: str) -> store.Arrays:
@@ -101,17 +94,21 @@ def _open(path: str, study_id: str) -> store.Arrays:
     return store.Arrays(path, held)
 
 
+_opened = lru_cache(maxsize=STUDIES_OPEN)(_open)
+
+
 def _refuse_another(path: str, study_id: str) -> None:
     """Refuse a store that was put in the place of the one that a task was sent for."""
-    found, known = stamp(located(path)), _stamps.get(path)
-    if known and found and known[0] == found:
-        held = known[1]
-    else:
-        held = str(read_attributes(located(path))["study_id"])
-        if found:
-            _stamps[path] = found, held
+    found = stamp(located(path))
+    held = _held(path, found) if found else _held.__wrapped__(path, found)
     if held != study_id:
         raise StoreError(f"{path} now holds study {held}, not {study_id}")
+
+
+@lru_cache(maxsize=STUDIES_OPEN)
+def _held(path: str, found: tuple[int, ...] | None) -> str:
+    """Id of the study in a store, which has a stamp."""
+    return str(read_attributes(located(path))["study_id"])
 
 
 def work(job: Job, blocks: list[int]) -> Answer:
@@ -201,86 +198,50 @@ class Overtime(Exception):
     """A block took longer than it may."""
 
 
-class _Interruption(BaseException):
+class _Interruption(SystemExit):
     """Raised in a thread from outside; no `except Exception` on its way takes it for its own."""
-
-
-class _Alarm:
-    """Interrupts the thread that sets it, unless it is put off in time."""
-
-    def __init__(self, seconds: float, *, deadly: bool) -> None:
-        self._deadly, self._thread = deadly, threading.get_ident()
-        self._guard = threading.RLock()  # its owner may be interrupted while taking it
-        self._over = self.rung = False
-        self._timer = _timer(seconds, self._ring)
-
-    def set(self) -> None:
-        """From here on the thread may be interrupted."""
-        self._timer.start()
-
-    def _ring(self) -> None:
-        with self._guard:
-            if self._over:
-                return
-            self.rung = True
-            _raise_in(self._thread, _Interruption)
-            if self._deadly:
-                self._timer = _timer(GRACE, self._kill)
-                self._timer.start()
-
-    def _kill(self) -> None:
-        with self._guard:
-            if not self._over:
-                os._exit(1)  # stuck in compiled code; a nanny starts another worker
-
-    def put_off(self) -> None:
-        """End the work: from here on nothing is interrupted."""
-        while not self._over:
-            try:
-                with self._guard:
-                    _raise_in(self._thread, None)  # what was not delivered yet
-                    self._over = True
-            except _Interruption:
-                continue
-        self._timer.cancel()
-
-
-def _timer(seconds: float, action: Callable[[], None]) -> threading.Timer:
-    timer = threading.Timer(seconds, action)
-    timer.daemon = True
-    return timer
-
-
-def _raise_in(thread: int, error: type[BaseException] | None) -> None:
-    raised = ctypes.py_object(error) if error else None
-    ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread), raised)
 
 
 def limited(work: Callable[[], T], seconds: float | None, spent: float = 0.0) -> T:
     """Do some work, for no longer than some seconds less those spent before; Overtime where it was.
 
-    Python code is interrupted. A worker process that is still in compiled code `GRACE` seconds
-    later ends itself; any other waits for it to return.
+    It is done in a thread, in which Python code is interrupted. A worker process whose thread is
+    still in compiled code `GRACE` seconds later ends itself; any other waits for it to return.
     """
     if seconds is None:
         return work()
-    # A worker in a process of its own may end without harm.
-    deadly = worker_address().partition("://")[0] not in ("", "inproc")
-    alarm = _Alarm(max(seconds - spent, 0.0), deadly=deadly)
-    where: _Interruption | None = None
-    # No context manager: an interruption on the way into its exit would go past it.
-    try:
+    found: list[T] = []
+    raised: list[BaseException] = []
+    over, left = threading.Event(), threading.Event()
+
+    def do() -> None:
         try:
-            alarm.set()
-            found = work()
-        finally:
-            alarm.put_off()
-    except _Interruption as interruption:
-        alarm.put_off()  # the only one there is may have come before that was begun
-        where = interruption
-    if alarm.rung:
-        raise Overtime(f"took longer than the {seconds:g} s that a block may take") from where
-    return found
+            found.append(work())
+        except BaseException as error:
+            raised.append(error)
+        over.set()
+        left.wait()  # until then no other thread has the number that is interrupted
+
+    thread, in_time = threading.Thread(target=do, daemon=True), False
+    thread.start()
+    try:
+        in_time = over.wait(max(seconds - spent, 0.0))
+    finally:  # after Ctrl-C too
+        if not in_time:
+            number, error = ctypes.c_ulong(thread.ident or 0), ctypes.py_object(_Interruption)
+            ctypes.pythonapi.PyThreadState_SetAsyncExc(number, error)
+        left.set()
+    if not in_time:
+        # A worker in a process of its own may end without harm.
+        deadly = worker_address().partition("://")[0] not in ("", "inproc")
+        thread.join(GRACE if deadly else None)
+        if thread.is_alive():
+            os._exit(1)  # stuck in compiled code; a nanny starts another worker
+        why = f"took longer than the {seconds:g} s that a block may take"
+        raise Overtime(why) from (raised[0] if raised else None)
+    if raised:
+        raise raised[0]
+    return found[0]
 
 
 def worker_address() -> str:

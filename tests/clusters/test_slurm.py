@@ -12,7 +12,7 @@ import yaml
 from slurm_daemons import command, jobs, missing, slurm
 from small import STUDY, receipts, tree
 
-from sweep.storage.logs import read_receipts
+from sweep.storage.opening import read_receipts
 from sweep.tasks.driver import run
 
 pytestmark = pytest.mark.skipif(bool(missing()), reason=missing())

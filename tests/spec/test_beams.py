@@ -3,7 +3,7 @@
 import pytest
 from written_specs import written
 
-from sweep.cli.terminal import warn_of_beam
+from sweep.cli.terminal import warn_of
 from sweep.spec import Spec, SpecError
 from sweep.spec.grid_rules import too_narrow
 
@@ -71,7 +71,7 @@ def test_one_mode_is_the_default():
 @pytest.mark.parametrize("changes", [{}, MODE | {"instrument.receiver.architecture": "direct"}])
 def test_a_beam_narrower_than_its_aperture_makes_is_told_where_all_light_mixes(changes, capsys):
     """Table 4.1: 50 urad from 25 mm, which make 79 urad."""
-    warn_of_beam(Spec.from_mapping(written(changes)))
+    warn_of(Spec.from_mapping(written(changes)))
     told = capsys.readouterr()
     assert not told.out and "a beam of 50 urad is narrower than an aperture of 25 mm" in told.err
     assert "78.9 urad" in told.err

@@ -23,9 +23,9 @@ from small import evaluated, logged, quiet, tree
 
 import sweep
 from sweep.cli import main
-from sweep.storage import locations, logs
+from sweep.storage import locations, opening
 from sweep.storage.locations import JOURNAL, located
-from sweep.storage.logs import read_lines, sealed, unsealed
+from sweep.storage.opening import read_lines, sealed, unsealed
 from sweep.tasks.driver import extend, resume, run
 from sweep.tasks.journal import LOCK, Holder, Lock, holder
 from sweep.tasks.progress import StoreError
@@ -106,9 +106,9 @@ def test_a_killed_driver_is_resumed_to_the_same_bytes(faults, place, undisturbed
     script.write_text(
         "import sys, time\n"
         "from six_blocks import six\n"
-        "from sweep.storage import logs\n"
+        "from sweep.storage import opening\n"
         "from sweep.tasks.driver import run\n"
-        "logs.WAVE = 0\n"
+        "opening.WAVE = 0\n"
         "def evaluate(study, block):\n"
         "    time.sleep(60 * (block == 3))\n"
         "    return study.evaluate(block)\n"
@@ -275,32 +275,32 @@ def test_damage_is_found_and_mended(memory, undisturbed):
 
 
 def test_receipts_are_gathered_in_objects_of_some_seconds(memory, monkeypatch):
-    monkeypatch.setattr(logs, "WAVE", 1e9)
+    monkeypatch.setattr(opening, "WAVE", 1e9)
     outcome = quiet(six(), memory)
     assert outcome.complete and outcome.blocks_computed == BLOCKS
     log = located(memory) / JOURNAL / "receipts.jsonl"
-    assert len(logs.segments(log)) <= 2  # the first at once, the others at the end
+    assert len(opening.segments(log)) <= 2  # the first at once, the others at the end
     assert sorted(receipts(memory)) == list(range(BLOCKS))
 
 
 @pytest.mark.parametrize("most", [1, 2, 100])
 def test_many_objects_of_a_log_become_few_and_say_the_same(memory, monkeypatch, most):
-    monkeypatch.setattr(logs, "MOST_SEGMENTS", most)
-    monkeypatch.setattr(logs, "SEGMENT_BYTES", 200)
+    monkeypatch.setattr(opening, "MOST_SEGMENTS", most)
+    monkeypatch.setattr(opening, "SEGMENT_BYTES", 200)
     path = located(memory) / "log"
-    log = logs.ObjectLog(path)
+    log = opening.ObjectLog(path)
     lines = [sealed({"block": block, "text": "x" * 50}) for block in range(9)]
     for line in lines:
         log.append(line)
         log.flush(now=True)
-    (path / logs.segments(path)[4]).write_bytes(lines[4][:-9] + b"\n")
+    (path / opening.segments(path)[4]).write_bytes(lines[4][:-9] + b"\n")
     log.keep(lambda line: unsealed(line) is not None)
-    assert list(logs.raw_lines(path)) == lines[:4] + lines[5:]
-    assert len(logs.segments(path)) == (9 if most == 100 else 3)
-    again = logs.ObjectLog(path)
+    assert list(opening.raw_lines(path)) == lines[:4] + lines[5:]
+    assert len(opening.segments(path)) == (9 if most == 100 else 3)
+    again = opening.ObjectLog(path)
     again.append(lines[4])
     again.flush(now=True)
-    assert list(logs.raw_lines(path)) == [*lines[:4], *lines[5:], lines[4]]
+    assert list(opening.raw_lines(path)) == [*lines[:4], *lines[5:], lines[4]]
 
 
 def test_plain_zarr_libraries_read_it(faults, place, undisturbed):

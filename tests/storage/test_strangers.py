@@ -14,8 +14,7 @@ from small import small
 
 import sweep
 from sweep.cli import main
-from sweep.storage.logs import closed
-from sweep.storage.opening import NotAStoreError
+from sweep.storage.opening import NotAStoreError, closed
 from sweep.tasks import store
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.progress import StoreError

@@ -7,7 +7,7 @@ import pytest
 import zarr
 
 from sweep.storage import locations
-from sweep.tasks.store import CODECS, WRITTEN_WHOLE, encoded
+from sweep.tasks.store import CODECS, encoded
 from sweep.tasks.study import ArrayLayout
 
 TYPES = ["float64", "float32", "int64", "uint8", "uint64", "int16", "bool"]
@@ -17,7 +17,7 @@ def array_at(path, shape, chunk, dtype, fill):
     made = zarr.create_array(
         path, shape=shape, chunks=chunk, dtype=dtype, fill_value=fill, compressors=CODECS
     )
-    return made.with_config(WRITTEN_WHOLE)
+    return made.with_config({"write_empty_chunks": True})
 
 
 def layout_of(array):

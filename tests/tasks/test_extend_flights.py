@@ -12,7 +12,7 @@ from test_extend import Interrupting, larger, see_it_refused
 
 from sweep.cli import main
 from sweep.model import clouds, navigation
-from sweep.tasks import flight_study
+from sweep.tasks import flight_study, worker
 from sweep.tasks.driver import extend, resume
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.journal import read_recipe
@@ -334,6 +334,6 @@ def test_another_study_put_in_the_older_ones_place_is_not_taken_for_it(
     extend(here, flight(draws=MORE_DRAWS), to=new, **stopped)
     shutil.rmtree(here)
     quiet(flight(**moved("ground", reflectance=0.01)), here)
-    monkeypatch.setattr("sweep.tasks.worker._studies", {})
+    worker._opened.cache_clear()
     assert resume(new, progress=False, scheduler="none").complete
     assert tree(new) == drawn_more

@@ -3,7 +3,14 @@ import os
 import pytest
 
 from sweep.storage.locations import JOURNAL
-from sweep.storage.logs import RECEIPTS, damaged_lines, read_lines, read_receipts, sealed, unsealed
+from sweep.storage.opening import (
+    RECEIPTS,
+    read_lines,
+    read_receipts,
+    read_sealed,
+    sealed,
+    unsealed,
+)
 from sweep.tasks import journal
 from sweep.tasks.journal import Failure, Journal, Receipt
 
@@ -38,7 +45,8 @@ def test_lines_that_are_not_as_they_were_written_are_passed_over_and_dropped(tmp
     one, two, three = (sealed({"block": block}) for block in (1, 2, 3))
     log.write_bytes(one + b'nonsense\n[3]\n{"block":4}\n' + two.replace(b"2", b"5", 1) + three)
     assert [record["block"] for record in read_lines(log)] == [1, 3]
-    assert damaged_lines(log) == [2, 3, 4, 5]
+    records = [record for _, record in read_sealed(log)]
+    assert [n for n, record in enumerate(records, 1) if record is None] == [2, 3, 4, 5]
     Journal(tmp_path)
     assert log.read_bytes() == one + three
     log.write_bytes(b'{"block"')

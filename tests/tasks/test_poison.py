@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import signal
 import threading
 import time
 from functools import partial
@@ -138,21 +139,34 @@ def test_a_time_limit_interrupts_what_it_limits_and_nothing_after_it():
         time.sleep(0.01)
 
 
-def test_an_interruption_on_the_way_into_putting_the_alarm_off_is_overtime(monkeypatch):
-    put_off, came = worker._Alarm.put_off, []
+def test_an_interruption_that_comes_too_late_is_overtime_and_leaves_no_thread():
+    seen = []
 
-    def late(alarm):
-        if not came:
-            came.append(alarm)
-            alarm.rung = True
-            raise worker._Interruption
-        put_off(alarm)
+    def done_after_all():
+        seen.append(threading.current_thread())
+        with contextlib.suppress(BaseException):
+            forever()
+        return "done"
 
-    monkeypatch.setattr(worker._Alarm, "put_off", late)
     with pytest.raises(Overtime):
-        worker.limited(lambda: "done", 60.0)
-    came[0]._timer.join(10)
-    assert came[0]._over and not came[0]._timer.is_alive()
+        worker.limited(done_after_all, 0.05)
+    assert not seen[0].is_alive()
+
+
+def test_a_limited_work_that_raises_or_is_stopped_by_ctrl_c_ends_with_it():
+    with pytest.raises(ValueError, match="nothing good"):
+        worker.limited(lambda: int("nothing good"), 60.0)
+    seen = []
+
+    def asleep():
+        seen.append(threading.current_thread())
+        forever()
+
+    threading.Timer(0.2, signal.raise_signal, [signal.SIGINT]).start()
+    with pytest.raises(KeyboardInterrupt):
+        worker.limited(asleep, 60.0)
+    seen[0].join(10)
+    assert not seen[0].is_alive()
 
 
 def test_a_durable_study_is_the_same_and_has_its_disk_synced_before_its_receipts(

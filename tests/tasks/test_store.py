@@ -6,7 +6,7 @@ import pytest
 import xarray as xr
 from small import everything, small
 
-from sweep.storage import logs
+from sweep.storage import opening
 from sweep.tasks import store
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.progress import StoreError
@@ -75,7 +75,7 @@ def test_a_written_block_reads_back_bit_for_bit_and_fills_its_chunks(path, study
     assert not is_whole(path, objects)
     written = arrays.write(3, results)
     assert is_whole(path, objects)
-    assert written.digest == logs.digest(path, objects)
+    assert written.digest == opening.digest(path, objects)
     assert written.bytes == sum((path / name).stat().st_size for name in objects)
     dataset = xr.open_zarr(path)
     for name, values in results.items():
