@@ -34,8 +34,8 @@ NOT_IN_THE_MODEL = {
 """Pure physics: arrays in, arrays out."""
 
 LARGEST_HOUSE = {
-    "lines": 48_309, "modules": 169, "lines of the model": 18_854, "modules of the model": 77,
-    "compiled functions": 132, "arguments of a compiled function": 10,
+    "lines": 47_743, "modules": 166, "lines of the model": 18_855, "modules of the model": 77,
+    "compiled functions": 129, "arguments of a compiled function": 10,
 }  # fmt: skip
 """Upper limits on the size of sweep/."""
 LARGEST_MODULE = 660
