@@ -204,7 +204,7 @@ def test_a_threshold_is_set_in_one_way_on_an_axis_or_off():
     at = spec.parameters_at({"tnr": 10})
     assert at[TNR] == 10 and PFA_SHOT not in at
     first = tnr_of(spec.parameters() | {PFA_SHOT: 1e-9})
-    assert reference(spec, {}).tnr == pytest.approx(float(first))
+    assert reference(spec, {})[0]["tnr"] == pytest.approx(float(first))
     with pytest.raises(SpecError, match=r"has no threshold; write 'tnr: 10', or threshold_to_mean"):
         Spec.from_mapping(written({TNR: ...}))
     with pytest.raises(SpecError, match=r"by tnr and by design_pfa_shot; keep one of them"):
