@@ -475,6 +475,11 @@ class SceneSpec(Study):
         return parameter_findings(self.parameters(), path, [value], location)
 
     @property
+    def base(self) -> Path:
+        """Folder that the scene's files are relative to."""
+        return self._base
+
+    @property
     def files(self) -> Files:
         """The scene's files."""
         return Files(self._base, self._digests)

@@ -305,8 +305,7 @@ def _succeed(path: Path, *, durable: bool) -> None:
 
 def _facts(spec: Declared) -> dict[str, str]:
     """Places of a study's files, for the recipe of its store."""
-    base = getattr(spec, "base", None)
-    return {} if base is None else {"base": str(base.absolute())}
+    return {"base": str(spec.base.absolute())} if isinstance(spec, SceneSpec) else {}
 
 
 def _check_code(spec: Declared) -> None:

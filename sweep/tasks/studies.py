@@ -265,7 +265,8 @@ def changed(spec: Declared, changes: Mapping[str, Any]) -> Declared:
             parent = ".".join(sections)
             raise SpecError([Mistake(path, f"is no field: {parent} holds none", str(value))])
         section[last] = value
-    return type(spec).from_mapping(written, base=getattr(spec, "base", "."))
+    base = spec.base if isinstance(spec, SceneSpec) else "."
+    return type(spec).from_mapping(written, base=base)
 
 
 def refuse_unlike(path: Location, older: Declared, spec: Declared) -> None:

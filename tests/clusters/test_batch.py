@@ -2,7 +2,9 @@
 
 import os
 import shlex
+import signal
 import subprocess
+import sys
 import threading
 import time
 from itertools import pairwise
@@ -167,3 +169,9 @@ def test_a_job_lost_and_one_refused_are_made_up_for(played_pbs, undisturbed):
     assert tree(outcome.store) == tree(undisturbed)
     assert int((played_pbs / "count").read_text()) >= 3  # the first, the refused, another
     assert (played_pbs / "deleted").read_text().split()[-1] == "3"  # none is left in the queue
+
+
+def test_ctrl_c_stays_what_it_is_where_batch_systems_are_used():
+    code = "import signal, sweep.tasks.clusters.batch; print(signal.getsignal(signal.SIGINT))"
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert told.stdout.strip() == str(signal.default_int_handler)

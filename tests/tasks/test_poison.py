@@ -162,7 +162,7 @@ def test_a_limited_work_that_raises_or_is_stopped_by_ctrl_c_ends_with_it():
         seen.append(threading.current_thread())
         forever()
 
-    threading.Timer(0.2, signal.raise_signal, [signal.SIGINT]).start()
+    threading.Timer(0.2, os.kill, [os.getpid(), signal.SIGINT]).start()
     with pytest.raises(KeyboardInterrupt):
         worker.limited(asleep, 60.0)
     seen[0].join(10)

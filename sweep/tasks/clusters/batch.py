@@ -8,15 +8,20 @@ from __future__ import annotations
 
 import asyncio
 import shlex
+import signal
 from typing import Any
 
-from dask_jobqueue import PBSCluster, SLURMCluster
-from dask_jobqueue.pbs import PBSJob
-from dask_jobqueue.slurm import SLURMJob
 from distributed.core import Status
 
 from sweep.spec.clusters import Batch, Bounds, Slurm
 from sweep.tasks.clusters import machines
+
+_ON_CTRL_C = signal.getsignal(signal.SIGINT)
+from dask_jobqueue import PBSCluster, SLURMCluster  # noqa: E402
+from dask_jobqueue.pbs import PBSJob  # noqa: E402
+from dask_jobqueue.slurm import SLURMJob  # noqa: E402
+
+signal.signal(signal.SIGINT, _ON_CTRL_C)  # dask_jobqueue has it end the program as it is imported
 
 #: Seconds until a running cluster submits again what was not taken.
 PAUSE = 15.0
