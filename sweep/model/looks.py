@@ -113,8 +113,6 @@ class Looks(NamedTuple):
         |X| and threshold are over the noise per quadrature of one record. If the noise is ``real``
         it has the power of both quadratures in one.
         """
-        from scipy import stats
-
         from sweep.model.marcum import marcum_q1
 
         signal, level, real = np.broadcast_arrays(signal, level, real)
@@ -125,6 +123,8 @@ class Looks(NamedTuple):
                 found = np.where(real, 0.5 * (special.erfc(near) + special.erfc(far)), found)
                 missed = np.where(real, 0.5 * (special.erfc(-near) - special.erfc(far)), missed)
             return self._votes(found, missed) if self.several else (found, missed)
+        from scipy import stats  # which takes a second, and one look has no need of
+
         a, b = (math.sqrt(self.number) * np.asarray(v, float) for v in (signal, level))
         found, missed = np.where(a > b, 1.0, 0.0), np.where(a > b, 0.0, 1.0)
         near = np.asarray((a - b < _SURE) & (b - a < _SURE + math.sqrt(2 * self.number)))
