@@ -10,7 +10,8 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
+from unittest import mock
 
 import numpy as np
 from rich.progress import Progress
@@ -71,13 +72,23 @@ def evaluated(spec: Spec | SceneSpec, folder: Path, told: Progress, title: str) 
     found: dict[str, list[np.ndarray]] = {}
     bar = told.add_task(title, total=study.points)
     total = planning = 0.0
+    of_flights = FlightStudy.select
+
+    def select(*given: Any) -> Any:
+        nonlocal planning
+        begun = time.perf_counter()
+        selected = of_flights(*given)
+        planning += time.perf_counter() - begun
+        return selected
+
     for block in range(study.n_blocks):
-        begun = time.perf_counter()  # of a grid a plan is kept, of a flight it is made again
-        study.selected(block) if isinstance(study, FlightStudy) else study.selection.of_block(block)
-        planned = time.perf_counter()
-        results = study.evaluate(block)
-        total += time.perf_counter() - (planned if flight else begun)
-        planning += planned - begun
+        begun = time.perf_counter()
+        if not isinstance(study, FlightStudy):  # of a grid a plan is kept
+            study.selection.of_block(block)
+            planning += time.perf_counter() - begun
+        with mock.patch.object(FlightStudy, "select", select):
+            results = study.evaluate(block)
+        total += time.perf_counter() - begun
         for name, values in results.items():
             if name.rsplit("/", 1)[-1] in PROBABILITIES:
                 found.setdefault(name, []).append(values.ravel())

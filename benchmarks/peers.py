@@ -153,12 +153,12 @@ def rehearse(client, folder: Path) -> None:
 @contextmanager
 def our_client(workers: int):
     """A client of workers that are started as `sweep run` does."""
-    from sweep.spec.clusters import Local
-    from sweep.tasks import cluster
+    from sweep.tasks.cluster import connected
+    from sweep.tasks.session import RunOptions
 
-    here = cluster.of_workers(Local(kind="local"), workers)
-    quietly = {"processes": True, "say": lambda text: None}
-    with cluster.connected(here, most=workers, **quietly) as reached:
+    here = RunOptions(workers=workers).place(study(2500))
+    assert here is not None
+    with connected(here, most=workers, processes=True, say=lambda text: None) as reached:
         reached.client.wait_for_workers(workers)
         yield reached.client
 

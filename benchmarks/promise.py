@@ -182,11 +182,11 @@ def known(spec: Spec | SceneSpec) -> Found:
     for tolerance, rung in at.items():
         trial = seen[rung.name]
         errors = apart(trial.seen, finest)
-        own = worst_of(errors)
+        least = worst_of(errors)
         kept, front = (
             min((seen[name].seconds for name, error in worst.items() if error <= most),
                 default=np.nan)
-            for most in (tolerance, max(ALIKE * own, NOTHING))
+            for most in (tolerance, max(ALIKE * least, NOTHING))
         )  # fmt: skip
         rows.append(Row(tolerance, errors, trial.seconds, kept, front))
         label = f"{tolerance:g}: {of_rays(trial.seen.beamlets)}" if flight else ""
