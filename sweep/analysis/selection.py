@@ -119,7 +119,7 @@ class Points:
 
     def varying(self) -> list[str]:
         """Coordinates with more than one value."""
-        return [n for own in self.places.values() for n in own if own[n].nunique() > 1]
+        return [n for own in self.places.values() for n in own if own[n].nunique(dropna=False) > 1]
 
     def further(self, names: Sequence[str]) -> list[str]:
         """Coordinates that tell points apart which those named leave together, the fewest."""
@@ -141,7 +141,7 @@ class Points:
     def apart(self, name: str) -> list[tuple[object, Points]]:
         """Points of each value of a coordinate, in the order in which the values first appear."""
         dim = self.dim_of(name)
-        groups = self.places[dim].groupby(self.values(name), sort=False)
+        groups = self.places[dim].groupby(self.values(name), sort=False, dropna=False)
         return [(value, replace(self, places={**self.places, dim: own})) for value, own in groups]
 
     def side(self, name: str) -> Side:

@@ -12,6 +12,7 @@ import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterator
+from contextvars import copy_context
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from itertools import islice
@@ -222,7 +223,9 @@ def limited(work: Callable[[], T], seconds: float | None, spent: float = 0.0) ->
         over.set()
         left.wait()  # until then no other thread has the number that is interrupted
 
-    thread, in_time = threading.Thread(target=do, daemon=True), False
+    # which sees what is set here, such as Dask's worker
+    thread = threading.Thread(target=copy_context().run, args=(do,), daemon=True)
+    in_time = False
     thread.start()
     try:
         in_time = over.wait(max(seconds - spent, 0.0))

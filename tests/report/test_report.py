@@ -4,6 +4,7 @@ import base64
 import gzip
 import json
 import re
+import shutil
 import subprocess
 import sys
 
@@ -240,3 +241,13 @@ def test_a_hundred_million_points_take_little_more_memory_than_a_million(tmp_pat
         )
         peaks.append(int(ran.stdout))
     assert peaks[1] < peaks[0] + 300_000, peaks  # an array of all points alone has 800 MB
+
+
+def test_a_place_of_a_flight_without_computed_shots_has_no_panel_over_time(scene_store, tmp_path):
+    store = tmp_path / "scene.zarr"
+    shutil.copytree(scene_store, store)
+    shutil.rmtree(store / "four" / "flags" / "c" / "0")  # of the first of two places
+    found, _ = flights.recordings(SceneStudy.of(store))
+    for chart in (flights.along(found), flights.errors(found)):
+        assert {panel.when["cloud"] for panel in chart.panels} == {found[1].words}
+        assert all(panel.lines for panel in chart.panels)

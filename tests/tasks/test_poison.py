@@ -1,6 +1,7 @@
 """Blocks that take too long, too much memory or their worker with them."""
 
 import contextlib
+import contextvars
 import os
 import signal
 import threading
@@ -151,6 +152,12 @@ def test_an_interruption_that_comes_too_late_is_overtime_and_leaves_no_thread():
     with pytest.raises(Overtime):
         worker.limited(done_after_all, 0.05)
     assert not seen[0].is_alive()
+
+
+def test_limited_work_sees_what_is_set_where_it_was_asked_for_as_dasks_worker_is():
+    here = contextvars.ContextVar("here")
+    here.set("a worker")
+    assert worker.limited(here.get, 60.0) == "a worker"
 
 
 def test_a_limited_work_that_raises_or_is_stopped_by_ctrl_c_ends_with_it():

@@ -105,7 +105,7 @@ def _bounds(snr: tuple[np.ndarray, ...], p: dict[str, np.ndarray]) -> estimators
     seen = [np.broadcast_to(a, shape).ravel() for a in snr]
     kinds = pandas.DataFrame({name: flat[name] for name in _ALIKE})
     spread = np.empty((2, len(kinds)))
-    for places in kinds.groupby(list(kinds), sort=False).indices.values():
+    for places in kinds.groupby(list(kinds), sort=False, dropna=False).indices.values():
         part = {name: a[places] for name, a in flat.items()}
         spread[:, places] = _alike([s[places] for s in seen], part)
     return estimators.Deviation(*spread.reshape(2, *shape))

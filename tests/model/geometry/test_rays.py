@@ -95,7 +95,7 @@ def facets(heights):
 def gale():
     """The heights of real terrain (rows, columns) [m]."""
     if not GALE.exists():
-        pytest.skip("the terrain lies beside the project")
+        pytest.skip("the shared terrain is not here")
     rasterio = pytest.importorskip("rasterio")
     with rasterio.open(GALE) as raster:
         return raster.read(1).astype(float)
