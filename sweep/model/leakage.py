@@ -82,20 +82,20 @@ def inspect(origin, lines, noise, table, form, sizes, tangent, room, exempt, ser
     :func:`sweep.model.crossings.crossing_series` of the threshold.
     """
     n, lowest, highest, total, faint = lines
-    half, beside = sizes[0] // 2, sizes[6]
+    half, beside, afar = sizes[0] // 2, sizes[6], total
     place = seen(origin, lowest, highest, sizes)
     mirror = max(min(place[0], half - place[1]), 0.0) if sizes[7] == IMAGED else math.inf
-    crossing = stays_below(noise[1], total, place, form, sizes)
-    afar, sources = total, 0
-    least = max(crossing, float(beside))
+    least = crossing = max(stays_below(noise[1], total, place, form, sizes), float(beside))
     left = noise[2] - _all_beyond(afar, least, mirror, noise, form)
     if left < 0.0 or crossing > beside:
         sources = take_sources(n, lowest, highest, float(beside), SOURCE_DIGITS, sizes, room)
         afar = weight_afar(total, sources, sizes, room)
-        if crossing > beside:
-            crossing = max(stays_below(noise[1], afar, place, form, sizes), float(beside))
-        least = min(max(crossing, float(beside)), float(beside + half))
+        crossing = max(stays_below(noise[1], afar, place, form, sizes), float(beside))
+        least = min(crossing, float(beside + half))
         left = noise[2] - _all_beyond(afar, least, mirror, noise, form)
+        while left < 0.0 and least < sizes[2]:  # bins that tables hold take less than an integral
+            least = min(1.25 * least, float(sizes[2]))
+            left = noise[2] - _all_beyond(afar, least, mirror, noise, form)
     known = n, lowest, highest, np.int64(0), faint / max(total, 1e-300)
     if left >= 0.0:
         low, high = run_of(least, place, sizes)
