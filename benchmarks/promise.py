@@ -15,7 +15,7 @@ import promise_drawn
 import promise_instruments
 from rich.console import Console
 from rich.progress import Progress
-from shared import DOCS, EXPERIMENTS, table
+from shared import DOCS, EXPERIMENTS, table, wrapped
 
 from sweep.model.accuracy import Accuracy
 from sweep.spec import SceneSpec, Spec, SpecError, load
@@ -353,7 +353,7 @@ class Page:
             table(["experiment", "tolerance", *WHAT, "us"], self._rays),
             COSTS.strip().format(margin=DEARER - 1, front=front, fixed=fixed),
         ]
-        return "\n\n".join(parts) + "\n"
+        return wrapped("\n\n".join(parts)) + "\n"
 
 
 def main() -> None:

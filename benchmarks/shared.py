@@ -1,6 +1,7 @@
 """Helpers of the benchmarks: experiments with changes, tables, and pages to put them into."""
 
 import tempfile
+import textwrap
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -62,6 +63,15 @@ def line(cells: Iterable[str]) -> str:
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """A table in Markdown."""
     return "\n".join(map(line, [head, ["---"] * len(head), *rows]))
+
+
+def wrapped(page: str) -> str:
+    """A page whose paragraphs have lines of 100 characters; tables, lists and heads stay."""
+    parts = page.split("\n\n")
+    return "\n\n".join(
+        part if part.lstrip().startswith(("|", "-", "#")) else textwrap.fill(part, 100)
+        for part in parts
+    )
 
 
 def show(head: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
