@@ -68,7 +68,7 @@ STUDIES = {
     "square_low_descent": flight("square_low_descent", "corners", 200),
     "expanded_pattern": flight("expanded_pattern", "squares", 200),
     "forest_scan": flight("forest_scan", "sweep", 650),
-    "scan_pattern_comparison": flight("scan_pattern_comparison", "three", 20, **FEW_DRAWS),
+    "scan_pattern_comparison": flight("scan_pattern_comparison", "three", 200, **FEW_DRAWS),
 }  # fmt: skip
 
 

@@ -263,8 +263,7 @@ def _print_grid(store: Location) -> None:
 
     part, rows, share = summary(store)
     print_table(
-        "Probability of detection"
-        + (f", by {100 * share:.2g} % of the blocks" if share < 1 else ""),
+        "Probability of detection" + _looked_at(share),
         [part, "points", f"pd_shot > {DETECTED}", "median pd_shot", "median pd_doppler"],
         [
             [
@@ -277,6 +276,10 @@ def _print_grid(store: Location) -> None:
             for row in rows
         ],
     )
+
+
+def _looked_at(share: float) -> str:
+    return f", by {100 * share:.2g} % of the blocks" if share < 1 else ""
 
 
 def _print_scene(store: Location) -> None:
@@ -309,7 +312,8 @@ def tell_accuracy(store: Location) -> None:
         tell(f"warning: {told}", err=True)
     if rows := accuracy_table(store):
         print_table(
-            "Half-widths of pd by its draws, and where accuracy.tolerance is met",
+            "Half-widths of pd by its draws, and where accuracy.tolerance is met"
+            + _looked_at(rows[0].looked_at),
             ["", "met", "worst", "missed by", "draws", "needed", "at"],
             [
                 [
@@ -328,7 +332,7 @@ def tell_accuracy(store: Location) -> None:
     if rays := rays_table(store):
         kind, each = ("rays", "shot") if rays[0].name else ("beamlets", "point")
         print_table(
-            f"What more {kind} may change",
+            f"What more {kind} may change{_looked_at(rays[0].looked_at)}",
             ["", f"{kind} a {each}", "met", "worst", "missed by", "at"],
             [
                 [

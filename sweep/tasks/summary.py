@@ -73,9 +73,7 @@ def summary(store: str | Location) -> tuple[str, list[Row], float]:
     _, study = studies.read(path)
     if not isinstance(study, GridStudy):
         raise StoreError(f"{path} holds no study over a grid")
-    done = done_blocks(path, study)
-    blocks = _some(done, int(np.prod(study.grid.block_shape)))
-    share = len(blocks) / max(len(done), 1)
+    blocks, share = _some(path, study)
     axis = study.spec.axes[0] if study.spec.axes else None
     size = axis.size if axis else 1  # in parts of a value each, or of several where there are many
     edges = np.linspace(0, size, min(size, MOST_ROWS) + 1).astype(int)
@@ -101,8 +99,7 @@ def beyond_model(store: str | Location) -> tuple[int, str]:
     _, study = studies.read(path)
     if not isinstance(study, GridStudy):
         return 0, ""
-    number, why = 0, ""
-    blocks = _some(done_blocks(path, study), int(np.prod(study.grid.block_shape)))
+    (blocks, _), number, why = _some(path, study), 0, ""
     for block, (_, (shot,)) in zip(blocks, pieces(path, study, ("pd_shot",), blocks), strict=True):
         points = np.flatnonzero(np.isnan(shot))
         if points.size and not number:
@@ -122,19 +119,19 @@ def why_beyond(study: GridStudy, block: int, point: np.ndarray) -> str:
     return "it is not any more"
 
 
-def _some(done: np.ndarray, block_points: int) -> np.ndarray:
-    """Blocks to look at, rising: all, or as many as may be, drawn by chance but always the same."""
-    most = min(MOST_BLOCKS, max(MOST_POINTS // block_points, 1))
+def _some(store: Location, study: Study) -> tuple[np.ndarray, float]:
+    """Blocks done to look at, rising: all, or some by chance but always the same; their share."""
+    done = done_blocks(store, study)
+    most = min(MOST_BLOCKS, max(MOST_POINTS * study.n_blocks // study.points, 1))
     if len(done) <= most:
-        return done
-    return np.sort(np.random.default_rng(0).choice(done, most, replace=False))
+        return done, 1.0
+    return np.sort(np.random.default_rng(0).choice(done, most, replace=False)), most / len(done)
 
 
 def _name(axis: Axis, start: int, stop: int) -> str:
     """Values of a part of an axis; numbers of its points where it has several parameters."""
     values = range(axis.size) if len(axis.members) > 1 else axis.members[0].display
-    ends = dict.fromkeys([_shown(values[start]), _shown(values[stop - 1])])
-    return "..".join(ends)
+    return "..".join(dict.fromkeys([_shown(values[start]), _shown(values[stop - 1])]))
 
 
 def _shown(value: object) -> str:
@@ -245,6 +242,7 @@ class ErrorRow:
     total: int = 0  # the same of all points
     most: int = 0
     index: tuple[int, ...] = ()  # place of that point in the array
+    looked_at: float = 1.0  # share of the blocks, of large studies
     _over: float = -math.inf
 
     @property
@@ -299,17 +297,15 @@ def rays_table(store: str | Location) -> list[ErrorRow]:
     path = located(store)
     _, study = studies.read(path)
     if isinstance(study, GridStudy):
-        tolerance = Accuracy(_tolerance(study)).for_beamlets
-        tolerance = np.maximum(tolerance, Accuracy.least_rays_tolerance)
-        rows = _rows(path, study, {"": "beamlets_error"}, "beamlets", tolerance)
+        limit = np.maximum(Accuracy(_tolerance(study)).for_beamlets, Accuracy.least_rays_tolerance)
+        rows = _rows(path, study, {"": "beamlets_error"}, "beamlets", limit)
         return [row for row in rows if row.missed]
     if not isinstance(study, FlightStudy) or not study.spec.rays_by_tolerance:
         return []
     found, group = [], open_group(path)
     for name in study.scanners:
-        errors = {name: f"{name}/beamlets_error"}
-        tolerance = np.asarray(study.spec.accuracy.tolerance)
-        for row in _rows(path, study, errors, f"{name}/beamlets", tolerance):
+        errors, tolerance = {name: f"{name}/beamlets_error"}, study.spec.accuracy.tolerance
+        for row in _rows(path, study, errors, f"{name}/beamlets", np.asarray(tolerance)):
             if row.points:
                 times: Any = group[f"{name}/time"]
                 time = f"time {float(np.asarray(times[row.index[-1]])):.4g} s"
@@ -326,10 +322,10 @@ def _rows(
     tolerance: np.ndarray,
 ) -> list[ErrorRow]:
     """Rows by the names of arrays of errors, and of draws or rays."""
-    found, axes = [ErrorRow(name) for name in errors], study.spec.axes
+    (blocks, share), axes = _some(path, study), study.spec.axes
+    found = [ErrorRow(name, looked_at=share) for name in errors]
     tolerance = np.broadcast_to(tolerance, study.layouts[number].shape)
-    names = [number, *errors.values()]
-    for place, (numbers, *widths) in pieces(path, study, names, done_blocks(path, study)):
+    for place, (numbers, *widths) in pieces(path, study, [number, *errors.values()], blocks):
         for row, error in zip(found, widths, strict=True):
             row.add(error, tolerance[place], numbers, tuple(part.start for part in place))
     for row in found:

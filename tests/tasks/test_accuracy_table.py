@@ -110,3 +110,20 @@ def test_the_table_after_a_run_tells_where_the_most_beamlets_are_too_few(tmp_pat
     assert "What more beamlets may change" in said and "2 of 3" in said
     met = small(footprint={"beamlets": "auto", "phases": "incoherent", "speckle": "none"}, axes={})
     assert rays_table(quiet(met, tmp_path / "met.zarr").store) == []
+
+
+def test_a_large_study_is_told_by_some_of_its_blocks(tmp_path, monkeypatch):
+    """Each block is a file or two: `sweep status` would wait for all of them."""
+    from sweep.tasks import summary
+
+    axes = {"target.range": [f"{k} km" for k in range(1, 9)]}
+    draws = {"draws": {"number": 20}}
+    store = quiet(small(**ROUGH | draws, axes=axes, storage={"block_points": 1}), tmp_path / "l")
+    whole = accuracy_table(store.store)
+    assert {row.looked_at for row in whole} == {1.0} and {row.points for row in whole} == {8}
+    monkeypatch.setattr(summary, "MOST_BLOCKS", 2)
+    rows = accuracy_table(store.store)
+    assert {row.looked_at for row in rows} == {2 / 8} and {row.points for row in rows} == {2}
+    assert all(row.error <= all_.error for row, all_ in zip(rows, whole, strict=True))
+    said = CliRunner().invoke(main, ["status", str(store.store)]).output
+    assert "by 25 % of" in " ".join(said.split())
