@@ -70,7 +70,7 @@ def status(store: Location) -> None:
     if s.failures:
         click.echo(f"sweep resume {store} --retry-failed  tries failed blocks again.")
     if s.blocks_done:
-        tell_accuracy(store)
+        tell_accuracy(store, s.done)
 
 
 def _tell_what_is_under_way(store: Location) -> None:

@@ -19,6 +19,8 @@ from rich.filesize import decimal
 from sweep.storage.locations import Location, located
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from sweep.spec import SceneSpec, Spec
     from sweep.tasks.plan import EffectRow, EffectsTable, Plan
     from sweep.tasks.session import Outcome
@@ -302,15 +304,15 @@ def _print_scene(store: Location) -> None:
     )
 
 
-def tell_accuracy(store: Location) -> None:
+def tell_accuracy(store: Location, done: np.ndarray | None = None) -> None:
     """Print how well what is drawn is known, what beamlets leave, and what is not known at all."""
     from sweep.tasks.summary import accuracy_table, beyond_model, rays_table
 
-    number, why = beyond_model(store)
+    number, why = beyond_model(store, done)
     if number:
         told = f"points beyond the model, which have no results: {number:,}; the first: {why}"
         tell(f"warning: {told}", err=True)
-    if rows := accuracy_table(store):
+    if rows := accuracy_table(store, done):
         print_table(
             "Half-widths of pd by its draws, and where accuracy.tolerance is met"
             + _looked_at(rows[0].looked_at),
@@ -329,7 +331,7 @@ def tell_accuracy(store: Location) -> None:
             ],
             "at",
         )
-    if rays := rays_table(store):
+    if rays := rays_table(store, done):
         kind, each = ("rays", "shot") if rays[0].name else ("beamlets", "point")
         print_table(
             f"What more {kind} may change{_looked_at(rays[0].looked_at)}",

@@ -73,7 +73,7 @@ def summary(store: str | Location) -> tuple[str, list[Row], float]:
     _, study = studies.read(path)
     if not isinstance(study, GridStudy):
         raise StoreError(f"{path} holds no study over a grid")
-    blocks, share = _some(path, study)
+    blocks, share = _some(path, study, None)
     axis = study.spec.axes[0] if study.spec.axes else None
     size = axis.size if axis else 1  # in parts of a value each, or of several where there are many
     edges = np.linspace(0, size, min(size, MOST_ROWS) + 1).astype(int)
@@ -93,13 +93,13 @@ def summary(store: str | Location) -> tuple[str, list[Row], float]:
     return f"{axis.name} [{units}]" if units else axis.name, [*rows, whole], share
 
 
-def beyond_model(store: str | Location) -> tuple[int, str]:
+def beyond_model(store: str | Location, done: np.ndarray | None = None) -> tuple[int, str]:
     """Count points beyond the model, of a sample; return the reason for the first."""
     path = located(store)
     _, study = studies.read(path)
     if not isinstance(study, GridStudy):
         return 0, ""
-    (blocks, _), number, why = _some(path, study), 0, ""
+    (blocks, _), number, why = _some(path, study, done), 0, ""
     for block, (_, (shot,)) in zip(blocks, pieces(path, study, ("pd_shot",), blocks), strict=True):
         points = np.flatnonzero(np.isnan(shot))
         if points.size and not number:
@@ -119,9 +119,9 @@ def why_beyond(study: GridStudy, block: int, point: np.ndarray) -> str:
     return "it is not any more"
 
 
-def _some(store: Location, study: Study) -> tuple[np.ndarray, float]:
-    """Blocks done to look at, rising: all, or some by chance but always the same; their share."""
-    done = done_blocks(store, study)
+def _some(store: Location, study: Study, done: np.ndarray | None) -> tuple[np.ndarray, float]:
+    """Blocks to look at, of those done: all, or some by chance but always the same; their share."""
+    done = np.flatnonzero(receipted(store, study)) if done is None else done
     most = min(MOST_BLOCKS, max(MOST_POINTS * study.n_blocks // study.points, 1))
     if len(done) <= most:
         return done, 1.0
@@ -138,11 +138,6 @@ def _shown(value: object) -> str:
     if not isinstance(value, float):
         return str(value)
     return f"{value:.0f}" if 1e4 <= abs(value) < 1e6 else f"{value:.4g}"
-
-
-def done_blocks(store: Location, study: Study) -> np.ndarray:
-    """Numbers of the blocks that have a receipt, rising."""
-    return np.flatnonzero(receipted(store, study))
 
 
 def pieces(
@@ -205,7 +200,7 @@ def scene_summary(store: str | Location) -> list[SceneRow]:
         for place in (places if apart else [()])
     }
     group: Any = open_group(path)
-    for block in done_blocks(path, study).tolist():
+    for block in np.flatnonzero(receipted(path, study)).tolist():
         _, part = study.part(block)
         regions = study.regions(block)
         names = (f"{part.scanner}/{name}" for name in ("flags", "pd_shot", "velocity_status"))
@@ -282,30 +277,30 @@ class ErrorRow:
             self.index = tuple(first + int(i) for first, i in zip(start, at, strict=True))
 
 
-def accuracy_table(store: str | Location) -> list[ErrorRow]:
+def accuracy_table(store: str | Location, done: np.ndarray | None = None) -> list[ErrorRow]:
     """Return a row for each promised probability; none if nothing is drawn or computed."""
     path = located(store)
     _, study = studies.read(path)
     if not isinstance(study, GridStudy) or not study.spec.draws.any:
         return []
     errors = {name: f"{name}_half_width" for name in PROMISED}
-    return [row for row in _rows(path, study, errors, "n_draws", _tolerance(study)) if row.points]
+    return [r for r in _rows(path, study, done, errors, "n_draws", _tolerance(study)) if r.points]
 
 
-def rays_table(store: str | Location) -> list[ErrorRow]:
+def rays_table(store: str | Location, done: np.ndarray | None = None) -> list[ErrorRow]:
     """Return a row for each scanner; of a grid one where even the most beamlets are too few."""
     path = located(store)
     _, study = studies.read(path)
     if isinstance(study, GridStudy):
         limit = np.maximum(Accuracy(_tolerance(study)).for_beamlets, Accuracy.least_rays_tolerance)
-        rows = _rows(path, study, {"": "beamlets_error"}, "beamlets", limit)
+        rows = _rows(path, study, done, {"": "beamlets_error"}, "beamlets", limit)
         return [row for row in rows if row.missed]
     if not isinstance(study, FlightStudy) or not study.spec.rays_by_tolerance:
         return []
     found, group = [], open_group(path)
     for name in study.scanners:
         errors, tolerance = {name: f"{name}/beamlets_error"}, study.spec.accuracy.tolerance
-        for row in _rows(path, study, errors, f"{name}/beamlets", np.asarray(tolerance)):
+        for row in _rows(path, study, done, errors, f"{name}/beamlets", np.asarray(tolerance)):
             if row.points:
                 times: Any = group[f"{name}/time"]
                 time = f"time {float(np.asarray(times[row.index[-1]])):.4g} s"
@@ -317,12 +312,13 @@ def rays_table(store: str | Location) -> list[ErrorRow]:
 def _rows(
     path: Location,
     study: GridStudy | FlightStudy,
+    done: np.ndarray | None,
     errors: Mapping[str, str],
     number: str,
     tolerance: np.ndarray,
 ) -> list[ErrorRow]:
     """Rows by the names of arrays of errors, and of draws or rays."""
-    (blocks, share), axes = _some(path, study), study.spec.axes
+    (blocks, share), axes = _some(path, study, done), study.spec.axes
     found = [ErrorRow(name, looked_at=share) for name in errors]
     tolerance = np.broadcast_to(tolerance, study.layouts[number].shape)
     for place, (numbers, *widths) in pieces(path, study, [number, *errors.values()], blocks):
@@ -354,6 +350,7 @@ class Status:
     points_done: int
     blocks: int
     blocks_done: int
+    done: np.ndarray  # their numbers
     points_begun: float  # drawn in part, in blocks that take long
     failures: dict[int, dict[str, Any]]  # of blocks that are not done, by block
     holder: journal.Holder | None  # who writes to it
@@ -394,6 +391,7 @@ def status(store: str | Location) -> Status:
         points_done=points,
         blocks=study.n_blocks,
         blocks_done=receipts.blocks,
+        done=np.flatnonzero(receipts.points),
         points_begun=sum(begun_points(path, study.id).values()),
         failures=journal.given_up(path, study.n_blocks),
         holder=holder,
