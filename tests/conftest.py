@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import signal
 import sys
 from math import pi
 from pathlib import Path
@@ -16,6 +17,10 @@ sys.path.insert(0, str(Path(__file__).parent / "tasks"))  # small studies, for o
 MEMORY, ROOM = Path("/dev/shm"), 8 << 30
 if MEMORY.is_dir() and os.access(MEMORY, os.W_OK) and shutil.disk_usage(MEMORY).free > ROOM:
     os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(MEMORY))
+
+# What starts tests in the background may have Ctrl-C ignored, which all processes would take over.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 _approx = pytest.approx
 
