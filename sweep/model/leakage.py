@@ -96,7 +96,7 @@ def inspect(origin, lines, noise, table, form, sizes, tangent, room, exempt, ser
         while left < 0.0 and least < sizes[2]:  # bins that tables hold take less than an integral
             least = min(1.25 * least, float(sizes[2]))
             left = noise[2] - _all_beyond(afar, least, mirror, noise, form)
-    known = n, lowest, highest, np.int64(0), faint / max(total, 1e-300)
+    known = n, lowest, highest, faint / max(total, 1e-300)
     if left >= 0.0:
         low, high = run_of(least, place, sizes)
         count = high - low + 1

@@ -422,32 +422,30 @@ def _put_envelope(square, ends, sizes, reach, envelope):
     """
     bins, cells = sizes[2], sizes[3]
     middle, half = bins * cells + cells - 1 + _BEYOND, cells // 2
-    number = reach.shape[1] - bins - 1
-    far, parts = np.empty(number), np.zeros((4, number))
-    for d in range(ends.shape[1] - 1, -1, -1):
-        for k in range(4):
-            for i in range(number):
-                parts[k, i] = parts[k, i] * reach[1, bins + 1 + i] + ends[k, d]
-    for i in range(number):
-        first = parts[0, i] * parts[0, i] + parts[1, i] * parts[1, i]
-        last = parts[2, i] * parts[2, i] + parts[3, i] * parts[3, i]
-        far[i] = first + last + 2.0 * math.sqrt(first * last)
+    for i in range(np.uint64(bins + 1), np.uint64(reach.shape[1])):
+        c, a, b, p, q = reach[1, i], 0.0, 0.0, 0.0, 0.0
+        for k in range(DERIVATIVES + 2):
+            d = DERIVATIVES + 1 - k
+            a, b = a * c + ends[0, d], b * c + ends[1, d]
+            p, q = p * c + ends[2, d], q * c + ends[3, d]
+        first, last = a * a + b * b, p * p + q * q
+        envelope[0, i] = first + last + 2.0 * math.sqrt(first * last)
+    pairs = np.empty(bins * cells + cells + 1)  # from the cell before the line on
+    for i in range(pairs.size):
+        up, down = np.uint64(middle - 1 + i), np.uint64(middle + 1 - i)
+        above = square[up] + square[up + np.uint64(half)]
+        below = square[down] + square[down - np.uint64(half)]
+        pairs[i] = _MARGIN * _MARGIN * max(above, below)
     most, area, before = 0.0, 0.0, 0.0  # of the square
     for i in range(reach.shape[1] - 1, -1, -1):
-        if i <= bins:
-            above, below = np.uint64(middle + i * cells), np.uint64(middle - i * cells)
-            total = 0.0
-            for k in range(-1, cells):  # from the cell before on
-                up, down = above + np.uint64(k), below - np.uint64(k)
-                total = max(
-                    total,
-                    square[up] + square[up + np.uint64(half)],
-                    square[down] + square[down - np.uint64(half)],
-                )
-            most = max(most, _MARGIN * _MARGIN * total)
+        if i > bins:
+            most = max(most, envelope[0, i])
         else:
-            most = max(most, far[i - bins - 1])
+            for k in range(i * cells, (i + 1) * cells + 1):
+                most = max(most, pairs[k])
         width = reach[0, i + 1] - reach[0, i] if i + 1 < reach.shape[1] else 0.0
         area += width * 0.5 * (most + before)  # an upper sum, where it falls ever slower
         before = most
-        envelope[0, i], envelope[1, i] = math.sqrt(most), area
+        envelope[0, i], envelope[1, i] = most, area
+    for i in range(reach.shape[1]):
+        envelope[0, i] = math.sqrt(envelope[0, i])

@@ -45,6 +45,9 @@ Python's that is written in a call."""
 BLOCK_SIZE = 128
 """Lines that are done together; constant, so that compiled loops need no tests of what overlaps."""
 
+TOGETHER = 32
+"""Of these, lines that are summed together: many echoes have few."""
+
 _X, _EVEN, _ODD, _RE, _IM, _LANES = (BLOCK_SIZE * k for k in range(6))
 
 LEAST_WIDTH = 14 * BLOCK_SIZE
@@ -178,18 +181,18 @@ def survey(room, n, power):
     Of amplitudes the sum is root n times the root of their squares, of powers their own.
     """
     lowest, highest, total, squares = room[PLACE, 0], room[PLACE, 0], 0.0, 0.0
-    for start in range(0, n, BLOCK_SIZE):
-        number = min(BLOCK_SIZE, n - start)
+    for start in range(0, n, TOGETHER):
+        number = min(TOGETHER, n - start)
         for i in range(number):
             re, im = room[RE, start + i], room[IM, start + i]
             room[BLOCK, _X + i], room[BLOCK, _RE + i] = room[PLACE, start + i], re * re + im * im
             room[BLOCK, _IM + i] = abs(re) + abs(im)
-        for i in range(number, BLOCK_SIZE):
+        for i in range(number, TOGETHER):
             room[BLOCK, _X + i] = room[PLACE, start]
             room[BLOCK, _RE + i], room[BLOCK, _IM + i] = 0.0, 0.0
         for i in range(8):  # eight side by side, in an order that no machine changes
             a, b = 0.0, 0.0
-            for k in range(BLOCK_SIZE // 8):
+            for k in range(TOGETHER // 8):
                 a += room[BLOCK, _IM + 8 * k + i]
                 b += room[BLOCK, _RE + 8 * k + i]
             room[BLOCK, _LANES + i], room[BLOCK, _LANES + 8 + i] = a, b
@@ -198,7 +201,7 @@ def survey(room, n, power):
             squares += room[BLOCK, _LANES + 8 + i]
         for i in range(8):
             c, d = room[BLOCK, _X + i], room[BLOCK, _X + i]
-            for k in range(BLOCK_SIZE // 8):
+            for k in range(TOGETHER // 8):
                 c = min(c, room[BLOCK, _X + 8 * k + i])
                 d = max(d, room[BLOCK, _X + 8 * k + i])
             room[BLOCK, _LANES + 16 + i], room[BLOCK, _LANES + 24 + i] = c, d
@@ -265,13 +268,13 @@ def put_on_nodes(room, re_row, im_row, n, nodes, span, out_re, out_im):
     inverse = 1.0 / half if half > 0.0 else 0.0
     for j in range(nodes + 1):
         room[MOMENT_RE, j], room[MOMENT_IM, j] = 0.0, 0.0
-    for start in range(0, n, BLOCK_SIZE):
-        number = min(BLOCK_SIZE, n - start)
+    for start in range(0, n, TOGETHER):
+        number = min(TOGETHER, n - start)
         for i in range(number):
             room[BLOCK, _X + i] = (room[PLACE, start + i] - middle) * inverse
             room[BLOCK, _RE + i] = room[re_row, start + i]
             room[BLOCK, _IM + i] = room[im_row, start + i]
-        for i in range(number, BLOCK_SIZE):
+        for i in range(number, TOGETHER):
             room[BLOCK, _X + i], room[BLOCK, _RE + i], room[BLOCK, _IM + i] = 0.0, 0.0, 0.0
         _add_moments(room, nodes)
     for i in range(nodes):
@@ -296,13 +299,13 @@ def put_on_nodes(room, re_row, im_row, n, nodes, span, out_re, out_im):
 @njit(cache=True, error_model="numpy")
 def _add_moments(room, nodes):
     """Add sums over a block of lines of their weights times T_0(x) .. T_nodes(x)."""
-    for i in range(BLOCK_SIZE):
+    for i in range(TOGETHER):
         room[BLOCK, _EVEN + i] = 1.0
         room[BLOCK, _ODD + i] = room[BLOCK, _X + i]
     for j in range(0, nodes, 2):
         for i in range(8):  # eight sums side by side, in an order that no machine changes
             a, b, c, d = 0.0, 0.0, 0.0, 0.0
-            for k in range(BLOCK_SIZE // 8):
+            for k in range(TOGETHER // 8):
                 re, im = room[BLOCK, _RE + 8 * k + i], room[BLOCK, _IM + 8 * k + i]
                 even, odd = room[BLOCK, _EVEN + 8 * k + i], room[BLOCK, _ODD + 8 * k + i]
                 a += re * even
@@ -321,7 +324,7 @@ def _add_moments(room, nodes):
         room[MOMENT_RE, j + 1] += b
         room[MOMENT_IM, j] += c
         room[MOMENT_IM, j + 1] += d
-        for i in range(BLOCK_SIZE):
+        for i in range(TOGETHER):
             twice = 2.0 * room[BLOCK, _X + i]
             even = twice * room[BLOCK, _ODD + i] - room[BLOCK, _EVEN + i]
             room[BLOCK, _EVEN + i] = even

@@ -91,9 +91,16 @@ def add_near(first, count, lines, table, sizes, room):
 
     Each line is shared out among cells; each of these has a row of the table.
     """
-    n, lowest, highest, _, _ = lines
+    n, lowest, highest, _ = lines
     cells, last = sizes[3], math.floor(highest)
     for start in range(math.floor(lowest), last + 1, WINDOW):
+        near = sizes[2] + WINDOW
+        least, most = (
+            -((near + start - first) // sizes[0]),
+            (first + count - start + near) // sizes[0],
+        )
+        if least > most:  # tables hold nothing of these lines there
+            continue
         number = min(WINDOW, last + 1 - start) * cells + POINTS
         for c in range(number):
             room[CELL_RE, c], room[CELL_IM, c] = 0.0, 0.0
@@ -108,8 +115,6 @@ def add_near(first, count, lines, table, sizes, room):
             if taken == BLOCK_SIZE or (b == n - 1 and taken > 0):
                 _share_out(taken, room)
                 taken = 0
-        near = sizes[2] + WINDOW
-        least, most = (first - start - near) // sizes[0], (first + count - start + near) // sizes[0]
         for lap in range(least, most + 1):
             _add_cells(first, count, (start, number, lap), table, sizes, room)
 
@@ -189,7 +194,7 @@ def take_sources(n, lowest, highest, distance, digits, sizes, room):
     number = n
     if half > 0.0:
         z = 1.0 + distance / half
-        number = 2 + int(digits / math.log(z + math.sqrt(z * z - 1.0)))
+        number = 1 + int(digits / math.log(z + math.sqrt(z * z - 1.0)))
     elif n > 1:
         number = 1
     put_on_nodes(room, A_RE, A_IM, n, number, (middle, half), S_A_RE, S_A_IM)
@@ -291,10 +296,9 @@ def add_far(start, end, at, rows, b, digits, form, sizes, room):
 def field(first, count, lines, table, form, sizes, tangent, room):
     """F in bins ``first`` .., counted from the lines' origin, into rows F_RE and F_IM.
 
-    ``lines``: their number, lowest and highest place, how many sources stand for them, 0 if there
-    are none, and what may be left out of the shape.
+    ``lines``: their number, lowest and highest place, and what may be left out of the shape.
     """
-    n, lowest, highest, sources, faint = lines
+    n, lowest, highest, faint = lines
     whole = sizes[5] != 0
     count = (count + 7) // 8 * 8  # whole vectors: a rest takes as long
     for i in range(count):
@@ -304,12 +308,11 @@ def field(first, count, lines, table, form, sizes, tangent, room):
     if whole or (highest - first < reach and first + count - lowest < reach):
         return
     digits = SOURCE_DIGITS
-    if sources == 0:
-        distance = max(gap_of(first, count, lowest, highest, sizes[0]), float(reach))
-        if faint > 0.0:
-            part = math.log(max(form[1, envelope_from(distance, form)] / faint, 1.0))
-            digits = min(digits, 4.0 + (2.0 * part if sizes[4] else part))
-        sources = take_sources(n, lowest, highest, distance, digits, sizes, room)
+    distance = max(gap_of(first, count, lowest, highest, sizes[0]), float(reach))
+    if faint > 0.0:
+        part = math.log(max(form[1, envelope_from(distance, form)] / faint, 1.0))
+        digits = min(digits, 4.0 + (2.0 * part if sizes[4] else part))
+    sources = take_sources(n, lowest, highest, distance, digits, sizes, room)
     # Bins of which tables hold some lines, if not all; but for these, sources do.
     begun = math.floor(lowest)
     last = begun + (math.floor(highest) - begun) // WINDOW * WINDOW
@@ -370,7 +373,7 @@ def magnitudes(low, count, origin, lines, shifts, table, form, sizes, tangent, r
     ``shifts`` (2, m): places [bins] and weights over which |X|^2 is averaged; m may be 0.
     """
     power, view = sizes[4] != 0, sizes[7]
-    n, lowest, highest, sources, faint = lines
+    n, lowest, highest, faint = lines
     sign = -1 if is_turned(origin, lowest, highest, view) else 1
     many = shifts.shape[1] > 0
     if many:
@@ -380,7 +383,6 @@ def magnitudes(low, count, origin, lines, shifts, table, form, sizes, tangent, r
         if many:
             for b in range(n):
                 room[PLACE, b] += apart
-            sources = 0
         for turn in range(2 if view == IMAGED else 1):  # the lines, then their images
             way = sign if turn == 0 else -sign
             first = low - origin if way > 0 else 1 - low - count - origin
@@ -388,7 +390,7 @@ def magnitudes(low, count, origin, lines, shifts, table, form, sizes, tangent, r
                 gap = gap_of(first, count, lowest + apart, highest + apart, sizes[0])
                 if form[1, envelope_from(gap, form)] <= faint:
                     continue
-            moved = n, lowest + apart, highest + apart, sources, faint
+            moved = n, lowest + apart, highest + apart, faint
             field(first, count, moved, table, form, sizes, tangent, room)
             for i in range(count):
                 j = i if way > 0 else count - 1 - i
@@ -484,7 +486,7 @@ def detect(origin, lines, levels, shifts, table, form, sizes, tangent, room, exe
     for m in range(shifts.shape[1]):
         before, after = min(before, shifts[0, m]), max(after, shifts[0, m])
     place = seen(origin, lowest + before, highest + after, sizes)
-    level, sources, weight = levels[1], 0, total
+    level, weight = levels[1], total
     beyond = stays_below(level, weight, place, form, sizes)
     if not level > 0.0:
         beyond = np.inf
@@ -492,7 +494,7 @@ def detect(origin, lines, levels, shifts, table, form, sizes, tangent, room, exe
         sources = take_sources(n, lowest, highest, float(sizes[6]), SOURCE_DIGITS, sizes, room)
         weight = weight_afar(total, sources, sizes, room)
         beyond = max(stays_below(level, weight, place, form, sizes), 2.0 * sizes[6])
-    known = n, lowest, highest, sources, least / max(total, 1e-300)
+    known = n, lowest, highest, least / max(total, 1e-300)
     beyond = max(beyond, 2.0 * sizes[8])  # main lobes beside bins of half the largest
     while True:
         low, high = run_of(beyond, place, sizes)

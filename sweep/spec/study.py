@@ -291,7 +291,9 @@ class Study(Part):
         return digest(self.identity())
 
     def __eq__(self, other: object) -> bool:
-        return type(other) is type(self) and self.to_json() == other.to_json()  # type: ignore[attr-defined]
+        if not isinstance(other, type(self)):
+            return False
+        return (self._written, self._digests) == (other._written, other._digests)
 
     def __hash__(self) -> int:
         return hash(self.id)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import gc
 import math
 import os
 import socket
@@ -421,8 +422,11 @@ class Session:
     def _compile(self) -> None:
         if self._pool.options.evaluate:  # in place of the model
             return
+        threshold = gc.get_threshold()
+        gc.set_threshold(100_000)  # a compiler's objects live on: looking at them takes a tenth
         with suppress(Exception):  # what raises here is a block's failure, recorded as one
             self._study.compile()
+        gc.set_threshold(*threshold)
 
     def _take(self, answers: Iterator[Answer], blocks: BlockQueue) -> str:
         told, absence = False, Absence()

@@ -39,7 +39,7 @@ def seen(sizes, power, places, weights, first, count, shape):
     n, places = places.size, places + shift
     room = np.empty((ROOM, max(count, LEAST_WIDTH, MOST_CELLS) + 16))
     room[PLACE, :n], room[RE, :n], room[IM, :n] = places, weights.real, weights.imag
-    lines = n, places.min(), places.max(), 0, 0.0
+    lines = n, places.min(), places.max(), 0.0
     field(first, count, lines, table, form, numbers, tangents(sizes[0]), room)
     return room[F_RE, :count] + (0 if power else 1j * room[F_IM, :count])
 

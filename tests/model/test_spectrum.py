@@ -42,7 +42,7 @@ def magnitudes(name, sizes, origin, delta, weights, *, power=False, low=0, high=
     room[PLACE, :n], room[IM, :n] = delta, 0.0 if power else np.imag(weights)
     room[RE, :n] = np.abs(weights) ** 2 if power else np.real(weights)
     magnitudes_of(
-        low, count, origin, (n, delta.min(), delta.max(), 0, 0.0), np.empty((2, 0)), table, form,
+        low, count, origin, (n, delta.min(), delta.max(), 0.0), np.empty((2, 0)), table, form,
         numbers, tangents(fft_size), room,
     )  # fmt: skip
     return room[OUT, :count].copy()

@@ -39,7 +39,7 @@ def kernel(name: str, size: int, delta: float, bins: Iterable[int]) -> Iterator[
     room = np.empty((ROOM, max(LEAST_WIDTH, MOST_CELLS) + 16))
     room[PLACE, 0], room[RE, 0], room[IM, 0] = delta, 1.0, 0.0
     for k in bins:
-        field(k, 1, (1, delta, delta, 0, 0.0), table, form, sizes, tangents(size), room)
+        field(k, 1, (1, delta, delta, 0.0), table, form, sizes, tangents(size), room)
         yield float(np.hypot(room[F_RE, 0], room[F_IM, 0]))
 
 
