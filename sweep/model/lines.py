@@ -43,14 +43,14 @@ blocks of lines; moments. They are NumPy's integers, as numba compiles a functio
 Python's that is written in a call."""
 
 BLOCK_SIZE = 128
-"""Lines that are done together; constant, so that compiled loops need no tests of what overlaps."""
+"""Nodes that are done together; constant, so that compiled loops need no tests of what overlaps."""
 
 TOGETHER = 32
-"""Of these, lines that are summed together: many echoes have few."""
+"""Lines that are summed together: many echoes have few."""
 
 _X, _EVEN, _ODD, _RE, _IM, _LANES = (BLOCK_SIZE * k for k in range(6))
 
-LEAST_WIDTH = 14 * BLOCK_SIZE
+LEAST_WIDTH = 6 * BLOCK_SIZE
 """Of scratch."""
 
 COMMON = 17

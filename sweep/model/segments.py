@@ -295,18 +295,19 @@ def _sorted(part: np.ndarray, which: np.ndarray, shapes: Shapes, *modes: np.ndar
 
 def _different(shots: Shots, some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Points of which no two have the same phase errors; which of these each of some points has."""
-    of_all = [
+    of_all = (
         np.broadcast_to(np.asarray(one, float), shots.size)[some]
         for error in shots.phase_errors
         for value in error.values.values()
         for one in (value if isinstance(value, tuple) else (value,))
-    ]
-    varying = [v for v in of_all if (v != v[0]).any()]
-    if not varying:
+    )
+    varying = (v for v in of_all if (v != v[0]).any())
+    first_varying = next(varying, None)
+    if first_varying is None:
         return some[:1], np.zeros(some.size, np.int64)
     if not shots.alike:
         return some, np.arange(some.size)
-    first, which = different_rows(varying)
+    first, which = different_rows([first_varying, *varying])
     return some[first], which
 
 

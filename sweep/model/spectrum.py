@@ -22,7 +22,7 @@ from numpy.polynomial.chebyshev import cheb2poly, chebfit
 from sweep.model.detection import mark
 from sweep.model.elementary import sincos_cycles
 from sweep.model.line_shape import CELLS, POINTS, kernel
-from sweep.model.lines import BLOCK, BLOCK_SIZE, IM, PLACE, RE, X, put_on_nodes
+from sweep.model.lines import IM, PLACE, RE, X, put_on_nodes
 
 CELL_RE, CELL_IM, A_RE, A_IM, B_RE, B_IM = np.arange(7, 13)
 """Rows of scratch: cells; strengths of lines as the record's two ends see them."""
@@ -39,10 +39,10 @@ F_RE, F_IM, OUT, OUT_IM = np.arange(18, 22)
 TAN, TURN_RE, TURN_IM, COT, P_RE, P_IM, Q_RE, Q_IM = np.arange(22, 30)
 """Of bins far away: tan(pi k / N), exp(i pi r k), and scratch."""
 
-SUM, HALF_SQUARE, CHANCE, POINT, WEIGHT, SHARES = np.arange(30, 36)
-"""Of averages; of leakage; of lines among cells."""
+SUM, HALF_SQUARE, CHANCE, POINT, WEIGHT = np.arange(30, 35)
+"""Of averages; of leakage."""
 
-ROOM = 36
+ROOM = 35
 """Rows in all."""
 
 ZERO = np.int64(0)
@@ -67,22 +67,22 @@ WINDOW = 8
 EDGE = POINTS // 2 // CELLS[0] + 1
 """Bins beside a window in which its lines have cells."""
 
-MOST_CELLS = WINDOW * CELLS[1] + POINTS
+_SPARE = 2
+"""Cells of no weight beyond those among which a line is shared out, for whole vectors."""
+
+MOST_CELLS = WINDOW * CELLS[1] + POINTS + _SPARE
 
 BESIDE = WINDOW + EDGE + 1
 """Bins by which tables may hold less about a line than on either side of a cell."""
 
-_PART, _CELL, _RE, _IM = (BLOCK_SIZE * k for k in range(4))
-"""Of a block of lines: places beyond their cell, cells, and weights."""
-
 DEGREE = 13
 
 _s = np.cos(np.pi * (np.arange(DEGREE + 1) + 0.5) / (DEGREE + 1))
-BASIS = np.array([
-    cheb2poly(chebfit(_s, kernel((_s + 1) / 2 - j), DEGREE))
-    for j in range(1 - POINTS // 2, POINTS // 2 + 1)
-]).T.copy()  # fmt: skip
+BASIS = np.zeros((DEGREE + 1, POINTS + _SPARE))
 """Polynomials of the kernel, by power of s = -1 .. 1 across a cell and by cell."""
+
+for _j in range(POINTS):
+    BASIS[:, _j] = cheb2poly(chebfit(_s, kernel((_s + 1) / 2 - _j + POINTS // 2 - 1), DEGREE))
 
 
 @njit(cache=True, error_model="numpy")
@@ -95,46 +95,32 @@ def add_near(first, count, lines, table, sizes, room):
     cells, last = sizes[3], math.floor(highest)
     for start in range(math.floor(lowest), last + 1, WINDOW):
         near = sizes[2] + WINDOW
-        least, most = (
-            -((near + start - first) // sizes[0]),
-            (first + count - start + near) // sizes[0],
-        )
+        least = -((near + start - first) // sizes[0])
+        most = (first + count - start + near) // sizes[0]
         if least > most:  # tables hold nothing of these lines there
             continue
         number = min(WINDOW, last + 1 - start) * cells + POINTS
-        for c in range(number):
+        for c in range(number + _SPARE):
             room[CELL_RE, c], room[CELL_IM, c] = 0.0, 0.0
-        taken = 0
         for b in range(n):
             if start <= room[PLACE, b] < start + WINDOW:
                 place = (room[PLACE, b] - start) * cells
-                room[BLOCK, _PART + taken] = 2.0 * (place - math.floor(place)) - 1.0
-                room[BLOCK, _CELL + taken] = math.floor(place)
-                room[BLOCK, _RE + taken], room[BLOCK, _IM + taken] = room[RE, b], room[IM, b]
-                taken += 1
-            if taken == BLOCK_SIZE or (b == n - 1 and taken > 0):
-                _share_out(taken, room)
-                taken = 0
+                _share_out(place, room[RE, b], room[IM, b], room)
         for lap in range(least, most + 1):
             _add_cells(first, count, (start, number, lap), table, sizes, room)
 
 
 @njit(cache=True, error_model="numpy")
-def _share_out(number, room):
-    """Share a block of lines out among cells, POINTS of them each."""
-    for j in range(POINTS):
-        for i in range(number):
-            weight, part = BASIS[DEGREE, j], room[BLOCK, _PART + i]
-            for d in range(DEGREE - 1, -1, -1):
-                weight = weight * part + BASIS[d, j]
-            room[SHARES, j * BLOCK_SIZE + i] = weight
-    for i in range(number):
-        cell = np.uint64(room[BLOCK, _CELL + i])
-        re, im = room[BLOCK, _RE + i], room[BLOCK, _IM + i]
-        for j in range(np.uint64(POINTS)):
-            share = room[SHARES, j * np.uint64(BLOCK_SIZE) + np.uint64(i)]
-            room[CELL_RE, cell + j] += re * share
-            room[CELL_IM, cell + j] += im * share
+def _share_out(place, re, im, room):
+    """Share a line at a place among cells out among POINTS of them."""
+    cell = np.uint64(math.floor(place))
+    part = 2.0 * (place - math.floor(place)) - 1.0
+    for j in range(np.uint64(POINTS + _SPARE)):
+        weight = BASIS[DEGREE, j]
+        for d in range(DEGREE):
+            weight = weight * part + BASIS[DEGREE - 1 - d, j]
+        room[CELL_RE, cell + j] += re * weight
+        room[CELL_IM, cell + j] += im * weight
 
 
 @njit(cache=True, error_model="numpy")
