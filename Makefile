@@ -6,7 +6,7 @@ READY := .venv/.ready
 KERNELS := .venv/.kernels
 TIMED := .ci/timed
 
-.PHONY: install-core install demo test timed-lint timed-kernels test-all lint size stability fuzz chaos side-by-side effects accuracy stopping frozen promise detectors peers scaling validation instruments docs fields scale million lock forget-kernels clean
+.PHONY: install-core install demo test timed-lint timed-kernels test-all lint size stability fuzz chaos side-by-side effects accuracy stopping frozen promise detectors peers scaling validation instruments docs fields scale million lock clean
 SEED ?= 1
 
 # What grids and figures need; the demo needs no more.
@@ -50,10 +50,8 @@ lint: $(READY)
 	$(BIN)/mypy
 	$(BIN)/mypy --disable-error-code arg-type --disable-error-code index benchmarks
 
-# Once for all processes of tests, which would each compile the same. A compiled kernel's cache does
-# not notice a change in a kernel that it calls: where any has changed it begins anew.
+# Once for all processes of tests, which would each compile the same.
 $(KERNELS): $(READY) $(shell grep -rl --include='*.py' numba sweep)
-	$(MAKE) forget-kernels
 	$(MAKE) compile-grids compile-flights
 	touch $@
 
@@ -142,9 +140,6 @@ docs: $(READY)
 fields: $(READY)
 	$(BIN)/python docs/field_reference.py
 	$(BIN)/python docs/variable_reference.py
-
-forget-kernels:
-	find sweep -name '*.nb[ci]' -delete
 
 clean:
 	rm -rf .venv results build *.egg-info

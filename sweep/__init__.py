@@ -75,7 +75,26 @@ def _keep_kernels() -> None:
         sys.modules["numba"].config.CACHE_DIR = os.environ["NUMBA_CACHE_DIR"]
 
 
+def _forget_kernels() -> None:
+    """Delete kernels in the package that were compiled from other sources than are there now.
+
+    A kernel has those that it calls built in, but numba's cache looks at its own file alone: where
+    another has changed it would go on with the old one.
+    """
+    model = Path(__file__).parent / "model"
+    compiled_from = model / "__pycache__" / "compiled_from"
+    with suppress(OSError):
+        found = sorted((str(path), path.stat()) for path in model.rglob("*.py"))
+        sources = "\n".join(f"{path} {seen.st_size} {seen.st_mtime_ns}" for path, seen in found)
+        if not compiled_from.exists() or compiled_from.read_text() != sources:
+            for kernel in model.rglob("*.nb[ci]"):
+                kernel.unlink(missing_ok=True)
+            compiled_from.parent.mkdir(exist_ok=True)
+            compiled_from.write_text(sources)
+
+
 _keep_kernels()
+_forget_kernels()
 
 
 def __getattr__(name: str) -> Any:

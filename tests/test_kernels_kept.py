@@ -53,3 +53,26 @@ def test_without_a_folder_of_its_own_kernels_are_kept_in_a_temporary_one(install
     (tmp_path / mine).chmod(0o777)  # others may have put code there
     another = kept(installed, tmp_path)
     assert another != mine and another.startswith("sweep-kernels-")
+
+
+def test_kernels_of_other_sources_are_forgotten(tmp_path):
+    """One that calls a changed one too, whose own file is as it was."""
+    package = tmp_path / "sweep"
+    shutil.copytree(
+        Path(sweep.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__")
+    )
+    environment = {name: value for name, value in os.environ.items() if "NUMBA" not in name}
+
+    def kernels(code):
+        command = [sys.executable, "-c", code]
+        subprocess.run(
+            command, check=True, cwd=tmp_path, env=environment | {"PYTHONPATH": str(tmp_path)}
+        )
+        return {path.name: path.stat().st_mtime_ns for path in package.rglob("*.nbi")}
+
+    compiled = kernels(CODE.replace("assert", "#").replace("print", "#"))
+    assert any(name.startswith("bvh.") for name in compiled)
+    assert kernels("import sweep") == compiled
+    with (package / "model" / "elementary.py").open("a") as changed:
+        changed.write("\n")
+    assert kernels("import sweep") == {}

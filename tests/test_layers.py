@@ -34,7 +34,7 @@ NOT_IN_THE_MODEL = {
 """Pure physics: arrays in, arrays out."""
 
 LARGEST_HOUSE = {
-    "lines": 47_752, "modules": 166, "lines of the model": 18_845, "modules of the model": 77,
+    "lines": 47_771, "modules": 166, "lines of the model": 18_845, "modules of the model": 77,
     "compiled functions": 129, "arguments of a compiled function": 10,
 }  # fmt: skip
 """Upper limits on the size of sweep/."""
