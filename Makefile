@@ -12,19 +12,17 @@ SEED ?= 1
 # What grids and figures need; the demo needs no more.
 $(CORE): pyproject.toml requirements.lock
 	$(PYTHON) -c 'import sys; sys.exit("sweep needs Python >= 3.11" if sys.version_info < (3, 11) else 0)'
-	$(TIMED) "core" $(MAKE) --no-print-directory install-core
-	touch $@
-
-install-core:
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --constraint requirements.lock --editable .
+	$(TIMED) "core" $(BIN)/pip install --quiet --constraint requirements.lock --editable .
+	touch $@
 
 $(READY): $(CORE)
-	$(TIMED) "install" $(MAKE) --no-print-directory install
+	$(TIMED) "install" $(BIN)/pip install --quiet --requirement requirements.lock
 	touch $@
 
-install:
-	$(BIN)/pip install --quiet --requirement requirements.lock
+install-core: $(CORE)
+
+install: $(READY)
 
 demo: $(CORE)
 	$(BIN)/sweep run experiments/quickstart.yaml --store results/quickstart.zarr --overwrite
@@ -58,8 +56,7 @@ $(KERNELS): $(READY) $(shell grep -rl --include='*.py' numba sweep)
 compile-%: $(READY)
 	$(BIN)/python tests/compiling.py $*
 
-# Lines, modules and compiled functions; tests/test_layers.py holds what they may come to. And the
-# modules that a run of a grid and of a flight enters.
+# Lines, modules and compiled functions, and the modules that a run of a grid and of a flight enters.
 size: $(READY)
 	$(BIN)/python tests/house_size.py
 	$(BIN)/python tests/modules_entered.py experiments/quickstart.yaml experiments/square_low_descent.yaml
