@@ -1,7 +1,8 @@
 """Monte Carlo sweeps of FMCW Doppler lidar performance.
 
 `load` a spec, `run` it into a store, `open` the store as an xarray Dataset; the store of a scene
-as a DataTree with `open_scene`; `export` its point clouds, or see what the unit `reports`.
+as a DataTree with `open_scene`; `export` its point clouds, or see what the unit `reports`. `status`
+says how far a store is, `verify` checks every byte of it.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ if TYPE_CHECKING:  # as checkers of programs that use it see the names below
     from sweep.analysis.reports import reports
     from sweep.spec import load
     from sweep.tasks.driver import extend, resume, run
+    from sweep.tasks.summary import status
+    from sweep.tasks.verify import verify
 
 __version__ = _version("sweep")
 
@@ -34,10 +37,13 @@ _HOMES = {
     "open_scene": "sweep.analysis.opening",
     "export": "sweep.analysis.export",
     "reports": "sweep.analysis.reports",
+    "status": "sweep.tasks.summary",
+    "verify": "sweep.tasks.verify",
 }
 
 __all__ = [
     "__version__", "export", "extend", "load", "open", "open_scene", "reports", "resume", "run",
+    "status", "verify",
 ]  # fmt: skip
 
 

@@ -12,16 +12,17 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 MAY_IMPORT = {
     "units": {"units"},
     "extras": {"extras"},
-    "storage": {"storage"},
+    "messages": {"messages"},
+    "storage": {"storage", "messages"},
     "model": {"model"},
-    "scenes": {"scenes", "model", "units"},
-    "spec": {"spec", "scenes", "model", "units"},
-    "tasks": {"tasks", "extras", "storage", "spec", "scenes", "model", "units"},
-    "analysis": {"analysis", "storage", "spec", "scenes", "model", "units"},
-    "report": {"report", "analysis", "storage", "spec", "scenes", "model", "units"},
+    "scenes": {"scenes", "messages", "model", "units"},
+    "spec": {"spec", "messages", "scenes", "model", "units"},
+    "tasks": {"tasks", "extras", "messages", "storage", "spec", "scenes", "model", "units"},
+    "analysis": {"analysis", "messages", "storage", "spec", "scenes", "model", "units"},
+    "report": {"report", "analysis", "messages", "storage", "spec", "scenes", "model", "units"},
     "cli": {
-        "cli", "extras", "tasks", "report", "analysis", "storage", "spec", "scenes", "model",
-        "units",
+        "cli", "extras", "messages", "tasks", "report", "analysis", "storage", "spec", "scenes",
+        "model", "units",
     },
     "__init__": {"tasks", "analysis", "spec"},
 }  # fmt: skip
@@ -32,6 +33,7 @@ NOT_IN_THE_MODEL = {
     "rich", "trimesh", "xarray", "yaml", "zarr",
 }  # fmt: skip
 """Pure physics: arrays in, arrays out."""
+
 
 @cache
 def _nodes(path: Path) -> list[ast.AST]:

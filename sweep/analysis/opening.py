@@ -13,6 +13,7 @@ import numpy as np
 import xarray as xr
 
 from sweep.analysis.answers import comparison, errors, limits, physical, probability
+from sweep.messages import suggestion
 from sweep.model.outputs import RUNNING
 from sweep.spec import SceneSpec, Spec
 from sweep.storage import opening
@@ -154,8 +155,8 @@ def refuse_lost(path: Location) -> None:
                 if opening.digest(path, [name]) == record["digest"]:
                     continue
             raise NotAStoreError(
-                f"{path} has lost {name}, of a coordinate: `sweep verify {path} --repair` puts "
-                "it back"
+                f"{path} has lost {name}, of a coordinate: "
+                f"{suggestion('verify', path, repair=True)} puts it back"
             )
 
 

@@ -19,6 +19,7 @@ from sweep.analysis import labels
 from sweep.analysis.export import chosen
 from sweep.analysis.figures import SceneStudy
 from sweep.analysis.scenes.recording import INTERPOLATED, Recording, by_ranges
+from sweep.messages import STORE, suggestion
 from sweep.model.pairing import UNCONFIRMED
 from sweep.spec import Mistake, SpecError
 from sweep.spec.scene import Interface
@@ -121,7 +122,8 @@ def _shots(recording: Recording, draw: int, ranges: str) -> Table:
         parts.append(table)
     if not any(part["time"].size for part in parts):
         rule = f"holds no shot of {recording.scanner} and draw {draw} yet"
-        raise SpecError([Mistake("store", rule, "", "sweep resume goes on with it")])
+        remedy = f"{suggestion('resume', STORE)} goes on with it"
+        raise SpecError([Mistake("store", rule, "", remedy)])
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 

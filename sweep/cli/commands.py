@@ -38,6 +38,7 @@ from sweep.cli.terminal import (
     warn_before,
     warn_of,
 )
+from sweep.messages import PrintableStream, as_command
 from sweep.storage.locations import Location
 
 #: Errors of a file or folder that is not to be used: no permission, no room, something in the way.
@@ -54,6 +55,18 @@ class Commands(click.Group):
         """Add a command, listed with the whole first paragraph of its help."""
         cmd.short_help = " ".join((cmd.help or "").split("\n\n")[0].split())
         super().add_command(cmd, name)
+
+    def main(self, *args: Any, **kwargs: Any) -> Any:
+        """Run the command line; whatever it prints, a traceback too, is printable.
+
+        Streams stay wrapped, as Python prints the traceback of an error after this function.
+        """
+        for name in ("stdout", "stderr"):
+            stream = getattr(sys, name)
+            if stream is not None and not isinstance(stream, PrintableStream):
+                setattr(sys, name, PrintableStream(stream))
+        with as_command():
+            return super().main(*args, **kwargs)
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run a command; what is not a mistake of the user's keeps its traceback."""

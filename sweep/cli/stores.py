@@ -19,6 +19,7 @@ from sweep.cli.terminal import (
     tell,
     tell_accuracy,
 )
+from sweep.messages import command_line, one_line
 from sweep.storage.locations import Location, beside, files_below
 
 if TYPE_CHECKING:
@@ -44,7 +45,7 @@ def status(store: Location) -> None:
 
     s = read(store)
     left = duration(s.left) if s.rate else "unknown"
-    click.echo(f"{s.title or store}\nstudy {s.study_id}")
+    click.echo(f"{one_line(s.title or store)}\nstudy {one_line(s.study_id)}")
     tell(
         f"{s.points_done:,} of {s.points:,} {s.unit}, {s.blocks_done:,} of {s.blocks:,} blocks"
         f"{f', {amount(s.points_begun)} more begun' if s.points_begun else ''}"
@@ -55,7 +56,7 @@ def status(store: Location) -> None:
         click.echo(f"{rate} in the last run, by {counted(s.workers, 'worker')}")
     if s.holder_lives and s.holder:
         tell(
-            f"running: process {s.holder.pid} on {s.holder.host}, {left} left, "
+            f"running: process {one_line(s.holder.pid)} on {one_line(s.holder.host)}, {left} left, "
             f"last heartbeat {duration(s.heartbeat)} ago"
         )
     elif s.complete:
@@ -63,12 +64,13 @@ def status(store: Location) -> None:
     elif s.blocks - s.blocks_done == len(s.failures):
         click.echo("not running; all that is left has failed")
     else:
-        click.echo(f"not running; sweep resume {store}  goes on.")
+        click.echo(f"not running; {command_line('resume', store)}  goes on.")
     _tell_what_is_under_way(store)
     for block, failure in sorted(s.failures.items()):
-        tell(f"block {block} failed on {failure['host']}: {failure['error']}")
+        tell(f"block {block} failed on {one_line(failure['host'])}: {failure['error']}")
     if s.failures:
-        click.echo(f"sweep resume {store} --retry-failed  tries failed blocks again.")
+        retry = command_line("resume", store, retry_failed=True)
+        click.echo(f"{retry}  tries failed blocks again.")
     if s.blocks_done:
         tell_accuracy(store, s.done)
 
@@ -82,7 +84,7 @@ def _tell_what_is_under_way(store: Location) -> None:
     try:
         if new := under_way(real(store)):
             what = "extended" if EXTENDS in read_recipe(new) else "replaced"
-            click.echo(f"being {what}: sweep status {new}  says how far that is.")
+            click.echo(f"being {what}: {command_line('status', new)}  says how far that is.")
     except StoreError as error:
         click.echo(str(error))
 
@@ -128,7 +130,7 @@ def verify(store: Location, repair: bool, spec_file: Path | None) -> None:
         _say_what_to_do(store, reports)
         sys.exit(DAMAGED)
     if not all(report.complete for report in reports):
-        click.echo(f"sweep resume {store}  goes on.", err=True)
+        click.echo(f"{command_line('resume', store)}  goes on.", err=True)
         sys.exit(INCOMPLETE)
 
 
@@ -178,9 +180,11 @@ def _say_what_to_do(store: Location, reports: list[Report]) -> None:
             )
     found = {damage.mended_by for report in reports for damage in report.damages}
     if "repair" in found:
-        click.echo(f"sweep verify {store} --repair  puts back what is not results.", err=True)
+        repair = command_line("verify", store, repair=True)
+        click.echo(f"{repair}  puts back what is not results.", err=True)
     if "resume" in found:
-        click.echo(f"sweep resume {store}  computes what is lost and mends the journal.", err=True)
+        resume = command_line("resume", store)
+        click.echo(f"{resume}  computes what is lost and mends the journal.", err=True)
     if "hand" in found:
         click.echo("What is no part of a store is not sweep's to remove: remove it.", err=True)
 

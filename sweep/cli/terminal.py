@@ -16,6 +16,7 @@ import click
 from click.shell_completion import CompletionItem
 from rich.filesize import decimal
 
+from sweep.messages import command_line, one_line, printable
 from sweep.storage.locations import Location, located
 
 if TYPE_CHECKING:
@@ -236,18 +237,19 @@ def conclude(outcome: Outcome, store: Location) -> None:
         f"in {duration(outcome.seconds)}"
     )
     if outcome.complete:
-        click.echo(f"sweep figures {store}  draws it.")
+        click.echo(f"{command_line('figures', store)}  draws it.")
         return
     for failure in outcome.failures[:5]:
         tell(f"block {failure.block} failed: {failure.error}", err=True)
     left = outcome.blocks - outcome.blocks_done
     failed = len(outcome.failures) + outcome.left_out
-    why = outcome.stopped or f"{failed:,} failed; sweep status {store}  tells why"
+    why = outcome.stopped or f"{failed:,} failed; {command_line('status', store)}  tells why"
     click.echo(f"Incomplete, {left:,} of {outcome.blocks:,} blocks left: {why}.", err=True)
     if left > failed:
-        click.echo(f"sweep resume {store}  goes on.", err=True)
+        click.echo(f"{command_line('resume', store)}  goes on.", err=True)
     if failed:
-        click.echo(f"sweep resume {store} --retry-failed  tries failed blocks again.", err=True)
+        retry = command_line("resume", store, retry_failed=True)
+        click.echo(f"{retry}  tries failed blocks again.", err=True)
     sys.exit(INCOMPLETE)
 
 
@@ -362,6 +364,8 @@ def print_table(title: str, headings: list[str], rows: list[list[str]], words: s
     from rich.markup import escape
     from rich.table import Table
 
+    title = printable(title)
+    rows = [[one_line(cell) for cell in row] for row in rows]
     table, console = Table(title=title, title_justify="left", box=SIMPLE_HEAD), Console()
     columns = [[heading, *cells] for heading, *cells in zip(headings, *rows, strict=True)]
     whole = [max(map(len, column)) for column in columns]

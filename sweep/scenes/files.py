@@ -13,11 +13,12 @@ from urllib.parse import unquote
 
 import numpy as np
 
+from sweep.messages import PrintableError
 from sweep.model.geometry.quaternion import from_heading
 from sweep.units import QuantityError, read_unit
 
 
-class SceneError(Exception):
+class SceneError(PrintableError):
     """A file that a scene can not be made of: the rule broken, and what to do about it."""
 
     def __init__(self, file: str | Path, rule: str, remedy: str) -> None:

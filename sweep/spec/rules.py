@@ -24,6 +24,7 @@ import numpy as np
 from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
+from sweep.messages import printable
 from sweep.model.effects.phase_errors import NO_TABLE
 from sweep.model.effects.sweep_table import sweep_table
 from sweep.model.window import ALIASES, COSINE_SUMS
@@ -59,7 +60,7 @@ class Mistake:
         place = f"{self.file}:{self.line}: " if self.line else f"{self.file}: " if self.file else ""
         said = f"{self.path}: {self.rule}" if self.path else self.rule
         wrote = f" (you wrote {self.value})" if self.value else ""
-        return place + said + wrote + (f"; {self.suggestion}" if self.suggestion else "")
+        return printable(place + said + wrote + (f"; {self.suggestion}" if self.suggestion else ""))
 
 
 class SpecError(Exception):

@@ -35,6 +35,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
+from sweep.messages import printable
+
 #: Kinds of addresses; `memory` is for tests, and lives as long as its process.
 SCHEMES = ("s3", "gs", "az", "memory")
 
@@ -80,7 +82,7 @@ class ObjectStoreError(OSError):
     """An object store that can't be used as asked: the text says why and what to do."""
 
     def __str__(self) -> str:
-        return f"{self.filename}: {self.strerror}"
+        return printable(f"{self.filename}: {self.strerror}")
 
 
 @dataclass(frozen=True, order=True)

@@ -27,6 +27,7 @@ import numpy as np
 import zarr
 from zarr.storage import LocalStore
 
+from sweep.messages import SPEC, STORE, PrintableError, suggestion
 from sweep.storage.locations import (
     JOURNAL,
     REQUESTS,
@@ -92,7 +93,7 @@ _WORDS = {"name": "bytes", "configuration": {"endian": "little"}}
 _SHARDS = {"index_codecs": [_WORDS, _CHECKSUM], "index_location": "end"}
 
 
-class StoreError(Exception):
+class StoreError(PrintableError):
     """A store that can't be used as asked."""
 
 
@@ -178,7 +179,8 @@ def _document(path: Location) -> dict[str, Any]:
     if how := remedy(path):
         raise NotAStoreError(f"{path / 'zarr.json'} is damaged{how}")
     if isinstance(path, Path) and path.is_file():
-        what = "a file, and no Zarr store of sweep's: `sweep run` computes a spec into one"
+        run = suggestion("run", SPEC, store=STORE)
+        what = f"a file, and no Zarr store of sweep's: {run} computes a spec into one"
         raise NotAStoreError(f"{path} is {what}{_near(path)}")
     raise NotAStoreError(f"{path} is not a Zarr store of sweep's{_near(path)}")
 
@@ -201,8 +203,10 @@ def remedy(path: Location) -> str:
     """Remark on how to put back what a store was made of, where it says what that was."""
     if not (path / JOURNAL / MANIFEST).exists():
         return ""
-    how = "`" if listed_attributes(path) else " --spec FILE`, with the study's spec,"
-    return f": `sweep verify {path} --repair{how} puts it back"
+    if listed_attributes(path):
+        return f": {suggestion('verify', path, repair=True)} puts it back"
+    how = suggestion("verify", path, repair=True, spec=SPEC)
+    return f": {how}, with the study's spec, puts it back"
 
 
 def _near(path: Location) -> str:
@@ -306,7 +310,7 @@ def _check_files(path: Location) -> None:
         raise ValueError(f"{'/'.join([JOURNAL, *odd[:1]])} is no plain file")
 
 
-class ReplacedError(ValueError):
+class ReplacedError(PrintableError, ValueError):
     """A store that was extended or replaced since it was opened."""
 
 

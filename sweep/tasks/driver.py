@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from sweep.messages import option, suggestion
 from sweep.spec import SceneSpec
 from sweep.storage.locations import (
     PACKED,
@@ -220,19 +221,19 @@ def _refuse_unsound(
 
 def _refuse_in_the_way(path: Location, study: GridStudy | FlightStudy) -> None:
     """Refuse a place in which there is something, or for which something is under way."""
-    new, what_next = under_way(path), f"`sweep resume {path}` goes on with it"
+    new, what_next = under_way(path), f"{suggestion('resume', path)} goes on with it"
     if path.exists():
         attributes, held = _held(path)
         refuse_other_study(path, attributes, held.spec, study.spec)
         done = int(np.count_nonzero(receipted(path, study)))
         said = f"{path} holds this study already, {done} of {study.n_blocks} blocks done"
         if done == study.n_blocks:
-            what_next = f"`sweep status {path}` tells about it"
+            what_next = f"{suggestion('status', path)} tells about it"
     elif new:
         said = f"a study is under way in {new}"
     else:
         return
-    raise StoreError(f"{said}: {what_next}, --overwrite begins anew")
+    raise StoreError(f"{said}: {what_next}, {option('overwrite')} begins anew")
 
 
 def _into(

@@ -38,6 +38,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import psutil
 
+from sweep.messages import SPEC, one_line, suggestion
 from sweep.storage.locations import (
     JOURNAL,
     REQUESTS,
@@ -212,7 +213,7 @@ def refuse_damaged_recipe(store_path: Location) -> None:
     if any(record is None for _, record in read_sealed(path)):
         raise StoreError(
             f"{path} is damaged, and with it where the files of the study are: "
-            f"`sweep resume {store_path} --spec FILE` puts it down anew"
+            f"{suggestion('resume', store_path, spec=SPEC)} puts it down anew"
         )
 
 
@@ -597,9 +598,10 @@ class Lock:
     def _refuse_a_living_one(self) -> None:
         other = holder(self._store)
         if other and other.token not in _left and is_live(self._store, other):
+            who = f"process {one_line(other.pid)} on {one_line(other.host)}"
             raise BusyError(
-                f"{self._store} is being written by process {other.pid} on {other.host}: "
-                "wait for it, or stop it; `sweep status` shows how far it is"
+                f"{self._store} is being written by {who}: "
+                f"wait for it, or stop it; {suggestion('status', self._store)} shows how far it is"
             )
 
     def _beat(self) -> None:

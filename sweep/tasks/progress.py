@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
+from sweep.messages import PrintableError, printable
 from sweep.storage.opening import StoreError as StoreError
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ LATE = 2.0
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
-class TaskError(Exception):
+class TaskError(PrintableError):
     """A study that can't be run as asked: the text says why and what to do."""
 
 
@@ -177,7 +178,7 @@ class Lines(_Counting):
 
     def say(self, text: str) -> None:
         """Print a line of its own."""
-        print(text, file=sys.stderr, flush=True)
+        print(printable(text), file=sys.stderr, flush=True)
 
     def end(self) -> None:
         """Say how far it is."""
@@ -227,7 +228,7 @@ class Bar(_Counting):
 
     def say(self, text: str) -> None:
         """Print a line above the bar."""
-        self.console.print(text, markup=False, highlight=False, soft_wrap=True)
+        self.console.print(printable(text), markup=False, highlight=False, soft_wrap=True)
 
     def end(self) -> None:
         """Leave the bar as it is."""

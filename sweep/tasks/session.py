@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sweep.messages import option
 from sweep.spec import Spec
 from sweep.spec.clusters import (
     Address,
@@ -280,8 +281,11 @@ class Outcome:
         """Why the run ended before its blocks did."""
         if self.stopped:
             return self.stopped
+        if self.complete:
+            return ""
         if not self.failures:
-            return f"{self.left_out} blocks failed before; --retry-failed tries them again"
+            retry = option("retry_failed")
+            return f"{self.left_out} blocks failed before; {retry} tries them again"
         return f"{len(self.failures)} blocks failed, the first with {self.failures[0].error}"
 
 

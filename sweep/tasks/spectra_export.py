@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sweep.messages import option
 from sweep.model.detectors import taper
 from sweep.model.effects.catalogue import DEFAULTS, EFFECTS
 from sweep.model.looks import NUMBER, Looks
@@ -156,9 +157,11 @@ def write(dataset: xr.Dataset, path: Path, *, overwrite: bool = False) -> None:
         raise StoreError(f"{path} ends in neither {' nor '.join(SUFFIXES)}")
     if path.exists():
         if not overwrite:
-            raise StoreError(f"{path} is there already: --overwrite puts the new one in its place")
+            raise StoreError(
+                f"{path} is there already: {option('overwrite')} puts the new one in its place"
+            )
         if not _is_written_here(path):
-            raise StoreError(f"{path} holds no spectra of `sweep spectra`: name another --output")
+            raise StoreError(f"{path} holds no spectra of `sweep spectra`: name another file")
     with draft(path.resolve(), replace=overwrite) as made:
         if path.suffix == ".zarr":
             dataset.to_zarr(made, mode="w", zarr_format=3, consolidated=False)

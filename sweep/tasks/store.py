@@ -12,6 +12,7 @@ import errno
 import json
 import os
 import platform
+import shlex
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -26,6 +27,7 @@ import zarr
 from numcodecs.zstd import Zstd
 from zarr.codecs import Crc32cCodec, ZstdCodec
 
+from sweep.messages import option, option_name, suggestion
 from sweep.model import VERSION
 from sweep.spec import SceneSpec, Spec, difference
 from sweep.storage import locations, opening
@@ -127,7 +129,9 @@ def making(path: ObjectPath) -> Iterator[None]:
         if mark.exists():  # what a creation or removal cut short has left
             remove(path)
         elif found := [name for name, _ in path.below() if not name.startswith(f"{JOURNAL}/")]:
-            raise StoreError(f"something else is at {path} ({found[0]}): name another --store")
+            raise StoreError(
+                f"something else is at {path} ({found[0]}): name another {option_name('store')}"
+            )
         mark.write_bytes(b"")
         yield
         mark.unlink()
@@ -368,7 +372,7 @@ def refuse_damaged(path: Location) -> None:
         listed = "\n".join(f"  {damage.object} {damage.what}" for damage in found)
         raise StoreError(
             f"{path} is not as it was made:\n{listed}\n"
-            f"`sweep verify {path} --repair` puts back what was there."
+            f"{suggestion('verify', path, repair=True)} puts back what was there."
         )
 
 
@@ -438,7 +442,7 @@ def refuse_to_replace(path: Location) -> None:
     if not isinstance(path, Path):
         raise StoreError(
             f"{path} can't be replaced or extended in its place, as an object store has no "
-            "renaming: name another place with --store; this one then stays"
+            f"renaming: name another place with {option_name('store')}; this one then stays"
         )
     refuse_foreign(path)
 
@@ -452,7 +456,7 @@ def under_way(path: Location) -> Path | None:
         now = "holds another study now" if path.exists() else "is gone"
         raise StoreError(
             f"{new} was begun to take the place of a store at {path}, which {now}: "
-            f"`rm -r {new}`, or have --overwrite begin anew"
+            f"`rm -r {shlex.quote(str(new))}`, or have {option('overwrite')} begin anew"
         )
     return new
 
@@ -467,7 +471,7 @@ def refuse_other_study(
     lines = "\n".join(f"  {line}" for line in difference(held, asked))
     raise StoreError(
         f"{path} holds another study (in the store -> in the spec):\n{lines}\n"
-        "Name another --store, or --overwrite this one."
+        f"Name another {option_name('store')}, or replace this one with {option('overwrite')}."
     )
 
 

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sweep.messages import NEW, SPEC, command_line, suggestion
 from sweep.scenes.files import SceneError
 from sweep.spec import SceneSpec, Spec, SpecError, difference, from_stored
 from sweep.spec.grid_rules import is_method
@@ -67,7 +68,8 @@ def read(path: Location) -> tuple[dict[str, Any], AnyStudy]:
     """Attributes of a store and the study that it holds; StoreError where it can't be read."""
     attributes = opening.read_attributes(path)
     if attributes["kind"] == ACCURACY:
-        raise StoreError(f"{path} holds what accuracy costs, no study: sweep figures draws it")
+        draw = command_line("figures", path)
+        raise StoreError(f"{path} holds what accuracy costs, no study: `{draw}` draws it")
     return attributes, described(path, attributes)
 
 
@@ -275,7 +277,7 @@ def refuse_unlike(path: Location, older: Declared, spec: Declared) -> None:
         raise StoreError(
             f"{path} can't be extended to this study: a flight over a scene and a study over a "
             "grid have nothing in common. Run it into a store of its own: "
-            "sweep run SPEC --store NEW"
+            f"{suggestion('run', SPEC, store=NEW)}"
         )
     lines = unlike(older, spec)
     if lines:
@@ -285,7 +287,7 @@ def refuse_unlike(path: Location, older: Declared, spec: Declared) -> None:
             f"{path} can't be extended to this study (in the store -> asked for):\n{listed}\n"
             f"A store is extended by values on axes, new axes,{scanners} more draws or a tighter "
             "accuracy.tolerance. Any other study needs a store of its own: "
-            "sweep run SPEC --store NEW"
+            f"{suggestion('run', SPEC, store=NEW)}"
         )
 
 

@@ -19,6 +19,7 @@ import google_crc32c
 import numpy as np
 import zarr
 
+from sweep.messages import suggestion
 from sweep.storage import opening
 from sweep.storage.locations import (
     JOURNAL,
@@ -111,7 +112,9 @@ def _study(path: Location, spec: Spec | SceneSpec | None) -> AnyStudy | None:
             raise
         return studies.study_of(spec, path)
     if spec and attributes["study_id"] != spec.id:
-        raise StoreError(f"{path} holds another study than the spec: `sweep status` names it")
+        raise StoreError(
+            f"{path} holds another study than the spec: {suggestion('status', path)} names it"
+        )
     if (
         attributes["kind"] == studies.ACCURACY
         or (attributes["kind"] == "eyepoints" and not read_recipe(path))

@@ -89,7 +89,7 @@ def test_a_store_is_extended_into_another_place(memory, tmp_path):
     axes = {**six().to_yaml_mapping()["axes"], "instrument.laser.power": ["1 W", "2 W", "3 W"]}
     larger, place = six(axes=axes), {"scheduler": "none", "progress": False}
     quiet(six(), memory)
-    with pytest.raises(StoreError, match=r"an object store has no renaming: .* --store"):
+    with pytest.raises(StoreError, match=r"an object store has no renaming: .* store="):
         extend(memory, larger, **place)
     there, here = memory.replace("small", "larger"), tmp_path / "here.zarr"
     before = remote_tree(memory)

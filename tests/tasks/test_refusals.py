@@ -86,7 +86,7 @@ def test_what_is_no_store_of_ours_is_refused_and_left_as_it_is(tmp_path):
 
 def test_a_run_into_a_whole_store_of_the_same_study_points_to_status_and_overwrite(undisturbed):
     before = everything(undisturbed)
-    with pytest.raises(StoreError, match=r"12 of 12 blocks done: `sweep status .*--overwrite"):
+    with pytest.raises(StoreError, match=r"12 of 12 blocks done: `sweep.status\(.*overwrite=True"):
         quiet(small(), undisturbed)
     assert everything(undisturbed) == before
 

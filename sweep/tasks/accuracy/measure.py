@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from sweep.messages import option, option_name
 from sweep.spec import SceneSpec, Spec
 from sweep.storage import opening
 from sweep.storage.locations import Location, real
@@ -117,9 +118,9 @@ def _refuse_in_the_way(path: Location, overwrite: bool) -> None:
     if not path.exists():
         return
     if opening.read_attributes(path)["kind"] != ACCURACY:
-        raise StoreError(f"{path} holds a study's results: name another --store")
+        raise StoreError(f"{path} holds a study's results: name another {option_name('store')}")
     if not overwrite:
-        raise StoreError(f"{path} is there already: --overwrite measures anew")
+        raise StoreError(f"{path} is there already: {option('overwrite')} measures anew")
     store.refuse_to_replace(path)
 
 
