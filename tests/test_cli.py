@@ -568,7 +568,7 @@ def test_the_installed_command_runs_on_workers_and_can_be_interrupted(here):
     assert long.returncode == 3
     assert "sweep resume results/long.zarr" in errors
     assert "/sweep/" not in errors  # no traceback of ours
-    assert "dashboard http://127.0.0.1:" in errors
+    assert "1 worker on this machine" in errors and "dashboard" not in errors
     assert "Probability of detection" in output
 
 

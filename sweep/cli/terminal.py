@@ -123,6 +123,11 @@ PERFORMANCE_REPORT = click.option(
     metavar="FILE.html",
     help="Write Dask's own report of the run.",
 )
+DASHBOARD = click.option(
+    "--dashboard",
+    is_flag=True,
+    help="Serve Dask's dashboard to all users of this machine, on its loopback address.",
+)
 DURABLE = click.option(
     "--durable",
     is_flag=True,
@@ -171,6 +176,7 @@ def computing(command: Callable[..., Any]) -> Callable[..., Any]:
     """Give a command the options of all that compute, which it hands on as they are."""
     options = (
         WORKERS, SCHEDULER, CLUSTER, ALLOW_CODE, BLOCK_TIMEOUT, DURABLE, PERFORMANCE_REPORT,
+        DASHBOARD,
     )  # fmt: skip
     for option in reversed(options):
         command = option(command)

@@ -20,6 +20,7 @@ from sweep.spec.rules import Finding, Numeric, SpecError, Special, Text
 from sweep.units import QuantityError
 
 LOOPBACK = "127.0.0.1"
+NO_DASHBOARD, DASHBOARD_PORT = "none", 8787
 _COUNT = Numeric(about="Workers", example="8", at_least="1", at_most="100000", whole=True)
 _BOUNDS = "write e.g. {least: 2, most: 40}"
 
@@ -100,8 +101,13 @@ class Scheduler(Part):
     host: str = of.word("Address that workers reach it by", "10.0.0.5", "")
     interface: str = of.word("Or the network interface that it has", "ib0", "")
     port: int = of.count("Port; 0 for any", "8786", "0", "65535", default=0)
-    dashboard: str = of.word(
-        "Address of the dashboard; port 0 for any", f"{LOOPBACK}:8787", f"{LOOPBACK}:8787"
+    dashboard: str = of.text(
+        "Port of Dask's dashboard, 0 for any; none: no dashboard. It has no password, and listens "
+        "to this machine alone: all users of this machine can see it",
+        NO_DASHBOARD,
+        pattern=rf"{NO_DASHBOARD}|((localhost|127\.0\.0\.1):)?[0-9]{{1,5}}",
+        remedy=f"write a port, such as {DASHBOARD_PORT}. It listens to this machine alone; "
+        f"`ssh -L {DASHBOARD_PORT}:{LOOPBACK}:{DASHBOARD_PORT} HOST` shows it on another",
     )
 
 

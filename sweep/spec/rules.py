@@ -415,7 +415,7 @@ class Text(Rule):
     def read(self, written: object) -> str:
         """Return the text."""
         if isinstance(written, bool) or not isinstance(written, str | int | float):
-            raise QuantityError("must be text")
+            raise QuantityError("must be text", self.remedy)
         if re.fullmatch(self.pattern, str(written)) is None:
             raise QuantityError("is no text that can stand here", self.remedy)
         return str(written)

@@ -71,7 +71,9 @@ def connected(
         Client(started, set_as_default=False) as client,
     ):
         _keep(started, cluster, bounds)
-        say(f"{_described(cluster, bounds)}: dashboard {started.dashboard_link}")
+        shows_dashboard = machines.shows_dashboard(cluster.scheduler)
+        link = f": dashboard {machines.dashboard_link(started)}" if shows_dashboard else ""
+        say(f"{_described(cluster, bounds)}{link}")
         slots = bounds.most * cluster.worker.threads
         if isinstance(cluster, Local):
             yield Reached(client, slots, lambda: started.scale(bounds.least))
@@ -107,7 +109,9 @@ def _started(cluster: Local | Batch | SSH, bounds: Bounds, processes: bool) -> A
     import dask
 
     try:
-        with dask.config.set(machines.CALM):
+        shows_dashboard = machines.shows_dashboard(cluster.scheduler)
+        pages = {} if shows_dashboard else machines.WITHOUT_PAGES
+        with dask.config.set({**machines.CALM, **pages}):
             if isinstance(cluster, Local):
                 return machines.start_here(cluster, bounds, processes=processes)
             if isinstance(cluster, Batch):

@@ -22,10 +22,13 @@ import numpy as np
 from sweep.messages import option
 from sweep.spec import Spec
 from sweep.spec.clusters import (
+    DASHBOARD_PORT,
+    NO_DASHBOARD,
     Address,
     AnyCluster,
     Bounds,
     Cluster,
+    Kubernetes,
     Local,
     LocalWorker,
     cluster_of,
@@ -120,6 +123,9 @@ class RunOptions:
         Whether to try blocks again that were given up, for their errors, in an earlier run.
     performance_report
         HTML file to put Dask's own account of the run into.
+    dashboard
+        Whether the workers that are started have Dask's dashboard, on a port of this machine alone.
+        It has no password: all users of this machine can see it.
     evaluate
         What computes a block in place of the model, with the same results; for instrumenting.
     """
@@ -134,6 +140,7 @@ class RunOptions:
     durable: bool = False
     retry_failed: bool = False
     performance_report: str | Path | None = None
+    dashboard: bool = False
     evaluate: Evaluate | None = None
 
     def place(self, spec: Spec | SceneSpec) -> AnyCluster | None:
@@ -148,21 +155,40 @@ class RunOptions:
             given = self.cluster
             if not isinstance(given, Cluster):
                 given = cluster_of(given) if isinstance(given, Mapping) else load_cluster(given)
-            return _of_workers(given, self.workers)
+            return self._with_dashboard(_of_workers(given, self.workers))
         scheduler, execution = self.scheduler, spec.execution
         if scheduler is None and self.workers is None:
             scheduler = execution.scheduler or None
+        if scheduler == NONE and self.dashboard:
+            raise ClusterError(f"a plain loop has no dashboard: leave out {option('dashboard')}")
         if scheduler == NONE or (scheduler is None and self._leaves_it_open(spec)):
             return None
         if scheduler is not None:
+            if self.dashboard:
+                raise ClusterError(
+                    f"the scheduler {scheduler} runs already: leave out {option('dashboard')}"
+                )
             return Address.model_construct(kind="scheduler", address=scheduler, security=None)
         here = Local(kind="local", worker=LocalWorker(threads=execution.threads))
-        return _of_workers(here, self.workers or execution.workers or None)
+        return self._with_dashboard(_of_workers(here, self.workers or execution.workers or None))
+
+    def _with_dashboard(self, cluster: AnyCluster) -> AnyCluster:
+        """Give a cluster that is started here a dashboard, if one is asked for."""
+        if not self.dashboard:
+            return cluster
+        if isinstance(cluster, Address | Kubernetes):
+            raise ClusterError(
+                f"the scheduler is not started on this machine: leave out {option('dashboard')}"
+            )
+        if cluster.scheduler.dashboard != NO_DASHBOARD:
+            return cluster
+        scheduler = cluster.scheduler.model_copy(update={"dashboard": str(DASHBOARD_PORT)})
+        return cluster.model_copy(update={"scheduler": scheduler})
 
     def _leaves_it_open(self, spec: Spec | SceneSpec) -> bool:
         """Tell whether nothing is said that takes workers, and the work takes none."""
         said = self.workers or self.block_timeout or self.performance_report or self.evaluate
-        if said or not self.processes or spec.execution != Execution():
+        if said or self.dashboard or not self.processes or spec.execution != Execution():
             return False
         return not any(own_functions(spec)) and about_seconds(spec) <= LITTLE
 

@@ -1,7 +1,5 @@
 """Workers between bounds, and a file's options as the command and Python take them."""
 
-import socket
-
 import pytest
 from click.testing import CliRunner
 from small import quiet, small, tree
@@ -9,7 +7,6 @@ from small import quiet, small, tree
 from sweep.cli import main
 from sweep.spec import cluster_of
 from sweep.tasks import cluster, session
-from sweep.tasks.clusters import machines
 from sweep.tasks.progress import ClusterError
 
 LOCAL = {"kind": "local", "scheduler": {"dashboard": "127.0.0.1:0"}}
@@ -71,12 +68,3 @@ def test_the_command_tells_what_is_wrong_with_a_clusters_file(tmp_path, monkeypa
     assert result.exit_code == 2
     assert "both named" in result.output
     assert not (tmp_path / "results").exists()
-
-
-def test_a_dashboard_has_the_port_asked_for_or_any_where_that_is_taken():
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        port = taken.getsockname()[1]
-        asked = cluster_of({**LOCAL, "scheduler": {"dashboard": f"127.0.0.1:{port}"}}).scheduler
-        assert machines.dashboard(asked) == "127.0.0.1:0"
-    assert machines.dashboard(asked) == f"127.0.0.1:{port}"

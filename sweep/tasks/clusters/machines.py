@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from sweep.spec.clusters import SSH, Bounds, Cluster, Local, Scheduler
+from sweep.spec.clusters import LOOPBACK, NO_DASHBOARD, SSH, Bounds, Cluster, Local, Scheduler
 from sweep.tasks.progress import ClusterError
 
 if TYPE_CHECKING:
@@ -43,7 +43,12 @@ CALM: dict[str, Any] = {
     "distributed.worker.profile.cycle": "10s",
     "distributed.worker.memory.monitor-interval": "200ms",
     "distributed.worker.memory.pause": False,
+    "distributed.worker.http.routes": [],  # pages that all users of the machine could see
 }
+
+#: Settings of a scheduler without a dashboard: its HTTP server, which Dask starts all the same, has
+#: no page. By default it shows workers, tasks and logs to all users of the machine.
+WITHOUT_PAGES: dict[str, Any] = {"distributed.scheduler.http.routes": []}
 
 #: Seconds of work ahead for which a cluster between bounds takes another worker thread.
 WORK_AHEAD = "1s"
@@ -79,22 +84,34 @@ def security_settings(cluster: Cluster) -> dict[str, Any]:
 
 
 def scheduler_options(section: Scheduler) -> dict[str, Any]:
-    """Address at which a scheduler of this process listens, and that of its dashboard."""
-    options: dict[str, Any] = {"port": section.port, "dashboard_address": dashboard(section)}
+    """Address at which a scheduler of this process listens, and that of its dashboard, if any."""
+    options: dict[str, Any] = {
+        "port": section.port,
+        "dashboard": shows_dashboard(section),
+        "dashboard_address": dashboard(section),
+    }
     if section.interface:
         return options | {"interface": section.interface}
-    return options | {"host": section.host or "127.0.0.1"}
+    return options | {"host": section.host or LOOPBACK}
+
+
+def shows_dashboard(section: Scheduler) -> bool:
+    """Tell whether a dashboard is asked for."""
+    return section.dashboard != NO_DASHBOARD
 
 
 def dashboard(section: Scheduler) -> str:
-    """Address for a dashboard: the one asked for, or any port where that is taken."""
-    host, _, port = section.dashboard.rpartition(":")
+    """Address of a scheduler's pages, on this machine's loopback interface.
+
+    The port is the one asked for; any where that is taken, or where no dashboard is asked for.
+    """
+    port = int(section.dashboard.rpartition(":")[2]) if shows_dashboard(section) else 0
     with socket.socket() as probe:
         try:
-            probe.bind((host, int(port)))
-        except (OSError, ValueError):
-            return f"{host}:0"
-    return section.dashboard
+            probe.bind((LOOPBACK, port))
+        except (OSError, OverflowError):
+            return f"{LOOPBACK}:0"
+    return f"{LOOPBACK}:{port}"
 
 
 LEAST_MEMORY = 1 << 30
@@ -130,7 +147,8 @@ def start_here(cluster: Local, bounds: Bounds, *, processes: bool) -> Any:
     from distributed import LocalCluster, Security
 
     listening = scheduler_options(cluster.scheduler)
-    dashboard, port = listening.pop("dashboard_address"), listening.pop("port")
+    pages = {name: listening.pop(name) for name in ("dashboard", "dashboard_address")}
+    port = listening.pop("port")
     options: dict[str, Any] = {
         "n_workers": bounds.least,
         "threads_per_worker": cluster.worker.threads,
@@ -141,17 +159,37 @@ def start_here(cluster: Local, bounds: Bounds, *, processes: bool) -> Any:
     }
     if processes:  # threads need no port
         options |= listening | {"scheduler_port": port}
-        options["scheduler_kwargs"] = {"worker_ttl": FROZEN}
+        pages["worker_ttl"] = FROZEN
         options["security"] = options["security"] or Security.temporary()
     else:
-        options["worker_dashboard_address"] = "127.0.0.1:0"  # which is for everyone to see without
+        options["worker_dashboard_address"] = f"{LOOPBACK}:0"  # by default all networks reach it
+        options["worker_class"] = _worker_without_pages()
     name = "distributed.nanny.pre-spawn-environ"
     variables = {**dask.config.get(name), **environment(cluster.environment)}
     with dask.config.set({**CALM, name: variables}):
         try:
-            return LocalCluster(dashboard_address=dashboard, **options)
+            return LocalCluster(scheduler_kwargs=pages, **options)
         except (OSError, ImportError, RuntimeError):  # a study needs no dashboard
-            return LocalCluster(dashboard_address=None, **options)
+            pages |= {"dashboard": False, "dashboard_address": f"{LOOPBACK}:0"}
+            return LocalCluster(scheduler_kwargs=pages, **options)
+
+
+def _worker_without_pages() -> type:
+    """Class of workers as threads that have an address for pages, as Dask asks for, and no page."""
+    from distributed import Worker
+
+    class WorkerWithoutPages(Worker):
+        def __init__(self, *arguments: Any, **options: Any) -> None:
+            super().__init__(*arguments, **options | {"dashboard": False})
+
+    return WorkerWithoutPages
+
+
+def dashboard_link(started: Any) -> str:
+    """Address of the dashboard of a cluster that was started here, for a browser."""
+    from distributed.utils import format_dashboard_link
+
+    return str(format_dashboard_link(LOOPBACK, started.scheduler_info["services"]["dashboard"]))
 
 
 def _memory(cluster: Local, bounds: Bounds) -> int:

@@ -1,0 +1,117 @@
+"""Dask's dashboard: there when it is asked for, and listening to this machine alone."""
+
+import socket
+import urllib.error
+import urllib.request
+
+import psutil
+import pytest
+from small import Said, small
+
+from sweep.spec import SpecError, cluster_of, load_cluster
+from sweep.spec.clusters import Bounds
+from sweep.tasks import cluster as clusters
+from sweep.tasks.clusters import machines
+from sweep.tasks.driver import run
+from sweep.tasks.progress import ClusterError
+from sweep.tasks.session import RunOptions
+
+PAGES = ("status", "info/main/workers.html", "json/counts.json", "metrics", "statics/", "health")
+"""Pages of a scheduler or a worker of Dask."""
+
+
+def reached(**section):
+    """Cluster of one worker in this process, with a section `scheduler`, and what is said."""
+    told = Said()
+    described = cluster_of({"kind": "local", "workers": 1, "scheduler": section})
+    return clusters.connected(described, most=1, processes=False, say=told.say), told
+
+
+def pages_by_port():
+    """HTTP status of each page at each port that this process or its children listen at."""
+    processes = [psutil.Process(), *psutil.Process().children(recursive=True)]
+    answers = {}
+    for process in processes:
+        for connection in process.net_connections():
+            if connection.status == psutil.CONN_LISTEN:
+                answers[connection.laddr] = [status(connection.laddr, page) for page in PAGES]
+    return answers
+
+
+def status(address, page):
+    """HTTP status of a page; 0 where no web server answers."""
+    try:
+        with urllib.request.urlopen(f"http://127.0.0.1:{address.port}/{page}", timeout=5) as answer:
+            return answer.status
+    except urllib.error.HTTPError as error:
+        return error.code
+    except (OSError, ValueError):
+        return 0
+
+
+def test_no_page_is_shown_unless_a_dashboard_is_asked_for():
+    connected, told = reached()
+    before = set(pages_by_port())
+    with connected:
+        opened = {a: s for a, s in pages_by_port().items() if a not in before}
+    assert opened and not any("dashboard" in line for line in told)
+    assert not any(code == 200 for codes in opened.values() for code in codes)
+
+
+@pytest.mark.parametrize("written", [0, "0", "127.0.0.1:0", "localhost:0"])
+def test_a_dashboard_that_is_asked_for_listens_to_this_machine_alone(written):
+    connected, told = reached(dashboard=written)
+    before = set(pages_by_port())
+    with connected:
+        opened = {a: s for a, s in pages_by_port().items() if a not in before}
+    assert any("dashboard http://127.0.0.1:" in line for line in told)
+    shown = {address for address, codes in opened.items() if 200 in codes}
+    assert shown and {address.ip for address in shown} == {"127.0.0.1"}
+
+
+@pytest.mark.parametrize(
+    "written", [":8787", "0.0.0.0:8787", "10.0.0.5:8787", "[::]:8787", "node1:8787", "yes", True]
+)
+def test_a_dashboard_for_other_machines_is_refused(written):
+    with pytest.raises(SpecError, match=r"scheduler\.dashboard: .*write a port, such as 8787"):
+        cluster_of({"kind": "local", "scheduler": {"dashboard": written}})
+
+
+def test_a_dashboard_has_the_port_asked_for_or_any_where_that_is_taken():
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        port = taken.getsockname()[1]
+        asked = cluster_of({"kind": "local", "scheduler": {"dashboard": port}}).scheduler
+        assert machines.dashboard(asked) == "127.0.0.1:0"
+    assert machines.dashboard(asked) == f"127.0.0.1:{port}"
+
+
+def test_schedulers_of_jobs_and_of_ssh_have_none_either():
+    section = {"host": "10.0.0.5"}
+    asked = {"kind": "slurm", "workers": 2, "worker": {"memory": "4 GB"},
+             "job": {"walltime": "1 h"}, "scheduler": section}  # fmt: skip
+    options = machines.scheduler_options(cluster_of(asked).scheduler)
+    assert options["dashboard"] is False and options["dashboard_address"] == "127.0.0.1:0"
+    asked["scheduler"] = section | {"dashboard": 0}
+    options = machines.scheduler_options(cluster_of(asked).scheduler)
+    assert options["dashboard"] is True and options["dashboard_address"] == "127.0.0.1:0"
+
+
+def test_a_run_asks_for_a_dashboard_by_an_option(tmp_path):
+    place = RunOptions(workers=1, dashboard=True).place(small())
+    assert place.scheduler.dashboard == "8787"
+    assert RunOptions(dashboard=True).place(small()).workers is None
+    assert RunOptions(workers=1).place(small()).scheduler.dashboard == "none"
+    given = {"kind": "local", "workers": 2, "scheduler": {"dashboard": "9000"}}
+    kept = RunOptions(cluster=given, dashboard=True).place(small())
+    assert kept.scheduler.dashboard == "9000" and kept.workers == Bounds(2, 2)
+    for elsewhere in ("none", "tcp://10.0.0.5:8786"):
+        with pytest.raises(ClusterError, match="leave out dashboard=True"):
+            run(small(), store=tmp_path / "a.zarr", scheduler=elsewhere, dashboard=True)
+
+
+def test_the_example_of_a_local_cluster_has_no_dashboard():
+    from pathlib import Path
+
+    described = load_cluster(Path(__file__).parents[2] / "deploy" / "local.yaml")
+    assert not machines.shows_dashboard(described.scheduler)
