@@ -15,7 +15,7 @@ from pydantic import Field, PrivateAttr, TypeAdapter, ValidationError
 
 import sweep.spec.parts as of
 from sweep.spec.parts import Part
-from sweep.spec.reading import Document, findings_of, plain, read_document
+from sweep.spec.reading import Document, findings_of, plain, read_document, without_extensions
 from sweep.spec.rules import Finding, Numeric, SpecError, Special, Text
 from sweep.units import QuantityError
 
@@ -262,7 +262,7 @@ def load_cluster(path: str | Path) -> AnyCluster:
 
 def cluster_of(mapping: Mapping[str, Any], *, base: Path | str = ".") -> AnyCluster:
     """Cluster from plain data, written as in a file whose folder is `base`."""
-    return _cluster(Document(plain(mapping)), Path(base).absolute())
+    return _cluster(Document(without_extensions(plain(mapping))), Path(base).absolute())
 
 
 def _cluster(document: Document, base: Path) -> AnyCluster:

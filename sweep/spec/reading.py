@@ -54,6 +54,10 @@ _PLAIN_TAGS = frozenset(
     f"tag:yaml.org,2002:{kind}"
     for kind in ("str", "int", "float", "bool", "null", "timestamp", "value", "map", "seq")
 )
+_MERGE_TAG = "tag:yaml.org,2002:merge"
+_MERGE_KEY = "<<"
+_EXTENSION = "x-"
+"""Beginning of the names of sections that hold anchors for others, and are no part of a spec."""
 
 
 @dataclass
@@ -69,12 +73,14 @@ class Document:
     """The file read; empty where there is none."""
     nodes: int = 0
     """YAML's nodes read, each as often as an alias repeats it."""
+    open_nodes: list[yaml.Node] = field(default_factory=list)
+    """Mappings being read, each within the one before."""
 
     def read(self, node: yaml.Node, location: Location) -> Any:
         """Value of one of YAML's nodes, whose places and mistakes are noted."""
         self.nodes += 1
         line = node.start_mark.line + 1
-        if self.nodes > MOST_NODES or len(location) > DEEPEST:
+        if self.nodes > MOST_NODES or max(len(location), len(self.open_nodes)) > DEEPEST:
             path, rule = dotted(location)[:200], "holds too many values"
             raise SpecError([Mistake(path, rule, "", "repeat less with aliases", line, self.file)])
         self.places.setdefault(location, (self.file, line))
@@ -88,22 +94,59 @@ class Document:
         return _scalar(node)
 
     def _mapping(self, node: yaml.MappingNode, location: Location) -> dict[str, Any]:
-        """Read a mapping with text keys; of a key given twice the first counts."""
+        """Read a mapping with text keys; of a key given twice the first counts.
+
+        A merge key, ``<<: *base``, brings the fields of other mappings that are not written here.
+        """
         values: dict[str, Any] = {}
+        merged_nodes: list[yaml.Node] = []
+        self.open_nodes.append(node)
         for key_node, child in node.value:
             if not isinstance(key_node, yaml.ScalarNode):
                 rule = "has a key that is no word"
                 self.findings.append(Finding(location, rule, "begin it with a word"))
                 continue
             key, line = key_node.value, key_node.start_mark.line + 1
-            inside = (*location, key)
-            if key in values:
+            inside, is_merge = (*location, key), key_node.tag == _MERGE_TAG
+            if key in values or (is_merge and merged_nodes):
                 rule = f"is given twice, on lines {self.places[inside][1]} and {line}"
-                self.findings.append(Finding(inside, rule, "keep one"))
+                remedy = "write '<<: [*first, *second]'" if is_merge else "keep one"
+                self.findings.append(Finding(inside, rule, remedy))
                 continue
             self.places[inside] = (self.file, line)
-            values[key] = self.read(child, inside)
-        return values
+            if is_merge:
+                is_list = isinstance(child, yaml.SequenceNode)
+                merged_nodes = child.value if is_list else [child]
+            else:
+                values[key] = self.read(child, inside)
+        fields: dict[str, Any] = {}
+        for merged_node in reversed(merged_nodes):  # of several the first counts
+            fields |= self._merged_fields(merged_node, location, values)
+        self.open_nodes.pop()
+        return fields | values
+
+    def _merged_fields(
+        self, node: yaml.Node, location: Location, written: Mapping[str, Any]
+    ) -> dict[str, Any]:
+        """Fields of a mapping that a merge key names, and the places of those not written here.
+
+        What is wrong in the mapping is told where it stands, and not once more here.
+        """
+        inside = (*location, _MERGE_KEY)
+        if not isinstance(node, yaml.MappingNode):
+            rule = "must name a mapping by its anchor, or a list of such"
+            self.findings.append(Finding(inside, rule, "write e.g. '<<: *base'"))
+            return {}
+        if node in self.open_nodes:
+            self.findings.append(Finding(inside, "merges a mapping into itself", "leave it out"))
+            return {}
+        base = Document({}, file=self.file, nodes=self.nodes, open_nodes=self.open_nodes)
+        fields: dict[str, Any] = base.read(node, location)
+        self.nodes, depth = base.nodes, len(location)
+        for place, at in base.places.items():
+            if len(place) > depth and place[depth] not in written:
+                self.places[place] = at
+        return fields
 
     def mistake(self, finding: Finding) -> Mistake:
         """Give a finding its file and line; those of the nearest place around it that has any."""
@@ -158,8 +201,13 @@ def parsed(text: str, path: Path) -> Document:
     document = Document({}, file=str(path))
     if not isinstance(root, yaml.MappingNode):
         raise _file_error(path, "must hold a mapping", "write e.g. 'title: A study'")
-    document.value = document.read(root, ())
+    document.value = without_extensions(document.read(root, ()))
     return document
+
+
+def without_extensions(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Content of a file without the sections that hold anchors for others, ``x-...``."""
+    return {name: value for name, value in content.items() if not name.startswith(_EXTENSION)}
 
 
 def _read_text(path: Path) -> str:

@@ -73,6 +73,7 @@ def _complete(study: Json, rules: Mapping[str, Rule], required: tuple[str, ...])
         ],
     }
     study["properties"]["axes"] = _axes_schema(rules)
+    study["patternProperties"] = {"^x-": {"description": "Anchors for other sections; not read"}}
     study["required"] = ["title", "instrument", *required]
 
 

@@ -54,6 +54,7 @@ from sweep.spec.reading import (
     plain,
     read_document,
     resolve_instrument,
+    without_extensions,
 )
 from sweep.spec.rules import (
     Finding,
@@ -125,7 +126,7 @@ class Study(Part):
         """
         if not isinstance(mapping, Mapping):
             raise SpecError([Mistake("", "must be a mapping", shown(mapping))])
-        return cls.from_document(Document(plain(mapping)), Path(base))
+        return cls.from_document(Document(without_extensions(plain(mapping))), Path(base))
 
     @classmethod
     def from_stored(cls, text: str, base: Path | str | None = None) -> Self:
