@@ -7,6 +7,7 @@ in a table, so that most specs are read without pint, which takes a second to im
 
 from __future__ import annotations
 
+import math
 import re
 import unicodedata
 from dataclasses import dataclass
@@ -19,14 +20,24 @@ from typing import Any
 LONGEST_TEXT = 100
 DECIBEL = "dB"
 PER_HERTZ = "1/Hz"
-DECIBEL_PER_HERTZ = "dB/Hz"
-"""A power ratio in each hertz: -155 dB/Hz is 10^-15.5 /Hz."""
+LOGARITHMIC = {
+    "dB": ("dB", Fraction(1)),
+    "dB/Hz": (PER_HERTZ, Fraction(1)),
+    "dBc/Hz": (PER_HERTZ, Fraction(1)),
+    "dBm": ("W", Fraction(1, 1000)),
+    "dBW": ("W", Fraction(1)),
+}
+"""Units of power that are logarithms: the SI unit, and its value at 0 dB. 30 dBm is 1 W, and
+-155 dB/Hz is 10^-15.5 /Hz; of a laser's noise it is also written as dBc/Hz."""
 
 _NUMBER = r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d{1,4})?"
 _POWER = r"(?P<base>\d{1,6})(?:\^|\*\*)(?P<exponent>\d{1,3})"
 _UNIT = r"(?:(?<=\s)1\s*/|[^\d\s.+\-]).*"
 _VALUE = re.compile(rf"\s*(?:{_POWER}|(?P<number>{_NUMBER}))\s*(?P<unit>{_UNIT})?", re.ASCII)
 _EXPONENT = r"(?:\^|\*\*)?(?:(?P<exponent>[+-]?\d(?:\.5)?)|\((?P<ratio>[+-]?\d/[1-9])\))"
+_GROUPED = re.compile(
+    r"\s*[+-]?\d+(?:[.]\d+)*(?:,\d+|(?:[_' ]\d{3}(?!\d|\s*/))+(?:[.,]\d+)?)+", re.ASCII
+)
 _FACTOR = re.compile(rf"(?P<name>[A-Za-z]+|%)(?:{_EXPONENT})?")
 _OPERATOR = re.compile(r"(\*(?!\*)|/(?![^(]*\))|(?<=[A-Za-z0-9)]) +(?=[A-Za-z]))")
 _NOT_FINITE = re.compile(r"\s*[+-]?\.?(nan|inf|infinity)\b", re.IGNORECASE)
@@ -38,7 +49,7 @@ _PREFIXED = {
     "m": "nm um mm cm m km au",
     "s": "ns us ms s",
     "Hz": "Hz kHz MHz GHz THz",
-    "W": "pW nW uW mW W kW",
+    "W": "pW nW uW mW W kW dBm dBW",
     "rad": "urad mrad rad deg arcmin arcsec",
     "A": "pA nA uA mA A",
     "ohm": "ohm kohm Mohm",
@@ -49,13 +60,16 @@ _PREFIXED = {
     "W/m^3": "W/m^2/nm mW/m^2/nm W/m^2/um",
     "V": "uV mV V",
     "byte": "MB GB TB MiB GiB",
-    "1/m": "1/cm 1/m 1/km",
-    PER_HERTZ: "1/Hz dB/Hz",
+    "1/m": "1/cm 1/m 1/km dB/m dB/km",
+    PER_HERTZ: "1/Hz dB/Hz dBc/Hz",
     DECIBEL: "dB",
     "": "%",
 }
 
 _PI = Fraction("3.1415926535897932384626433832795028841971693993751")
+_LN_10 = Fraction("2.3025850929940456840179914546843642076011014886288")
+_ATTENUATION = {"dB/m": _LN_10 / 10, "dB/km": _LN_10 / 10_000, "dB/cm": 10 * _LN_10}
+"""Attenuation of power with distance: [1/m] of a decibel in each metre, kilometre or centimetre."""
 _WATT = {"gram": 1, "meter": 2, "second": -3}
 _BASES: dict[str, tuple[Fraction, dict[str, int]]] = {
     "m": (Fraction(1), {"meter": 1}),
@@ -96,7 +110,7 @@ class QuantityError(ValueError):
 class Unit:
     """A unit as the user wrote it and its way to SI: ``si = factor * value + offset``.
 
-    Decibels are power ratios, or such ratios in each hertz: ``si = 10 ** (value / 10)``.
+    Decibels are ratios of powers: ``si = factor * 10 ** (value / 10)``.
     """
 
     text: str
@@ -106,23 +120,42 @@ class Unit:
     @property
     def decibel(self) -> bool:
         """True if values of this unit are logarithms of power ratios."""
-        return self.text in (DECIBEL, DECIBEL_PER_HERTZ)
+        return self.text in LOGARITHMIC
 
     def to_si(self, value: Fraction) -> float:
         """SI value of `value` in this unit, correctly rounded."""
         try:
-            return float(_ratio(value) if self.decibel else self.factor * value + self.offset)
+            scaled = self.factor * (_ratio(value) if self.decibel else value)
+            return float(scaled + self.offset)
         except OverflowError:
             raise QuantityError("must be a number that a float holds (below 1.8e308)") from None
 
 
-def read_number(written: object) -> tuple[Fraction, Unit]:
-    """Exact value and unit of a pure number: ``0.1``, ``"1e9"``, ``"2^17"`` or ``"10 %"``."""
+def read_number(written: object, about: str = "") -> tuple[Fraction, Unit]:
+    """Exact value and unit of a pure number: ``0.1``, ``"1e9"``, ``"2^17"`` or ``"10 %"``.
+
+    Where it has another unit, a `QuantityError` says what the number is `about`.
+    """
     value, unit = _split(written)
-    if unit not in ("", "%"):
-        ratio = f"; {_show(value)} dB is {_show(_ratio(value))}" if unit == DECIBEL else ""
-        raise QuantityError(f"is a pure number and takes no unit{ratio}")
-    return value, Unit(unit, Fraction(1, 100)) if unit else Unit("")
+    if unit in ("%", "percent"):
+        return value, Unit("%", Fraction(1, 100))
+    if unit:
+        what = f": {about}" if about else ""
+        raise QuantityError(f"is a pure number and takes no unit{what}", _without_unit(value, unit))
+    return value, Unit("")
+
+
+def _without_unit(value: Fraction, unit: str) -> str:
+    """Suggestion of the pure number that a number with a unit may mean, if that is clear."""
+    if unit == DECIBEL:
+        powers, amplitudes = _show(_ratio(value)), _show(_ratio(value / 2))
+        if powers == amplitudes:
+            return f"write {powers}"
+        return f"write {powers} for a ratio of powers, {amplitudes} for one of amplitudes"
+    if quotient := re.fullmatch(r"/\s*(\d+)", unit):
+        divisor = int(quotient[1])
+        return f"write {_show(value / divisor)}" if divisor else ""
+    return f"write {_show(value)}" if unit[0].isalpha() else ""
 
 
 def read_quantity(written: object, *, si_unit: str, example: str) -> tuple[Fraction, Unit]:
@@ -133,19 +166,26 @@ def read_quantity(written: object, *, si_unit: str, example: str) -> tuple[Fract
     """
     value, text = _split(written)
     if not text:
-        raise QuantityError("needs a unit", f"write e.g. '{example}'")
+        remedy = f"write e.g. '{example}'"
+        if si_unit == DECIBEL and value > 0:
+            remedy += f"; a ratio of {_show(value)} is {10 * math.log10(value):.4g} dB"
+        raise QuantityError("needs a unit", remedy)
     return value, read_unit(text, si_unit=si_unit, example=example)
 
 
 @lru_cache(maxsize=4096)
 def read_unit(text: str, *, si_unit: str, example: str) -> Unit:
     """Parse a unit that must measure what `si_unit` measures."""
-    if DECIBEL in (si_unit, text):
-        if si_unit == text:
-            return Unit(DECIBEL)
+    logarithmic = "".join(text.split())
+    if logarithmic in LOGARITHMIC:
+        measured, factor = LOGARITHMIC[logarithmic]
+        if measured == si_unit:
+            return Unit(logarithmic, factor)
         raise QuantityError(*_unfit(text, si_unit, example))
-    if si_unit == PER_HERTZ and "".join(text.split()) == DECIBEL_PER_HERTZ:
-        return Unit(DECIBEL_PER_HERTZ)
+    if logarithmic in _ATTENUATION and si_unit == "1/m":
+        return Unit(logarithmic, _ATTENUATION[logarithmic])
+    if si_unit == DECIBEL:
+        raise QuantityError(*_unfit(text, si_unit, example))
     factors = _factors(text)
     if factors is None:
         raise QuantityError(
@@ -163,7 +203,8 @@ def read_unit(text: str, *, si_unit: str, example: str) -> Unit:
 
 def _unfit(text: str, si_unit: str, example: str) -> tuple[str, str]:
     """Rule and suggestion for a unit of the wrong dimension."""
-    return f"needs a unit like {si_unit}, and '{text}' is none", f"write e.g. '{example}'"
+    power = " or '30 dBm'" if (si_unit, text) == ("W", DECIBEL) else ""
+    return f"needs a unit like {si_unit}, and '{text}' is none", f"write e.g. '{example}'{power}"
 
 
 def _split(written: object) -> tuple[Fraction, str]:
@@ -175,6 +216,8 @@ def _split(written: object) -> tuple[Fraction, str]:
         raise QuantityError(f"must be at most {LONGEST_TEXT} characters long")
     if _NOT_FINITE.match(text):
         raise QuantityError("must be a finite number")
+    if grouped := _GROUPED.match(text):
+        raise QuantityError(*_ungrouped(text, grouped[0]))
     match = _VALUE.fullmatch(text)
     if match is None:
         raise QuantityError("must be a number, with its unit where it has one")
@@ -182,6 +225,21 @@ def _split(written: object) -> tuple[Fraction, str]:
     if match["base"]:
         return Fraction(int(match["base"]) ** int(match["exponent"])), unit
     return Fraction(match["number"]), unit
+
+
+def _ungrouped(text: str, number: str) -> tuple[str, str]:
+    """Rule and suggestion for a number whose digits are grouped, or with a decimal comma."""
+    *groups, last = re.split(r"[,_'\s]", number)
+    remedies = []
+    if "," not in number or (len(last) == 3 and "." not in number):
+        remedies.append(f"'{''.join([*groups, last])}{text[len(number) :]}'")
+    if number.count(",") == 1:
+        whole, _, decimals = number.partition(",")
+        remedies.append(f"'{re.sub(r'[^-+0-9]', '', whole)}.{decimals}{text[len(number) :]}'")
+    return (
+        "has a number that is grouped, or has a comma; numbers are written like 1234.5",
+        f"write {' or '.join(remedies)}" if remedies else "",
+    )
 
 
 def _spelled(text: str) -> str:

@@ -354,6 +354,23 @@ def test_a_plan_and_a_run_tell_how_often_noise_raises_an_alarm(here, processing,
         assert (warning in result.stderr) == bool(warned)
 
 
+@pytest.mark.parametrize(
+    ("processing", "remedy"),
+    [
+        ("tnr: 7", "raise instrument.processing.tnr"),
+        ("threshold_to_mean: 4", "raise instrument.processing.threshold_to_mean"),
+        ("design_pfa_shot: 0.3", "lower instrument.processing.design_pfa_shot"),
+        ("tnr: 8, detector: {kind: ca_cfar}", "lower instrument.processing.detector.pfa"),
+    ],
+)
+def test_the_remedy_for_many_false_alarms_names_a_field_that_the_study_has(processing, remedy):
+    from sweep.cli.terminal import fewer_alarms
+
+    drawn = "draws: {method: spectra, number: 2}" if "detector" in processing else ""
+    spec = Spec.from_mapping(yaml.safe_load(STUDY.replace("tnr: 8", processing) + drawn))
+    assert fewer_alarms(spec) == remedy
+
+
 def test_alarms_of_an_axis_of_thresholds_and_of_cfar_are_by_design(here):
     from sweep.analysis.noise_only import alarms_of_study
 

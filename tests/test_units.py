@@ -1,4 +1,5 @@
 import math
+import re
 import subprocess
 import sys
 from fractions import Fraction
@@ -124,8 +125,10 @@ def test_all_spellings_of_a_length_are_one_float(micrometres):
         ("3 W", "dB", "needs a unit like dB"),
         ("3 dB", "1/Hz", "needs a unit like 1/Hz"),
         ("3 dB/Hz", "dB", "needs a unit like dB"),
-        ("3 dB/Hz", "1/m", "unknown unit 'dB'"),
-        ("3 dB/km", "1/m", "unknown unit 'dB'"),
+        ("3 dB/Hz", "1/m", "needs a unit like 1/m, and 'dB/Hz' is none"),
+        ("3 dB/km", "m", "unknown unit 'dB'"),
+        ("30 dBm", "Hz", "needs a unit like Hz, and 'dBm' is none"),
+        ("30 dBm", "dB", "needs a unit like dB"),
         ("1e-14 m^-2/3", "m^(-2/3)", "cannot be read"),
         ("1 1/2 m", "m", "cannot be read"),
         ("5 1", "m", "must be a number, with its unit"),
@@ -146,7 +149,7 @@ def test_all_spellings_of_a_length_are_one_float(micrometres):
         (True, "m", "must be a number"),
         (None, "m", "must be a number"),
         ([1], "m", "must be a number"),
-        ("1,5 m", "m", "cannot be read"),
+        ("1,5 m", "m", "has a comma; numbers are written like 1234.5; write '1.5 m'"),
     ],
 )
 def test_a_quantity_that_cannot_be_read_says_why_and_what_to_write(written, si_unit, words):
@@ -183,3 +186,42 @@ def test_importing_the_package_and_its_units_leaves_pint_alone():
 @pytest.mark.parametrize("name", sorted(units.USUAL))
 def test_usual_units_are_exactly_pints(name):
     assert units._root(name) == units.by_pint(name)
+
+
+@pytest.mark.parametrize(
+    ("written", "si_unit", "value"),
+    [
+        ("30 dBm", "W", 1.0),
+        ("0 dBm", "W", 1e-3),
+        ("-90 dBm", "W", 1e-12),
+        ("3 dBW", "W", 10**0.3),
+        ("-155 dBc/Hz", "1/Hz", 10**-15.5),
+        ("-155 dBc / Hz", "1/Hz", 10**-15.5),
+        ("0.2 dB/km", "1/m", 0.2e-4 * math.log(10)),
+        ("1 dB/m", "1/m", 0.1 * math.log(10)),
+        ("50 percent", "", 0.5),
+    ],
+)
+def test_units_of_decibels_mean_what_the_field_means_by_them(written, si_unit, value):
+    if si_unit:
+        number, unit = read_quantity(written, si_unit=si_unit, example="")
+    else:
+        number, unit = read_number(written)
+    assert unit.to_si(number) == pytest.approx(value, rel=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("written", "words"),
+    [
+        ("1.234,5 m", "write '1234.5 m'"),
+        ("1,234.5 m", "write '1234.5 m'"),
+        ("1,000 m", "write '1000 m' or '1.000 m'"),
+        ("1 000 000 m", "write '1000000 m'"),
+        ("1_000 m", "write '1000 m'"),
+        ("1'000 m", "write '1000 m'"),
+        ("-1,5e3 m", "write '-1.5e3 m'"),
+    ],
+)
+def test_a_number_with_a_comma_or_groups_is_told_as_it_is_written_here(written, words):
+    with pytest.raises(QuantityError, match=re.escape(words)):
+        read_quantity(written, si_unit="m", example="")

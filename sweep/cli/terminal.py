@@ -539,9 +539,27 @@ def warn_of(study: Spec | SceneSpec) -> None:
     if most > MANY_ALARMS:
         tell(
             "warning: noise alone raises a false alarm in either chirp with probability "
-            f"{most:.3g} (more than {MANY_ALARMS:g}): raise the threshold, or lower detector.pfa",
+            f"{most:.3g} (more than {MANY_ALARMS:g}): {fewer_alarms(study)}",
             err=True,
         )
+
+
+def fewer_alarms(study: Spec | SceneSpec) -> str:
+    """Fields of a study to change for fewer false alarms, as an imperative."""
+    from sweep.model.detectors import DETECTORS, FIXED
+    from sweep.model.estimators import DETECTOR
+    from sweep.model.threshold import WAYS
+
+    parameters, kind = study.parameters(), f"{DETECTOR}kind"
+    along = {member.path: member.values for axis in study.axes for member in axis.members}
+    kinds = {str(name) for name in along.get(kind, [parameters.get(kind, FIXED)])}
+    told = []
+    if FIXED in kinds:
+        (way,) = (way for way in WAYS if parameters.get(way) is not None)
+        told.append(f"{'lower' if 'pfa' in way else 'raise'} {way}")
+    if kinds & set(DETECTORS) - {FIXED}:
+        told.append(f"lower {DETECTOR}pfa")
+    return " and ".join(told)
 
 
 def warn_before(study: Spec | SceneSpec, store: Location) -> None:

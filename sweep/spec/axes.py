@@ -24,7 +24,13 @@ from sweep.spec.rules import (
     near_miss,
     rejected,
 )
-from sweep.spec.sections import parameter_rules, parameter_suggestion, short_name
+from sweep.spec.sections import (
+    AXES_TAKE,
+    NOT_ON_AXES,
+    parameter_rules,
+    parameter_suggestion,
+    short_name,
+)
 from sweep.units import QuantityError, Unit
 
 RESERVED = ("batch", "draw", "point", "spec")
@@ -148,10 +154,26 @@ def _rule_at(path: str, location: Location) -> Rule:
     """Rule of the parameter at a path."""
     rule = parameter_rules().get(path)
     if rule is None:
-        raise rejected(location, "is no parameter", parameter_suggestion(path))
+        raise rejected(location, *_why_no_axis(path))
     if isinstance(rule, SweepError):
         raise rejected(location, "is one table for a whole study", "put it into the instrument")
     return rule
+
+
+_WHOLE_STUDY = "is the same for a whole study"
+
+
+def _why_no_axis(path: str) -> tuple[str, str]:
+    """Rule and remedy for the path of what no axis may set."""
+    section, _, name = path.partition(".")
+    if path == "seed":
+        rule = f"{_WHOLE_STUDY}: each point and draw has random numbers of its own already"
+        return rule, "leave it out, or run a study for each seed"
+    if section == "effects" and name:
+        return _WHOLE_STUDY, "run a study for each mode, and compare them with sweep compare"
+    if section in NOT_ON_AXES:
+        return _WHOLE_STUDY, f"run a study for each value; {AXES_TAKE}"
+    return "is no parameter", parameter_suggestion(path)
 
 
 def _member(path: str, pieces: list[Values], location: Location) -> Member:
@@ -347,7 +369,7 @@ def _rounded(values: np.ndarray) -> np.ndarray:
 def values_in(unit: Unit, si: np.ndarray) -> np.ndarray:
     """SI values (n,) in the given unit, to 15 significant digits."""
     if unit.decibel:
-        return _rounded(10.0 * np.log10(si))
+        return _rounded(10.0 * np.log10(si / float(unit.factor)))
     if (unit.factor, unit.offset) == (1, 0):
         return _rounded(si.astype(float))
     (p, q), (a, b) = unit.offset.as_integer_ratio(), unit.factor.as_integer_ratio()
@@ -378,10 +400,10 @@ class Values:
 
     def displayed(self, unit: Unit) -> np.ndarray:
         """Values (n,) in the unit of choice."""
-        if self.progression is None or unit.decibel != self.unit.decibel:
-            return values_in(unit, self.si)
-        if unit == self.unit:
+        if self.progression is not None and unit == self.unit:
             return self.progression.values()
+        if self.progression is None or unit.decibel or self.unit.decibel:
+            return values_in(unit, self.si)
         offset = (self.unit.offset - unit.offset) / unit.factor
         return self.progression.mapped(self.unit.factor / unit.factor, offset).values()
 
@@ -489,6 +511,8 @@ def _read_bounds(
     first = exact[0][1]
     if any(unit.decibel != first.decibel for _, unit in exact):
         raise rejected(location, "mixes decibels with a plain unit", "take one of them")
+    if first.decibel and any(unit.factor != first.factor for _, unit in exact):
+        raise rejected(location, "mixes units of decibels", f"take {first.text} for all")
     # An increment feels no offset.
     offsets = [exact[0][1].offset - first.offset, exact[1][1].offset - first.offset, Fraction(0)]
     return [

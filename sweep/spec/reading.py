@@ -42,6 +42,8 @@ DEEPEST = 30
 MOST_NODES = 200_000
 
 _INSTRUMENT: Location = ("instrument",)
+_EXAMPLE = "settembrini_2026"
+"""Instrument of the library that remedies name."""
 _LIBRARY = Path(__file__).parents[1] / "instruments"
 _THRESHOLDS = {way.removeprefix(PROCESSING) for way in WAYS}
 
@@ -149,13 +151,47 @@ class Document:
         return fields
 
     def mistake(self, finding: Finding) -> Mistake:
-        """Give a finding its file and line; those of the nearest place around it that has any."""
+        """Give a finding its file and line; those of the nearest place around it that has any.
+
+        An instrument of the library is right by itself: what is wrong with its fields comes from
+        what the user has written, and is told there.
+        """
         location = finding.location
         while location and location not in self.places:
             location = location[:-1]
         file, line = self.places.get(location, (self.file, None))
-        path, value = dotted(finding.location), shown(finding.written)
-        return Mistake(path, finding.rule, value, finding.suggestion, line, file)
+        path, value, rule = dotted(finding.location), shown(finding.written), finding.rule
+        if Path(file).parent == _LIBRARY and file != self.file:
+            kept = _written_at(self.value, location)
+            rule += "" if isinstance(kept, dict) else f" ({Path(file).stem} has {kept})"
+            value = ""
+            file, line = self._cause(finding)
+        return Mistake(path, rule, value, finding.suggestion, line, file)
+
+    def _cause(self, finding: Finding) -> tuple[str, int | None]:
+        """File and line at which the user has set off a mistake in a field of the library's.
+
+        That is a field that the finding names, by its path or in words, else one of the same
+        section, else the instrument.
+        """
+        location, told = finding.location, f"{finding.rule} {finding.suggestion}"
+        section = location if isinstance(_written_at(self.value, location), dict) else location[:-1]
+        written = {place: at for place, at in self.places.items() if at[0] == self.file}
+        fields = [place for place in written if len(place) > 1 and place[1] != "like"]
+        fields.sort(key=lambda place: {"instrument": 0, "axes": 1}.get(str(place[0]), 2))
+        by_words = {place: str(place[-1]).rpartition(".")[2].replace("_", " ") for place in fields}
+        places = [
+            *(tuple(path.split(".")) for path in re.findall(r"[a-z_]\w*(?:\.\w+)+", told)),
+            *(
+                place
+                for place, words in by_words.items()
+                if re.search(rf"\b{re.escape(words)}\b", told)
+            ),
+            *(place for place in fields if place[:-1] == section),
+            (*_INSTRUMENT, "like"),
+            _INSTRUMENT,
+        ]
+        return next((written[place] for place in places if place in written), (self.file, None))
 
     def mistakes(self, findings: Iterable[Finding]) -> list[Mistake]:
         """Return findings as they stand in the file, each once; those in other files come last."""
@@ -312,14 +348,18 @@ def _read_error_table(document: Document, instrument: dict[str, Any], base: Path
 def _instrument_of(reference: object, location: Location, base: Path) -> Document:
     """Document of an instrument, where it stands as in a spec."""
     if not isinstance(reference, str):
-        what = "name of an instrument, see sweep instruments" if "like" in location else ""
-        raise rejected(location, f"must be the {what or 'path of a YAML file'}", "", reference)
+        if "file" in location:
+            remedy = "write it relative to this file"
+            raise rejected(location, "must be the path of a YAML file", remedy, reference)
+        rule = "must be the name of an instrument of the library"
+        raise rejected(location, rule, f"the library has {', '.join(library())}", reference)
     file, known = base / os.path.expanduser(reference), library()
     if "file" not in location and reference in known:
         return read_document(known[reference])
-    is_word = reference.isidentifier() and not os.path.exists(file)
+    is_word = not re.search(r"[/\\]|\.ya?ml$", reference) and not os.path.exists(file)
     if "like" in location or (is_word and "file" not in location):
-        remedy = near_miss(reference, known, otherwise=f"the library has {', '.join(known)}")
+        words = re.sub(r"\W+", "_", reference.strip().lower())
+        remedy = near_miss(words, known, otherwise=f"the library has {', '.join(known)}")
         raise rejected(location, "is no instrument of the library", remedy, reference)
     try:
         read = read_document(file)
@@ -371,6 +411,16 @@ def merged(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, A
         both = isinstance(below, Mapping) and isinstance(value, Mapping)
         result[key] = merged(below, value) if both else value  # type: ignore[arg-type]
     return result
+
+
+def _written_at(value: Any, location: Location) -> Any:
+    """Value at a location; empty text where there is none."""
+    try:
+        for part in location:
+            value = value[part]
+    except (KeyError, IndexError, TypeError):
+        return ""
+    return value
 
 
 def _is_leaf(value: Any, location: Location) -> bool:
@@ -438,7 +488,7 @@ def _finding(detail: dict[str, Any], root: Any) -> Finding:
     if kind == "union_tag_not_found":
         return Finding(location, "lacks its kind", f"write {_with_kind(place.models)}", written)
     rule = _PLAIN.get(kind, "has a value that cannot stand here")
-    return Finding(location, rule, "", written)
+    return Finding(location, rule, _remedy(place) if place.models else "", written)
 
 
 def _with_kind(models: parts.Models) -> str:
@@ -455,7 +505,12 @@ def _other_kind(tag: str, kinds: list[str]) -> str:
 
 def _remedy(place: parts.Place) -> str:
     """Remedy for a missing field or section."""
-    name = place.location[-1]
+    name, section = place.location[-1], place.location[:-1]
+    if place.location == _INSTRUMENT:
+        return (
+            f"write e.g. 'instrument: {{like: {_EXAMPLE}}}' (the library has "
+            f"{', '.join(library())}), or all of its sections"
+        )
     field = parts.fields_of(place.parents[0]).get(str(name)) if place.parents else None
     rule = parts.rule_of(field) if field is not None else None
     example = rule.example if rule is not None else ""
@@ -465,7 +520,9 @@ def _remedy(place: parts.Place) -> str:
     if len(place.models) > 1:
         return f"write '{name}:' with {_with_kind(place.models)}"
     if place.models:
-        return f"write '{name}:' with {', '.join(parts.fields_of(place.models[0]))}"
+        remedy = f"write '{name}:' with {', '.join(parts.fields_of(place.models[0]))}"
+        like = f", or take all that is missing from another: 'like: {_EXAMPLE}'"
+        return remedy + (like if section == _INSTRUMENT else "")
     return f"write '{name}: ...'"
 
 

@@ -38,6 +38,11 @@ Location = tuple[str | int, ...]
 ABSENT = object()
 """Stands for a value where none is written."""
 _LONGEST_VALUE = 60
+_SHORTEST_PART, _MOST_SUGGESTED = 4, 3
+"""Characters of a part of a name that suggests the whole, and whole names that are suggested."""
+_NO = {"no", "n", "false", "none", "never", "null", "disable", "disabled", "0", "off"}
+_YES = {"yes", "y", "true", "always", "enable", "enabled", "1", "on"}
+"""Words for off and on."""
 
 
 @dataclass(frozen=True, order=True)
@@ -142,10 +147,14 @@ def shown(written: object) -> str:
 
 
 def near_miss(name: str, known: Iterable[str], *, otherwise: str = "") -> str:
-    """Suggestion of the known name that `name` resembles, else a remedy."""
+    """Suggestion of the known name that `name` resembles, or those that hold it, else a remedy."""
     names = list(known)
     close = [k for k in names if k.lower() == name.lower()] or get_close_matches(name, names, n=1)
-    return f"did you mean '{close[0]}'?" if close else otherwise
+    if not close and len(name) >= _SHORTEST_PART:
+        close = [k for k in names if name.lower() in k.lower()]
+    if len(close) > _MOST_SUGGESTED:
+        return otherwise
+    return f"did you mean {' or '.join(map(repr, close))}?" if close else otherwise
 
 
 # Rules
@@ -275,7 +284,7 @@ class Numeric(Rule):
             rule = "is one value for a whole study, no point of an axis"
             raise QuantityError(rule, "leave it out")
         try:
-            return read_number(written)
+            return read_number(written, _first_clause(self.about))
         except QuantityError as error:
             if not self.word:
                 raise
@@ -339,6 +348,12 @@ class Numeric(Rule):
         return common | {"anyOf": kinds}
 
 
+def _first_clause(about: str) -> str:
+    """First clause of a description, as the end of a sentence."""
+    clause = re.split(r"[;:,.(] ?", about)[0].strip()
+    return clause[:1].lower() + clause[1:] if clause[1:2].islower() else clause
+
+
 @lru_cache(maxsize=1024)
 def _bound(rule: Numeric, written: str) -> float:
     """SI value of a rule's bound."""
@@ -365,6 +380,10 @@ class Choice(Rule):
         if written in self.options and isinstance(written, str):
             return written
         rule = self.rule or f"must be one of {', '.join(self.options)}"
+        said = str(written).strip().lower()
+        meant = ("off", "none") if said in _NO else ("on",) if said in _YES else ()
+        if option := next((option for option in meant if option in self.options), ""):
+            raise QuantityError(rule, f"write '{option}'")
         raise QuantityError(rule, near_miss(str(written), self.options, otherwise=self.remedy))
 
     def _json(self) -> Json:

@@ -512,6 +512,14 @@ SECTIONS: dict[str, type[BaseModel]] = {
 }
 
 
+AXES_TAKE = f"axes take fields of {', '.join([*SECTIONS][:-1])} and {[*SECTIONS][-1]}"
+NOT_ON_AXES = (
+    "draws", "effects", "error_floor", "execution", "figures", "interface",
+    "navigation", "platform", "question", "scanners", "scene", "seed", "storage", "title",
+)  # fmt: skip
+"""Sections and fields of a study that no axis may set."""
+
+
 @cache
 def parameter_rules() -> MappingProxyType[str, Rule]:
     """Rule of every parameter that an axis may vary, by dotted path."""
@@ -548,5 +556,4 @@ def parameter_suggestion(path: str, known: Iterable[str] | None = None) -> str:
     suggestion = near_miss(path, rules) or near_miss(tail, by_tail)
     for short, known in by_tail.items():
         suggestion = suggestion.replace(f"'{short}'", f"'{known}'")
-    *others, last = SECTIONS
-    return suggestion or f"axes take fields of {', '.join(others)} and {last}"
+    return suggestion or AXES_TAKE

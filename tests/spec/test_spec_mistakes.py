@@ -35,7 +35,22 @@ FIELDS = [
     ("instrument.telescope.aperture", "25 mn", "did you mean 'mm'?"),
     ("instrument.telescope.optical_efficiency", 1.01, "must be at most 1"),
     ("instrument.telescope.optical_efficiency", "-2.2 dB",
-     "takes no unit; -2.2 dB is 0.6026 (you wrote '-2.2 dB'); write e.g. '0.8'"),
+     "takes no unit: fraction of the collected light that reaches the detector (you wrote "
+     "'-2.2 dB'); write 0.6026 for a ratio of powers, 0.7762 for one of amplitudes"),
+    ("instrument.processing.tnr", "20 dB", "write 100 for a ratio of powers, 10 for one of ampl"),
+    ("instrument.processing.tnr", "10 sigma",
+     "takes no unit: threshold over the standard deviation of a noise-only bin's magnitude (you "
+     "wrote '10 sigma'); write 10"),
+    ("target.reflectance", "1/4", "is a pure number and takes no unit: "),
+    ("instrument.processing.fft_size", "1,024", "has a comma; numbers are written like 1234.5"),
+    ("instrument.processing.fft_size", "131 072", "write '131072'"),
+    ("instrument.laser.power", "1,5 W", "(you wrote '1,5 W'); write '1.5 W'"),
+    ("instrument.laser.power", "30 dB", "'dB' is none (you wrote '30 dB'); write e.g. '1 W' or "
+     "'30 dBm'"),
+    ("instrument.laser.power", "30 dbm", "has an unknown unit 'dbm' (you wrote '30 dbm'); did you "
+     "mean 'dBm'?"),
+    ("instrument.chirp.bandwidth", "30 dBm", "needs a unit like Hz, and 'dBm' is none"),
+    ("instrument.receiver.noise_figure", 2, "write e.g. '3 dB'; a ratio of 2 is 3.01 dB"),
     ("instrument.receiver.noise_figure", "-1 dB", "must be at least 0 dB"),
     ("instrument.receiver.temperature", "-300 degC", "must be at least 1 nK"),
     ("instrument.processing.fft_size", 100.5, "must be a whole number"),
@@ -52,10 +67,23 @@ FIELDS = [
     ("footprint.beamlets", "atuo", "must be a number or auto (you wrote 'atuo')"),
     ("accuracy.confidence", 0, "must be greater than 0"),
     ("accuracy.confidence", 1, "must be less than 1"),
-    ("atmosphere.extinction", "0.1 dB/km", "write e.g. '1e-4 1/m'"),
+    ("atmosphere.extinction", "0.1 dB", "write e.g. '1e-4 1/m'"),
     ("effects.leakge", "on", "is no field; did you mean 'leakage'?"),
     ("effects.leakage", "onn", "must be one of auto, on, off (you wrote 'onn'); did you mean 'on'"),
-    ("effects.leakage", 1, "must be one of auto, on, off"),
+    ("effects.leakage", 1, "must be one of auto, on, off (you wrote 1); write 'on'"),
+    ("effects.leakage", "no", "must be one of auto, on, off (you wrote 'no'); write 'off'"),
+    ("effects.leakage", "N", "must be one of auto, on, off (you wrote 'N'); write 'off'"),
+    ("effects.leakage", "none", "must be one of auto, on, off (you wrote 'none'); write 'off'"),
+    ("effects.leakage", 0, "must be one of auto, on, off (you wrote 0); write 'off'"),
+    ("effects.leakage", "enabled", "(you wrote 'enabled'); write 'on'"),
+    ("footprint.speckle", False, "must be one of developed, none (you wrote False); write 'none'"),
+    ("instrument", ..., "is missing; write e.g. 'instrument: {like: settembrini_2026}' (the "
+     "library has automotive_fmcw, chester_2017"),
+    ("instrument", None, "write e.g. 'instrument: {like: settembrini_2026}'"),
+    ("instrument", 3, "write e.g. 'instrument: {like: settembrini_2026}'"),
+    ("instrument", "chester", "is no instrument of the library (you wrote 'chester'); did you mean "
+     "'chester_2017_table_4_1' or 'chester_2017_table_5_1'?"),
+    ("instrument", "Rogers 2021", "did you mean 'rogers_2021'?"),
     ("execution.scheduler", "tcp://10.0.0.5:8786", "say --scheduler ADDRESS, or --cluster FILE"),
     ("seed", 1.5, "must be a whole number"),
     ("platform", {}, "is no field; it is for studies with a scene, in place of a target"),
@@ -78,6 +106,64 @@ def test_a_wrong_field_is_reported_once_with_path_rule_and_remedy(path, value, w
         assert mistake.suggestion
 
 
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("settembrini", "(you wrote 'settembrini'); did you mean 'settembrini_2026'?"),
+        ("x", "is no instrument of the library (you wrote 'x'); the library has automotive_fmcw, "),
+        (None, "must be the name of an instrument of the library (you wrote nothing); the library"),
+    ],
+)
+def test_an_instrument_that_the_library_lacks_is_told_with_those_that_it_has(name, words):
+    (mistake,) = mistakes_of(written({"instrument": {"like": name}}))
+    assert mistake.path == "instrument.like" and words in str(mistake)
+
+
+LIKE = """\
+title: A study
+instrument:
+  like: automotive_fmcw
+  {fields}
+target: {{range: {range}, grazing_angle: 30 deg, reflectance: 0.1}}
+"""
+
+
+@pytest.mark.parametrize(
+    ("fields", "reach", "line", "path", "words"),
+    [
+        ("processing: {acquisition_delay: 1 s}", "100 m", 4, "instrument.chirp.duration",
+         "(automotive_fmcw has 6.1 us)"),
+        ("telescope: {aperture: 30 mm}", "900 km", 5, "instrument.chirp.duration",
+         "(automotive_fmcw has 6.1 us)"),
+        ("processing: {tnr: 3}\n  chirp: {}", "100 m", None, "", ""),
+        ("processing: {tnr: 3, design_pfa_bin: 1e-6}", "100 m", 4, "instrument.processing",
+         "sets the threshold by tnr and by design_pfa_bin; keep one of them"),
+        ("receiver: {record: complex, architecture: direct}", "100 m", 4,
+         "instrument.receiver.record", "samples I and Q"),
+    ],
+)  # fmt: skip
+def test_what_a_field_sets_off_in_the_library_s_instrument_is_told_at_the_field(
+    tmp_path, fields, reach, line, path, words
+):
+    file = tmp_path / "a.yaml"
+    file.write_text(LIKE.format(fields=fields, range=reach))
+    if line is None:
+        assert load(file).instrument.processing.tnr == 3
+        return
+    with pytest.raises(SpecError) as caught:
+        load(file)
+    told = {mistake.path: mistake for mistake in caught.value.mistakes}
+    assert (told[path].file, told[path].line) == (str(file), line)
+    assert words in str(told[path])
+    assert not any("sweep/instruments" in str(mistake) for mistake in caught.value.mistakes)
+
+
+def test_in_plain_data_no_file_of_the_library_is_told():
+    mapping = written({"instrument": {"like": "rogers_2021", "processing": {"tnr": -1}}})
+    mapping["target"]["range"] = "900 km"
+    assert {(mistake.file, mistake.line) for mistake in mistakes_of(mapping)} == {("", None)}
+
+
 def test_a_filter_before_the_adc_shapes_noise_that_is_to_be_white():
     receiver = "instrument.receiver."
     changes = {f"{receiver}antialias_bandwidth": "200 MHz", f"{receiver}noise_shape": "white"}
@@ -89,12 +175,23 @@ def test_a_filter_before_the_adc_shapes_noise_that_is_to_be_white():
 AXES = [
     ({"target.rnge": ["1 m"]}, "target.rnge", "did you mean 'target.range'?"),
     ({"range": ["1 m"]}, "range", "did you mean 'target.range'?"),
-    ({"seed": [1, 2]}, "seed", "is no parameter; axes take fields"),
+    ({"seed": [1, 2]}, "seed", "is the same for a whole study: each point and draw has random "
+     "numbers of its own already; leave it out, or run a study for each seed"),
+    ({"effects.leakge": ["on"]}, "effects.leakge", "is the same for a whole study"),
+    ({"draws.number": [1, 2]}, "draws.number", "is the same for a whole study; run a study for "
+     "each value; axes take fields of instrument, target, atmosphere, footprint and accuracy"),
+    ({"title": ["a", "b"]}, "title", "is the same for a whole study"),
+    ({"laser": [1]}, "laser", "is no parameter"),
     ({"target.range": []}, "target.range", "holds no value"),
     ({"target.range": "1 m"}, "target.range", "must be a list or a generator"),
     ({"target.range": ["1 m", "-2 m"]}, "target.range[1]", "must be at least 1 nm"),
     ({"target.range": ["1 m", "100 cm"]}, "target.range", "holds 1.0 m more than once"),
-    ({"effects.leakage": ["on"]}, "effects.leakage", "is no parameter"),
+    ({"effects.leakage": ["on"]}, "effects.leakage", "is the same for a whole study; run a study "
+     "for each mode, and compare them with sweep compare"),
+    ({"instrument.laser.power": {"linear": ["0 dBm", "3 dBW"], "number": 3}},
+     "instrument.laser.power.linear", "mixes units of decibels; take dBm for all"),
+    ({"instrument.laser.power": {"linear": ["0 dBm", "3 W"], "number": 3}},
+     "instrument.laser.power.linear", "mixes decibels with a plain unit"),
     ({"instrument.laser.relative_intensity_noise": {"linear": ["-160 dB/Hz", "1e-15 1/Hz"],
       "number": 3}}, "instrument.laser.relative_intensity_noise.linear", "mixes decibels"),
     ({"target.range": {"linear": ["1 m", "9 m"]}}, "target.range", "lacks the number of values"),

@@ -74,7 +74,7 @@ def test_numbers_mean_what_they_say_whatever_yaml_makes_of_them(tmp_path):
         path.write_text(text.replace("tnr: 10", f"tnr: {spelling}"))
         assert load(path).instrument.processing.tnr == value
     path.write_text(text.replace("tnr: 10", "tnr: 1:30"))
-    assert "is a pure number and takes no unit (you wrote '1:30')" in refusal(path)
+    assert "(you wrote '1:30'); write e.g. '10'" in refusal(path)
 
 
 def instrument_file(tmp_path):

@@ -79,7 +79,7 @@ def si(array: xr.DataArray) -> xr.DataArray:
         return array
     unit = rule.exact(f"1 {units}")[1]
     if unit.decibel:
-        return 10 ** (array / 10)
+        return float(unit.factor) * 10 ** (array / 10)
     return array * float(unit.factor) + float(unit.offset)
 
 
