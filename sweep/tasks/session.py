@@ -10,7 +10,7 @@ import socket
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -126,6 +126,8 @@ class RunOptions:
     dashboard
         Whether the workers that are started have Dask's dashboard, on a port of this machine alone.
         It has no password: all users of this machine can see it.
+    allow_code
+        Python modules whose detectors and estimators the study may run, here and on its workers.
     evaluate
         What computes a block in place of the model, with the same results; for instrumenting.
     """
@@ -141,7 +143,14 @@ class RunOptions:
     retry_failed: bool = False
     performance_report: str | Path | None = None
     dashboard: bool = False
+    allow_code: Sequence[str] = ()
     evaluate: Evaluate | None = None
+
+    def __post_init__(self) -> None:
+        if self.allow_code:
+            from sweep.tasks.user_code import allow
+
+            allow([self.allow_code] if isinstance(self.allow_code, str) else self.allow_code)
 
     def place(self, spec: Spec | SceneSpec) -> AnyCluster | None:
         """Return the cluster given here or by the spec's `execution`; None for a plain loop.
@@ -223,7 +232,7 @@ class Pool(ExitStack):
         super().__init__()
         self.options, self.interrupts = options, Interrupts()
         self.told = chosen(options.progress)
-        self._cluster = options.place(spec)
+        self._cluster, self._spec = options.place(spec), spec
         self.most = 1  # blocks of the study: more workers than that have nothing to do
         self._reached: Reached | None = None
 
@@ -260,7 +269,9 @@ class Pool(ExitStack):
     def answers(self, path: str, study_id: str, queue: BlockQueue, seen: Seen) -> Iterator[Answer]:
         """Answers of a study's blocks as they arrive; `seen` tells what is in the store here."""
         options = self.options
-        job = Job(path, study_id, options.evaluate, options.block_timeout, options.durable)
+        job = Job(
+            path, study_id, options.evaluate, options.block_timeout, options.durable, self._code()
+        )
         if self.is_plain:
             if options.performance_report is not None:
                 self.told.say("no performance report: a plain loop has no scheduler to tell of it")
@@ -270,6 +281,14 @@ class Pool(ExitStack):
         client, slots, _ = self.connect()
         scheduler = Scheduler(client, slots, job, queue, seen=seen, say=self.told.say)
         return scheduler.answers(lambda: self.interrupts.stopping)
+
+    def _code(self) -> tuple[tuple[str, str], ...]:
+        """Modules of the user's whose functions the study names, and their digests."""
+        if not any(own_functions(self._spec)):
+            return ()
+        from sweep.tasks.user_code import allowed_code
+
+        return tuple(allowed_code(self._spec).items())
 
     def revive(self) -> None:
         """Start workers of this machine again that are gone."""

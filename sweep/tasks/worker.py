@@ -25,7 +25,7 @@ from sweep.storage.opening import read_attributes
 from sweep.tasks import journal, store, studies
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.journal import Begun, Failure, Receipt
-from sweep.tasks.progress import StoreError
+from sweep.tasks.progress import CodeError, StoreError
 from sweep.tasks.study import Evaluate, Results, Stop, Unfinished
 
 T = TypeVar("T")
@@ -64,6 +64,7 @@ class Job:
     evaluate: Evaluate | None = None  # in place of the study, with the same results
     seconds: float | None = None  # that one block may take
     durable: bool = False  # whether its chunks are on the disk before its receipt
+    code: tuple[tuple[str, str], ...] = ()  # modules of the user's that may run, and their digests
 
 
 @dataclass
@@ -119,10 +120,21 @@ def work(job: Job, blocks: list[int]) -> Answer:
     """
     answer = Answer(worker=worker_address(), host=socket.gethostname())
     try:
+        if answer.worker:
+            _admit(job)
         _work(answer, study(job.path, job.study_id), blocks, job)
-    except (StoreError, OSError) as error:
+    except (CodeError, StoreError, OSError) as error:
         answer.unfit = error
     return answer
+
+
+def _admit(job: Job) -> None:
+    """Allow the code that the run's driver allows in this worker; CodeError if it has another."""
+    if job.code:
+        from sweep.tasks.user_code import admit
+
+        for module, digest in job.code:
+            admit(module, digest)
 
 
 def _work(answer: Answer, arrays: store.Arrays, blocks: list[int], job: Job) -> None:
