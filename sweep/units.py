@@ -134,7 +134,7 @@ class Unit:
 def read_number(written: object, about: str = "") -> tuple[Fraction, Unit]:
     """Exact value and unit of a pure number: ``0.1``, ``"1e9"``, ``"2^17"`` or ``"10 %"``.
 
-    Where it has another unit, a `QuantityError` says what the number is `about`.
+    A `QuantityError` for any other unit says what the number is `about`.
     """
     value, unit = _split(written)
     if unit in ("%", "percent"):

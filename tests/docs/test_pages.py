@@ -36,6 +36,13 @@ ELSEWHERE = re.compile(r"^(make|pip|helm|kubectl) |--cluster deploy/", re.M)
 
 LAID_OVER = "laid_over.yaml"
 
+
+class Words(yaml.SafeLoader):
+    """Loader of YAML's scalars as they are written, and of its merge keys."""
+
+    yaml_implicit_resolvers = {"<": yaml.SafeLoader.yaml_implicit_resolvers["<"]}  # noqa: RUF012
+
+
 WHOLE = {
     "title": "What a fragment of a spec is laid over",
     "instrument": "chester_2017_table_4_1",
@@ -72,7 +79,7 @@ def save(text, over=WHOLE):
     """A spec under the name that its first line gives; one without is laid over a whole spec."""
     found = re.match(r"# (\S+\.yaml)\n", text)
     path = Path(found.group(1) if found else LAID_OVER)
-    laid = text if found else yaml.dump(over | yaml.load(text, yaml.BaseLoader))
+    laid = text if found else yaml.dump(over | yaml.load(text, Words))
     path.write_text(laid, encoding="utf-8")
     return path
 
@@ -106,7 +113,7 @@ def test_blocks_are_of_kinds_that_can_be_run_and_specs_are_right(page, here):
             path = save(text, over)
             assert sweep.load(path).title
             if path.name != LAID_OVER:
-                over = yaml.load(text, yaml.BaseLoader)
+                over = yaml.load(text, Words)
         assert language != "text" or before in {"python", "sh"}
 
 
