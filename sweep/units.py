@@ -136,7 +136,7 @@ def read_number(written: object, about: str = "") -> tuple[Fraction, Unit]:
 
     A `QuantityError` for any other unit says what the number is `about`.
     """
-    value, unit = _split(written)
+    value, unit = _split(written, "must be a number")
     if unit in ("%", "percent"):
         return value, Unit("%", Fraction(1, 100))
     if unit:
@@ -155,7 +155,7 @@ def _without_unit(value: Fraction, unit: str) -> str:
     if quotient := re.fullmatch(r"/\s*(\d+)", unit):
         divisor = int(quotient[1])
         return f"write {_show(value / divisor)}" if divisor else ""
-    return f"write {_show(value)}" if unit[0].isalpha() else ""
+    return f"write {_show(value)}" if unit.isalpha() else ""
 
 
 def read_quantity(written: object, *, si_unit: str, example: str) -> tuple[Fraction, Unit]:
@@ -164,7 +164,7 @@ def read_quantity(written: object, *, si_unit: str, example: str) -> tuple[Fract
     The SI unit fixes its dimension: ``"dB"`` for a power ratio written in decibels. The example
     is shown where the unit is missing, unknown or unfit: a `QuantityError`.
     """
-    value, text = _split(written)
+    value, text = _split(written, "must be a number with a unit")
     if not text:
         remedy = f"write e.g. '{example}'"
         if si_unit == DECIBEL and value > 0:
@@ -207,10 +207,10 @@ def _unfit(text: str, si_unit: str, example: str) -> tuple[str, str]:
     return f"needs a unit like {si_unit}, and '{text}' is none", f"write e.g. '{example}'{power}"
 
 
-def _split(written: object) -> tuple[Fraction, str]:
-    """Exact number and unit text (empty where none) of what was written."""
+def _split(written: object, rule: str) -> tuple[Fraction, str]:
+    """Exact number and unit text (empty where none) of what was written; the rule if unreadable."""
     if isinstance(written, bool) or not isinstance(written, int | float | str):
-        raise QuantityError("must be a number, with its unit where it has one")
+        raise QuantityError(rule)
     text = _spelled(str(written))
     if len(text) > LONGEST_TEXT:
         raise QuantityError(f"must be at most {LONGEST_TEXT} characters long")
@@ -220,7 +220,7 @@ def _split(written: object) -> tuple[Fraction, str]:
         raise QuantityError(*_ungrouped(text, grouped[0]))
     match = _VALUE.fullmatch(text)
     if match is None:
-        raise QuantityError("must be a number, with its unit where it has one")
+        raise QuantityError(rule)
     unit = (match["unit"] or "").strip()
     if match["base"]:
         return Fraction(int(match["base"]) ** int(match["exponent"])), unit

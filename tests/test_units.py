@@ -131,7 +131,7 @@ def test_all_spellings_of_a_length_are_one_float(micrometres):
         ("30 dBm", "dB", "needs a unit like dB"),
         ("1e-14 m^-2/3", "m^(-2/3)", "cannot be read"),
         ("1 1/2 m", "m", "cannot be read"),
-        ("5 1", "m", "must be a number, with its unit"),
+        ("5 1", "m", "must be a number with a unit"),
         ("1 m^(1/0)", "m", "cannot be read"),
         ("nan m", "m", "must be a finite number"),
         ("inf m", "m", "must be a finite number"),

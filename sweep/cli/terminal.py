@@ -48,8 +48,27 @@ class LocalPath(click.Path):
         super().__init__(path_type=Path, **rules)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return the path, as click checks it."""
-        return super().convert(os.path.expanduser(value), param, ctx)
+        """Return the path, as click checks it; for one that is not there, say what is near it."""
+        path = Path(os.path.expanduser(value))
+        if self.exists and not path.exists():
+            self.fail(f"{self.name.capitalize()} '{path}' does not exist{_near(path)}", param, ctx)
+        if self.exists and not self.dir_okay and (path / "zarr.json").is_file():
+            hint = f"{command_line('resume', value)} goes on with it"
+            self.fail(f"'{path}' is a store, and a file is needed: {hint}", param, ctx)
+        return super().convert(str(path), param, ctx)
+
+
+def _near(path: Path) -> str:
+    """Remark on a file whose name is like that of a missing one, or on the YAML files beside it."""
+    from sweep.spec.reading import similar_file
+
+    try:
+        names = [other.name for other in path.parent.iterdir() if other.suffix in (".yaml", ".yml")]
+    except OSError:
+        return f": there is no folder '{path.parent}'"
+    others = f"there is: {', '.join(sorted(names)[:5])}" if names else ""
+    near = similar_file(path, otherwise=others)
+    return f"; {near}" if near else ""
 
 
 class StorePath(click.ParamType):
@@ -89,6 +108,8 @@ def assignments(
             raise click.BadParameter(
                 f"{text!r} is not NAME=VALUE, as in {example}", param_hint=option
             )
+        if name.strip() in found:
+            raise click.BadParameter(f"{name.strip()!r} is given twice", param_hint=option)
         found[name.strip()] = value.strip()
     return found
 

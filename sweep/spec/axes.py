@@ -27,6 +27,7 @@ from sweep.spec.rules import (
 from sweep.spec.sections import (
     AXES_TAKE,
     NOT_ON_AXES,
+    SECTIONS,
     parameter_rules,
     parameter_suggestion,
     short_name,
@@ -106,7 +107,8 @@ def place_on_grid(path: str, axes: tuple[Axis, ...]) -> Location:
 def read_axes(written: object) -> tuple[tuple[Axis, ...], list[Finding]]:
     """Axes of a spec's ``axes`` section that can be read, and everything that is wrong with it."""
     if not isinstance(written, dict):
-        return (), [Finding(("axes",), "must be a mapping of paths to values", "", written)]
+        remedy = "write e.g. 'target.range: [1 km, 2 km]' below it, or leave it out"
+        return (), [Finding(("axes",), "must be a mapping of paths to values", remedy, written)]
     axes: list[Axis] = []
     findings = Findings()
     for key, value in written.items():
@@ -145,9 +147,21 @@ def _read_axis(key: str, written: object, location: Location) -> Axis:
     """One axis, plain or zipped."""
     if isinstance(written, dict) and "zip" in written:
         return _read_zip(key, written, location)
+    if key in SECTIONS and isinstance(written, dict):
+        path, values = _first_path(key, written)
+        rule = "is a section, and an axis is named by the whole path of a field"
+        raise rejected(location, rule, f"write '{path}: {values}'")
     member = _member(key, read_pieces(written, _rule_at(key, location), location), location)
     _without_duplicates(member, location)
     return Axis(member.name, (member,))
+
+
+def _first_path(path: str, written: object) -> tuple[str, str]:
+    """Dotted path of the first field within sections as written, and its values in short."""
+    while isinstance(written, dict) and written and not set(written) & set(_FORMS):
+        name = next(iter(written))
+        path, written = f"{path}.{name}", written[name]
+    return path, "[...]" if isinstance(written, list) else "{linear: [...], number: ...}"
 
 
 def _rule_at(path: str, location: Location) -> Rule:
@@ -171,6 +185,8 @@ def _why_no_axis(path: str) -> tuple[str, str]:
         return rule, "leave it out, or run a study for each seed"
     if section == "effects" and name:
         return _WHOLE_STUDY, "run a study for each mode, and compare them with sweep compare"
+    if path in ("instrument", "instrument.like", "instrument.file"):
+        return _WHOLE_STUDY, "run a study for each, and compare them with sweep compare"
     if section in NOT_ON_AXES:
         return _WHOLE_STUDY, f"run a study for each value; {AXES_TAKE}"
     return "is no parameter", parameter_suggestion(path)
@@ -326,6 +342,8 @@ _FORMS = {
     "log": "{log: [first, last], number: 10}",
     "step": "{step: [first, last, step]}",
 }
+_ALIASES = {"linspace": "linear", "geomspace": "log", "logspace": "log", "arange": "step"}
+"""Names that generators have in NumPy."""
 _NUMBER = Numeric(about="", example="10", at_least="2", at_most=str(MOST_VALUES), whole=True)
 
 
@@ -418,7 +436,8 @@ def read_pieces(written: object, rule: Rule, location: Location) -> list[Values]
     if isinstance(written, dict):
         return [_read_generator(written, rule, location)]
     if not isinstance(written, list):
-        remedy = f"write e.g. [{written}] or {_FORMS['linear']}"
+        example = getattr(rule, "example", "") if written is None else written
+        remedy = f"write e.g. [{example}] or {_FORMS['linear']}"
         raise rejected(location, "must be a list or a generator", remedy, written)
     if not written:
         raise rejected(location, "holds no value", "list at least one")
@@ -449,7 +468,7 @@ def _read_generator(written: dict[Any, Any], rule: Rule, location: Location) -> 
     """Values of ``{linear: ...}``, ``{log: ...}`` or ``{step: ...}``, within the field's bounds."""
     kinds = [key for key in written if key in _FORMS]
     if len(kinds) != 1:
-        remedy = near_miss(str(next(iter(written), "")), _FORMS)
+        remedy = near_miss(_ALIASES.get(name := str(next(iter(written), "")), name), _FORMS)
         remedy = remedy or f"write e.g. {_FORMS['linear']}"
         raise rejected(location, "must have exactly one of linear, log and step", remedy)
     if not isinstance(rule, Numeric):

@@ -417,7 +417,8 @@ def _variable_findings(
     known = {*outputs.OUTPUTS, *further}
     if variable is None or variable in known or (with_draws and variable in drawn):
         return
-    rule, remedy = "is no stored quantity", near_miss(variable, [*known, *drawn])
+    remedy = near_miss(variable, [*known, *drawn], otherwise="write e.g. 'pd_shot' or 'snr_up'")
+    rule = "is no stored quantity"
     if variable in drawn:
         rule = "is found over draws, and this study has none"
         remedy = "set draws: {number: ...} or {limit: ...}"

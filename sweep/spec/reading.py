@@ -52,6 +52,16 @@ _MOST_DIGITS = 4000
 _DECIMAL = re.compile(r"[+-]?(0|[1-9]\d*)(\.\d*)?([eE][+-]?\d{1,3})?")
 _NO_FILE = "check the path, which is relative to the file that names it"
 _NO_YAML = "look at the brackets, quotes, colons and indentation there and above"
+_YAML_REMEDIES = {
+    "'\\t'": "indent with blanks, not with tabs",
+    "mapping values are not allowed": "put a blank after each colon, quotes around text that holds "
+    "': ', and the same number of blanks before fields of one section",
+    "found character": "put quotes around the text that holds it",
+    "undefined alias": "define it above as '&name', or put quotes around text that begins with *",
+    "another document": "keep one of them: a file holds one document, without lines '---' in it",
+    "unexpected end of stream": "close the quotes of the text that begins there",
+}
+"""Remedies by what YAML's parser says."""
 _PLAIN_TAGS = frozenset(
     f"tag:yaml.org,2002:{kind}"
     for kind in ("str", "int", "float", "bool", "null", "timestamp", "value", "map", "seq")
@@ -228,15 +238,20 @@ def parsed(text: str, path: Path) -> Document:
     try:
         root = yaml.compose(text, Loader=_Loader)
     except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark or error.context_mark
-        rule = f"is no valid YAML: {error.problem or error.context}"
-        raise _file_error(path, rule, _NO_YAML, mark.line + 1 if mark else None) from None
+        mark, begun = error.problem_mark or error.context_mark, error.context_mark
+        problem = f"{error.problem or error.context}".replace("\t", "\\t")
+        rule = f"is no valid YAML: {problem}"
+        if mark and begun and begun.line < mark.line:
+            rule += f" (in what begins on line {begun.line + 1})"
+        remedy = next((say for part, say in _YAML_REMEDIES.items() if part in problem), _NO_YAML)
+        raise _file_error(path, rule, remedy, mark.line + 1 if mark else None) from None
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         rule = f"is no valid YAML: {str(error).splitlines()[0]}"
         raise _file_error(path, rule, _NO_YAML) from None
     document = Document({}, file=str(path))
     if not isinstance(root, yaml.MappingNode):
-        raise _file_error(path, "must hold a mapping", "write e.g. 'title: A study'")
+        rule = "holds nothing" if root is None else "must hold a mapping of fields to values"
+        raise _file_error(path, rule, "write e.g. 'title: A study', and a field on each line")
     document.value = without_extensions(document.read(root, ()))
     return document
 
@@ -252,7 +267,7 @@ def _read_text(path: Path) -> str:
         with path.open("rb") as file:
             content = file.read(LARGEST_FILE + 1)
     except FileNotFoundError:
-        raise _file_error(path, "does not exist", _similar_file(path)) from None
+        raise _file_error(path, "does not exist", similar_file(path)) from None
     except IsADirectoryError:
         raise _file_error(path, "is a directory", "name a YAML file") from None
     except (OSError, ValueError) as error:
@@ -271,13 +286,16 @@ def _file_error(path: Path, rule: str, suggestion: str = "", line: int | None = 
     return SpecError([Mistake("", rule, "", suggestion, line, str(path))])
 
 
-def _similar_file(path: Path) -> str:
-    """Suggestion of a file beside the missing one."""
+def similar_file(path: Path, *, otherwise: str = _NO_FILE) -> str:
+    """Suggestion of a YAML file beside a missing one, by its name without the suffix."""
     try:
-        names = [p.name for p in path.parent.iterdir() if p.suffix in (".yaml", ".yml")]
+        names = {p.stem: p.name for p in path.parent.iterdir() if p.suffix in (".yaml", ".yml")}
     except OSError:
-        return _NO_FILE
-    return near_miss(path.name, names, otherwise=_NO_FILE)
+        return otherwise
+    suggestion = near_miss(path.stem, names)
+    for stem, name in names.items():
+        suggestion = suggestion.replace(repr(stem), repr(name))
+    return suggestion or otherwise
 
 
 class _Loader(yaml.SafeLoader):
@@ -303,6 +321,10 @@ def resolve_instrument(document: Document, base: Path) -> bool:
     overrides: dict[str, Any] = {}
     if isinstance(written, dict):
         _read_error_table(document, written, base)
+        if "like" in written and "file" in written:
+            rule = "names another instrument, besides instrument.like"
+            document.findings.append(Finding(("instrument", "file"), rule, "keep one of them"))
+            return False
         key = next((key for key in ("like", "file") if key in written), "")
         if not key:
             return True
@@ -470,8 +492,9 @@ def _finding(detail: dict[str, Any], root: Any) -> Finding:
     location = place.location
     if kind == BROKEN_RULE:
         context, path = detail["ctx"], dotted(location)
-        if isinstance(written, list) and path in parameter_rules() and path != ERROR_TABLE:
-            remedy = f"put several under axes: '{path}: [...]'"
+        if isinstance(written, list | dict) and path in parameter_rules() and path != ERROR_TABLE:
+            values = "[...]" if isinstance(written, list) else "{linear: [...], number: ...}"
+            remedy = f"put several under axes: '{path}: {values}'"
             return Finding(location, "takes one value", remedy, written)
         shown = ABSENT if isinstance(written, dict) else written
         return Finding(location, context["rule"], context["suggestion"], shown)
@@ -488,7 +511,19 @@ def _finding(detail: dict[str, Any], root: Any) -> Finding:
     if kind == "union_tag_not_found":
         return Finding(location, "lacks its kind", f"write {_with_kind(place.models)}", written)
     rule = _PLAIN.get(kind, "has a value that cannot stand here")
-    return Finding(location, rule, _remedy(place) if place.models else "", written)
+    remedy = _remedy(place) if place.models else _remedy_of_list(place, kind)
+    return Finding(location, rule, remedy, written)
+
+
+def _remedy_of_list(place: parts.Place, kind: str) -> str:
+    """Remedy for what must be a list or a mapping of parts, and is none."""
+    if kind in ("list_type", "tuple_type"):
+        return "put it in brackets, [...], or on lines that begin with '- '"
+    return (
+        f"write '{place.location[-1]}:' with a name and its fields below"
+        if kind == "dict_type"
+        else ""
+    )
 
 
 def _with_kind(models: parts.Models) -> str:
@@ -507,16 +542,17 @@ def _remedy(place: parts.Place) -> str:
     """Remedy for a missing field or section."""
     name, section = place.location[-1], place.location[:-1]
     if place.location == _INSTRUMENT:
-        return (
-            f"write e.g. 'instrument: {{like: {_EXAMPLE}}}' (the library has "
-            f"{', '.join(library())}), or all of its sections"
-        )
+        return instrument_remedy()
     field = parts.fields_of(place.parents[0]).get(str(name)) if place.parents else None
     rule = parts.rule_of(field) if field is not None else None
     example = rule.example if rule is not None else ""
     if example:
         varies = isinstance(rule, Numeric) and dotted(place.location) in parameter_rules()
         return f"write e.g. '{name}: {example}'" + (", or put it on an axis" if varies else "")
+    if isinstance(name, int) and place.models:
+        kinds = len(place.models) > 1
+        fields = _with_kind(place.models) if kinds else ", ".join(parts.fields_of(place.models[0]))
+        return f"write a mapping with {fields}"
     if len(place.models) > 1:
         return f"write '{name}:' with {_with_kind(place.models)}"
     if place.models:
@@ -526,17 +562,29 @@ def _remedy(place: parts.Place) -> str:
     return f"write '{name}: ...'"
 
 
+def instrument_remedy() -> str:
+    """Remedy for a study without an instrument."""
+    return (
+        f"write e.g. 'instrument: {{like: {_EXAMPLE}}}' (the library has {', '.join(library())}), "
+        "or all of its sections"
+    )
+
+
 def _sibling(place: parts.Place, root: type[BaseModel]) -> str:
     """Field that an unknown one resembles: beside it, else anywhere."""
     name = str(place.location[-1])
     beside = [field for model in place.parents for field in parts.fields_of(model)]
     if name in _OTHER_STUDYS and place.parents == (root,):
         return _OTHER_STUDYS[name]
-    suggestion = near_miss(name, beside)
-    if suggestion:
-        return suggestion
-    known = (*parameter_rules(), *parts.rules_of(root, ""))
+    known = dict.fromkeys((*parameter_rules(), *parts.rules_of(root, "")))
+    if name[:1].isdigit():
+        return "a comma begins another field here: write numbers with a point, such as 2.5"
+    if name in known:
+        section, _, field = name.rpartition(".")
+        return f"write '{field}: ...' in the section '{section}'"
     elsewhere = [path for path in known if path.rsplit(".", 1)[-1] == name]
     if elsewhere:
         return f"did you mean '{elsewhere[0]}'?"
+    if suggestion := near_miss(name, beside):
+        return suggestion
     return f"the fields here are {', '.join(beside)}" if beside else ""

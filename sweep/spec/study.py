@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import math
+import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property, partial
@@ -50,6 +51,7 @@ from sweep.spec.parts import (
 from sweep.spec.reading import (
     Document,
     findings_of,
+    instrument_remedy,
     parsed,
     plain,
     read_document,
@@ -147,6 +149,7 @@ class Study(Part):
         """Spec from a document, which is changed; files are left alone without a base."""
         has_instrument = resolve_instrument(document, base or Path())
         written = document.value
+        lacks_instrument = "instrument" not in written
         filled = [
             path
             for path, first in paths_on_axes(written.get("axes")).items()
@@ -170,6 +173,9 @@ class Study(Part):
             if dotted(finding.location) not in filled
             and (has_instrument or finding.location[0] != "instrument")
         ]
+        if lacks_instrument and filled:  # an axis has filled in some of it
+            findings = [f for f in findings if f.location[0] != "instrument"]
+            findings.insert(0, Finding(("instrument",), "is missing", instrument_remedy()))
         findings = document.findings + findings
         if findings or spec is None:
             raise SpecError(document.mistakes(findings))
@@ -623,6 +629,11 @@ def load(path: str | Path) -> Spec | SceneSpec:
     SpecError
         With every mistake in it, each with its path, its line and a remedy.
     """
+    if not isinstance(path, str | os.PathLike):
+        raise TypeError(
+            f"a study is loaded from the path of a YAML file, not from a {type(path).__name__}; "
+            "`sweep.spec.Spec.from_mapping(...)` makes one of plain data"
+        )
     document = read_document(Path(path))
     return _kind(document.value).from_document(document, Path(path).parent)
 

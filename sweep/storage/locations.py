@@ -285,6 +285,9 @@ def located(where: str | Location) -> Location:
     """Parse a place: a path, ``s3://bucket/key``, ``gs://...``, ``az://...``."""
     if isinstance(where, ObjectPath):
         return where
+    if not isinstance(where, str | os.PathLike):
+        kind = type(where).__name__
+        raise TypeError(f"a store is named by its path, such as 'study.zarr', and not by a {kind}")
     text = str(where)
     if not re.match(rf"({'|'.join(SCHEMES)}):/", text):
         if re.match(r"(?!file:)[A-Za-z][A-Za-z0-9+.-]+:/", text):

@@ -157,7 +157,7 @@ def refuse_foreign(path: Location) -> None:
 
 def _ours(path: Location, attributes: Any) -> dict[str, Any]:
     if not isinstance(attributes, dict) or "study_id" not in attributes:
-        raise NotAStoreError(f"{path} is a Zarr store, but not one that sweep made")
+        raise NotAStoreError(f"{path} is a Zarr store, but not one that sweep made{_near(path)}")
     return attributes
 
 
@@ -182,7 +182,10 @@ def _document(path: Location) -> dict[str, Any]:
         run = suggestion("run", SPEC, store=STORE)
         what = f"a file, and no Zarr store of sweep's: {run} computes a spec into one"
         raise NotAStoreError(f"{path} is {what}{_near(path)}")
-    raise NotAStoreError(f"{path} is not a Zarr store of sweep's{_near(path)}")
+    run = suggestion("run", SPEC, store=STORE)
+    raise NotAStoreError(
+        f"{path} is not a Zarr store of sweep's: {run} computes a spec into one{_near(path)}"
+    )
 
 
 def listed_attributes(path: Location) -> dict[str, Any]:

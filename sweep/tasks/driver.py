@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from sweep.messages import option, suggestion
-from sweep.spec import SceneSpec
+from sweep.spec import SceneSpec, Spec
 from sweep.storage.locations import (
     PACKED,
     Location,
@@ -86,7 +87,8 @@ def run(
         Where a store is in the way or can't be written; where no scheduler or worker is to be had;
         where the study names a function that may not run (:mod:`sweep.tasks.user_code`).
     """
-    path, how = real(located(store)), RunOptions(**options)
+    path, how = real(located(store)), RunOptions.of(options)
+    _refuse_no_study(spec)
     _check_code(spec)
     pool = Pool(how, spec)
     if not overwrite:
@@ -115,7 +117,9 @@ def resume(store: str | Location, *, spec: Declared | None = None, **options: An
     ClusterError
         Where there is no scheduler or worker to be had.
     """
-    named, how = real(located(store)), RunOptions(**options)
+    named, how = real(located(store)), RunOptions.of(options)
+    if spec is not None:
+        _refuse_no_study(spec)
     named = replaced_by(named) if isinstance(named, Path) else named
     path = under_way(named) or named
     attributes, study = _held(path)
@@ -176,7 +180,9 @@ def extend(
     StoreError, ClusterError
         As in `run` and `resume`; where the study asked for is not a larger one.
     """
-    path, how = real(located(store)), RunOptions(**options)
+    path, how = real(located(store)), RunOptions.of(options)
+    if spec is not None:
+        _refuse_no_study(spec)
     attributes, older = _held(path)
     asked = changed(older.spec if spec is None else spec, changes or {})
     _check_code(asked)
@@ -190,6 +196,17 @@ def extend(
     if not overwrite:
         under_way(goal)
     return _into(goal, asked, pool, replace=overwrite or goal == path, anew=overwrite, extends=path)
+
+
+def _refuse_no_study(spec: object) -> None:
+    """Refuse what is no study, such as the path of its file."""
+    if isinstance(spec, Spec | SceneSpec):
+        return
+    if isinstance(spec, str | os.PathLike):
+        how = f"give `sweep.load({str(spec)!r})`"
+    else:
+        how = "`sweep.load(...)` reads one, `sweep.spec.Spec.from_mapping(...)` makes one"
+    raise TypeError(f"a study is needed, not a {type(spec).__name__}: {how}")
 
 
 def _held(path: Location) -> tuple[dict[str, object], GridStudy | FlightStudy]:

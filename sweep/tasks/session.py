@@ -6,14 +6,16 @@ import errno
 import gc
 import math
 import os
+import re
 import socket
 import threading
 import time
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import partial
+from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,6 +36,7 @@ from sweep.spec.clusters import (
     cluster_of,
     load_cluster,
 )
+from sweep.spec.rules import near_miss
 from sweep.spec.sections import Execution
 from sweep.storage.locations import Location, ObjectStoreError
 from sweep.storage.opening import read_receipts
@@ -45,6 +48,7 @@ from sweep.tasks.progress import (
     Progress,
     SchedulerLost,
     StoreError,
+    TaskError,
     chosen,
     duration,
     working,
@@ -147,10 +151,29 @@ class RunOptions:
     evaluate: Evaluate | None = None
 
     def __post_init__(self) -> None:
+        whole = isinstance(self.workers, Integral) and not isinstance(self.workers, bool)
+        if self.workers is not None and not (whole and self.workers > 0):
+            raise ClusterError(f"workers must be a whole number above 0, not {self.workers!r}")
+        if self.scheduler not in (None, NONE) and not _is_address(self.scheduler):
+            raise ClusterError(
+                f"{self.scheduler!r} is no address of a Dask scheduler: write e.g. "
+                f"'tcp://10.0.0.5:8786', or '{NONE}' for a plain loop here"
+            )
+        timeout = self.block_timeout
+        if timeout is not None and not (isinstance(timeout, int | float) and timeout > 0):
+            raise TaskError(f"block_timeout must be a number of seconds above 0, not {timeout!r}")
         if self.allow_code:
             from sweep.tasks.user_code import allow
 
             allow([self.allow_code] if isinstance(self.allow_code, str) else self.allow_code)
+
+    @classmethod
+    def of(cls, options: Mapping[str, Any]) -> RunOptions:
+        """Options by name; a TypeError with the nearest name for one that there isn't."""
+        names = [field.name for field in fields(cls)]
+        for name in options.keys() - set(names):
+            raise TypeError(f"there is no option {name!r}; {near_miss(name, names)}".rstrip("; "))
+        return cls(**options)
 
     def place(self, spec: Spec | SceneSpec) -> AnyCluster | None:
         """Return the cluster given here or by the spec's `execution`; None for a plain loop.
@@ -200,6 +223,13 @@ class RunOptions:
         if said or self.dashboard or not self.processes or spec.execution != Execution():
             return False
         return not any(own_functions(spec)) and about_seconds(spec) <= LITTLE
+
+
+def _is_address(text: object) -> bool:
+    """Tell whether a text is an address of a Dask scheduler, with or without a protocol."""
+    return isinstance(text, str) and bool(
+        re.fullmatch(r"(\w+://)?[^\s/:]\S*:\d+|inproc://.+", text)
+    )
 
 
 def _of_workers(cluster: AnyCluster, workers: int | None) -> AnyCluster:

@@ -40,6 +40,13 @@ DETECTOR, ESTIMATOR = METHODS
 
 def allow(modules: Iterable[str]) -> None:
     """Allow this process and its workers to import modules, named as before a spec's colon."""
+    for module in (modules := list(modules)):
+        if module.endswith(".py") or not all(part.isidentifier() for part in module.split(".")):
+            name = module.partition(":")[0].removesuffix(".py").replace("/", ".")
+            near = f"; write {name!r}" if name.replace(".", "_").isidentifier() else ""
+            raise CodeError(
+                f"{module!r} is no name of a Python module, as a spec has it before the colon{near}"
+            )
     allowed = {*_allowed(), *modules}
     if allowed:
         os.environ[ALLOWED] = ",".join(sorted(allowed))

@@ -181,6 +181,7 @@ AXES = [
     ({"draws.number": [1, 2]}, "draws.number", "is the same for a whole study; run a study for "
      "each value; axes take fields of instrument, target, atmosphere, footprint and accuracy"),
     ({"title": ["a", "b"]}, "title", "is the same for a whole study"),
+    ({"instrument.like": ["rogers_2021"]}, "instrument.like", "run a study for each, and compare"),
     ({"laser": [1]}, "laser", "is no parameter"),
     ({"target.range": []}, "target.range", "holds no value"),
     ({"target.range": "1 m"}, "target.range", "must be a list or a generator"),

@@ -23,7 +23,7 @@ def refusal(path):
         (b"title: [", "bad.yaml:1: is no valid YAML"),
         (b"title: [a\nb: }", "look at the brackets"),
         (b"title: a\n\tb: c", "is no valid YAML"),
-        (b"", "must hold a mapping"),
+        (b"", "holds nothing"),
         (b"just words", "must hold a mapping"),
         (b"\xff\xfe\x00", "is no UTF-8 text"),
         (b"title: a\x00b", "is no valid YAML"),
