@@ -145,7 +145,7 @@ def test_a_changed_spec_is_refused_with_what_changed(ran):
         (["run", "wrong.yaml"], "telescope"),
         (["plan", "wrong.yaml"], "telescope"),
         (["run", "small.yaml", "--workers", "0"], "--workers"),
-        (["run", "small.yaml", "--scheduler", "nonsense"], "no Dask scheduler answers at nonsense"),
+        (["run", "small.yaml", "--scheduler", "nonsense"], "is no address of a Dask scheduler"),
         (["resume", "absent.zarr"], "there is no store at"),
         (["status", "notes"], "is not a Zarr store"),
         (["figures", "notes"], "is not a Zarr store"),

@@ -287,7 +287,7 @@ def _file_error(path: Path, rule: str, suggestion: str = "", line: int | None = 
 
 
 def similar_file(path: Path, *, otherwise: str = _NO_FILE) -> str:
-    """Suggestion of a YAML file beside a missing one, by its name without the suffix."""
+    """Suggestion of a YAML file near a missing one, by its name without the suffix."""
     try:
         names = {p.stem: p.name for p in path.parent.iterdir() if p.suffix in (".yaml", ".yml")}
     except OSError:

@@ -434,7 +434,11 @@ class Text(Rule):
     def read(self, written: object) -> str:
         """Return the text."""
         if isinstance(written, bool) or not isinstance(written, str | int | float):
-            remedy = self.remedy if self.example else "write it as one text, in quotes if need be"
+            remedy = (
+                self.remedy
+                if self.pattern != Text.pattern
+                else "write it as one text, in quotes if need be"
+            )
             raise QuantityError("must be text", remedy)
         if re.fullmatch(self.pattern, str(written)) is None:
             raise QuantityError("is no text that can stand here", self.remedy)
