@@ -1,8 +1,8 @@
 """Compilation of kernels by numba, and the folder in which compiled kernels are cached.
 
 A compiled kernel has the kernels that it calls built in, and the constants that it reads. The cache
-of numba looks at the file of the kernel alone. Where another file has changed it would go on with
-the old code. Kernels are therefore cached in a folder named by a fingerprint of all files of the
+of numba looks at the file of the kernel alone, and would go on with old code after a change of
+another file. Kernels are therefore cached in a folder named by a fingerprint of all files of the
 model, and of the libraries and settings that compile them:
 
     BASE/sweep-kernels-UID/FINGERPRINT

@@ -39,6 +39,7 @@ from sweep.cli.terminal import (
     warn_of,
 )
 from sweep.storage.locations import Location
+from sweep.tasks.streams import forgiving_output
 
 #: Errors of a file or folder that is not to be used: no permission, no room, something in the way.
 UNUSABLE = {
@@ -54,6 +55,11 @@ class Commands(click.Group):
         """Add a command, listed with the whole first paragraph of its help."""
         cmd.short_help = " ".join((cmd.help or "").split("\n\n")[0].split())
         super().add_command(cmd, name)
+
+    def main(self, *args: Any, **options: Any) -> Any:
+        """Run the program; its exit code does not depend on anybody hearing what it says."""
+        with forgiving_output():
+            return super().main(*args, **options)
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run a command; what is not a mistake of the user's keeps its traceback."""

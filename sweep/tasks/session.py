@@ -277,7 +277,9 @@ class Outcome:
 
     @property
     def why(self) -> str:
-        """Why the run ended before its blocks did."""
+        """Why blocks are missing, in words; empty if the study is complete."""
+        if self.complete:
+            return ""
         if self.stopped:
             return self.stopped
         if not self.failures:
