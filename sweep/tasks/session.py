@@ -283,8 +283,13 @@ class Outcome:
         if self.stopped:
             return self.stopped
         if not self.failures:
-            return f"{self.left_out} blocks failed before; --retry-failed tries them again"
-        return f"{len(self.failures)} blocks failed, the first with {self.failures[0].error}"
+            return f"{_blocks(self.left_out)} failed before; --retry-failed tries them again"
+        return f"{_blocks(len(self.failures))} failed, the first with {self.failures[0].error}"
+
+
+def _blocks(number: int) -> str:
+    """Put a number of blocks into words."""
+    return f"{number:,} block{'' if number == 1 else 's'}"
 
 
 class Absence:
