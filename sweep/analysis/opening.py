@@ -17,7 +17,8 @@ from sweep.model.outputs import RUNNING
 from sweep.spec import SceneSpec, Spec
 from sweep.storage import opening
 from sweep.storage.locations import JOURNAL, Location, located
-from sweep.storage.opening import CHECKED, NotAStoreError, read_lines, read_receipts, readable
+from sweep.storage.opening import CHECKED, NotAStoreError, read_lines, read_receipts
+from sweep.storage.sound import readable
 
 BATCH = "batch"
 PIECE = 2**20

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import logging
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -79,13 +80,16 @@ class Commands(click.Group):
             from sweep.spec import SpecError
             from sweep.storage.locations import ObjectStoreError, worded
             from sweep.storage.opening import ReplacedError
+            from sweep.storage.sound import DamagedChunkError
             from sweep.tasks.progress import StoreError, TaskError
 
             told = (
-                ObjectStoreError, ReplacedError, SceneError, SpecError, StoreError, TaskError,
-                UnsupportedShot,
+                DamagedChunkError, ObjectStoreError, ReplacedError, SceneError, SpecError,
+                StoreError, TaskError, UnsupportedShot,
             )  # fmt: skip
             said = worded(error)
+            # Requests that Zarr has made beside the one that failed end with the program.
+            logging.getLogger("asyncio").setLevel(logging.CRITICAL)
             if line := remedy(said):
                 tell(line, err=True)
             elif isinstance(said, told):

@@ -261,8 +261,10 @@ def conclude(outcome: Outcome, store: Location) -> None:
 def _described(error: Exception) -> str:
     """Text of an error, with its kind where that is no error of this program's."""
     from sweep.storage.opening import StoreError
+    from sweep.storage.sound import DamagedChunkError
 
-    return str(error) if isinstance(error, StoreError) else f"{type(error).__name__}: {error}"
+    is_told = isinstance(error, StoreError | DamagedChunkError)
+    return str(error) if is_told else f"{type(error).__name__}: {error}"
 
 
 def _print_summary(store: Location) -> None:
