@@ -152,7 +152,7 @@ def refuse_lost(path: Location) -> None:
         name = record.get("object", "")
         if f"{name}/".partition("/c/")[0] in names:
             with suppress(OSError):
-                if opening.digest(path, [name]) == record["digest"]:
+                if opening.has_digest(path, [name], record["digest"]):
                     continue
             raise NotAStoreError(
                 f"{path} has lost {name}, of a coordinate: `sweep verify {path} --repair` puts "

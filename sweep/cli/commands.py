@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import errno
-import logging
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -49,6 +49,10 @@ UNUSABLE = {
 }  # fmt: skip
 
 
+#: Errors of a disk that takes no more.
+FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+
+
 class Commands(click.Group):
     """Commands whose users' mistakes end in plain words and exit code 2."""
 
@@ -88,18 +92,29 @@ class Commands(click.Group):
                 StoreError, TaskError, UnsupportedShot,
             )  # fmt: skip
             said = worded(error)
-            # Requests that Zarr has made beside the one that failed end with the program.
-            logging.getLogger("asyncio").setLevel(logging.CRITICAL)
             if line := remedy(said):
                 tell(line, err=True)
             elif isinstance(said, told):
                 tell(str(said), err=True)
-            elif isinstance(said, OSError) and said.filename and said.errno in UNUSABLE:
-                place = f"{said.filename}: {said.strerror}"
-                tell(f"{place}: mend that, or name another place", err=True)
+            elif isinstance(said, OSError) and (line := _unusable(said)):
+                tell(line, err=True)
             else:
                 raise
             ctx.exit(MISTAKE)
+
+
+def _unusable(error: OSError) -> str:
+    """Words for a file, folder or disk that is not to be used; empty for any other error."""
+    from sweep.storage.locations import reason
+
+    if error.errno in (errno.EMFILE, errno.ENFILE):
+        return f"{error.strerror}: raise their limit, `ulimit -n`, and try again"
+    if error.filename and error.errno in UNUSABLE:
+        why = reason(error, Path(os.fsdecode(error.filename)))
+        return f"{os.fsdecode(error.filename)}: {why}: mend that, or name another place"
+    if error.errno in FULL:  # writing, which names no file
+        return f"{error.strerror}: make room where the output goes, or name another place"
+    return ""
 
 
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})

@@ -6,8 +6,11 @@ damaged. Here both are a `DamagedChunkError`, which names the block, the chunk a
 
 from __future__ import annotations
 
+import asyncio
+import atexit
 import math
 import re
+from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -19,7 +22,7 @@ from zarr.core.buffer import default_buffer_prototype
 from zarr.storage import LocalStore, StorePath, WrapperStore
 
 from sweep.storage import opening
-from sweep.storage.locations import JOURNAL, PACKED, Location, zarr_store
+from sweep.storage.locations import JOURNAL, PACKED, Location, worded, zarr_store
 from sweep.storage.opening import MANIFEST, read_document, read_lines, read_receipts
 
 #: Name of a chunk: its array, and its position in the grid of chunks.
@@ -27,6 +30,9 @@ CHUNK = re.compile(r"(.+)/c((?:/\d+)*)")
 
 #: Dimensions of flights by which their blocks are cut, last.
 CYCLE, SHOT = "cycle", "shot"
+
+#: Time that reads which nobody waits for have to end, as the program does [s].
+READS_LEFT_SECONDS = 5.0
 
 _CHECKSUM_BYTES = 4
 _INDEX_BYTES = 16  # offset and length of a chunk in a shard
@@ -153,7 +159,14 @@ class SoundStore(WrapperStore[Any]):
     async def get(self, key: str, prototype: Any = None, byte_range: Any = None) -> Any:
         """Return the bytes of a file, or of a part of it; DamagedChunkError for a damaged chunk."""
         prototype = prototype or default_buffer_prototype()
-        found = await self._store.get(key, prototype, byte_range)
+        try:
+            return await self._checked(key, prototype, byte_range)
+        except Exception:
+            _failed_loops.add(asyncio.get_running_loop())
+            raise
+
+    async def _checked(self, key: str, prototype: Any, byte_range: Any) -> Any:
+        found = await self._fetch(key, prototype, byte_range)
         name = key.removeprefix(self._prefix).lstrip("/")
         if not CHUNK.fullmatch(name) or not (what := self._damage(name, found, byte_range)):
             return found
@@ -162,6 +175,15 @@ class SoundStore(WrapperStore[Any]):
         if what := self._damage(name, whole, None):
             raise DamagedChunkError(self._described(name, what))
         return await self._store.get(key, prototype, byte_range)
+
+    async def _fetch(self, key: str, prototype: Any, byte_range: Any) -> Any:
+        """Return the bytes of a file, asked for twice where the body of the first answer is cut."""
+        try:
+            return await self._store.get(key, prototype, byte_range)
+        except Exception as error:
+            if isinstance(self._location, Path) or worded(error) is error:
+                raise
+            return await self._store.get(key, prototype, byte_range)
 
     async def get_partial_values(self, prototype: Any, key_ranges: Any) -> list[Any]:
         """Return parts of files, checked."""
@@ -207,6 +229,25 @@ class SoundStore(WrapperStore[Any]):
                 f"and `sweep resume {path}` computes it again"
             )
         return f"{place} {what}: {remedy}"
+
+
+_failed_loops: set[asyncio.AbstractEventLoop] = set()
+"""Loops of Zarr's in which a read has failed, and others may be left that nobody waits for."""
+
+
+@atexit.register
+def _cancel_reads() -> None:
+    """Cancel the reads that are left, of which asyncio would print a traceback each."""
+
+    async def cancel() -> None:
+        tasks = asyncio.all_tasks() - {asyncio.current_task()}
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    for loop in _failed_loops:
+        with suppress(Exception):
+            asyncio.run_coroutine_threadsafe(cancel(), loop).result(READS_LEFT_SECONDS)
 
 
 def readable(location: Location, held: str) -> Any:

@@ -31,7 +31,7 @@ from sweep.spec.clusters import (
     load_cluster,
 )
 from sweep.spec.sections import Execution
-from sweep.storage.locations import Location, ObjectStoreError
+from sweep.storage.locations import NO_INODES, Location, ObjectStoreError, reason
 from sweep.storage.opening import read_receipts
 from sweep.tasks import journal, store
 from sweep.tasks.journal import Failure, Journal, Lock, Look, Receipt, given_up
@@ -71,6 +71,8 @@ HOPELESS = 20
 REMEDIES = {
     errno.ENOSPC: "make room on its disk",
     errno.EDQUOT: "make room in your quota",
+    errno.EMFILE: "raise the limit of open files, `ulimit -n`",
+    errno.ENFILE: "raise the machine's limit of open files",
     errno.EROFS: "have its disk mounted for writing",
     errno.EACCES: "have the permission to write there",
     errno.EPERM: "have the permission to write there",
@@ -496,8 +498,10 @@ def unwritable(path: Location, error: OSError) -> str:
         return f"the store can't be written: {error.strerror}"
     if not _is_there(path):
         return f"{path} is no longer there: have its disk back, or its folder"
-    remedy = REMEDIES.get(error.errno or 0, "see to its disk")
-    return f"the store can't be written ({error.strerror or error}): {remedy}"
+    words, remedy = reason(error, path), REMEDIES.get(error.errno or 0, "see to its disk")
+    if words == NO_INODES:
+        remedy = "remove files from its disk, or have one with more inodes"
+    return f"the store can't be written ({words}): {remedy}"
 
 
 def _is_there(path: Location) -> bool:

@@ -1,6 +1,6 @@
 """Output to a terminal, a pipe or a log that may be full, gone or missing.
 
-What a program says must not end what it computes: a stream that fails goes silent.
+Words of a program must not end its computing: a stream that fails goes silent.
 """
 
 from __future__ import annotations

@@ -2,6 +2,8 @@
 
 import pickle
 import shutil
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from small_flights import small_scene
 
 import sweep
 from sweep.cli import main
+from sweep.report import writing
 from sweep.storage.locations import eyepoints_path, located
 from sweep.storage.sound import ChunkOwners, DamagedChunkError, open_arrays, readable
 from sweep.tasks import studies
@@ -178,3 +181,51 @@ def test_a_packed_copy_tells_of_a_chunk_in_a_file_of_several(grid, tmp_path):
 def test_a_store_that_is_opened_goes_to_other_processes(grid):
     store = pickle.loads(pickle.dumps(readable(located(grid), studies.read(grid)[1].id)))
     assert store.read_only
+
+
+READER = """
+import sys
+import sweep
+from sweep.storage.opening import ReplacedError
+from sweep.storage.sound import DamagedChunkError
+
+dataset = sweep.open(sys.argv[1])
+if len(sys.argv) > 2:
+    import shutil
+    shutil.rmtree(sys.argv[1])
+    shutil.copytree(sys.argv[2], sys.argv[1])
+try:
+    dataset.pd_shot.compute()
+except (DamagedChunkError, ReplacedError) as error:
+    print(type(error).__name__)
+"""
+
+
+@pytest.mark.parametrize("happens", ["DamagedChunkError", "ReplacedError"])
+def test_a_reader_that_meets_an_error_ends_without_further_words(copy, drawn, happens):
+    """Zarr leaves reads that nobody waits for, of which asyncio would print a traceback each."""
+    for chunk in (copy / "pd_shot/c/0").glob("*/0"):
+        flip(chunk)
+    words = [str(copy)] if happens == "DamagedChunkError" else [str(copy), str(drawn)]
+    command = [sys.executable, "-c", READER, *words]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, f"{happens}\n", "")
+
+
+@pytest.mark.parametrize(
+    "error, words",
+    [
+        (OSError(24, "Too many open files"), "Too many open files: raise their limit, `ulimit -n`"),
+        (OSError(28, "No space left on device"), "No space left on device: make room where the"),
+    ],
+)
+def test_a_report_that_can_not_be_written_is_told_in_words(
+    grid, tmp_path, monkeypatch, error, words
+):
+    def fail(store, file):
+        raise error
+
+    monkeypatch.setattr(writing, "write", fail)
+    asked = ["report", str(grid), "-o", str(tmp_path / "page.html")]
+    done = CliRunner().invoke(main, asked)
+    assert done.exit_code == 2 and words in done.output and "Traceback" not in done.output
