@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 import signal
 import sys
 import threading
 from typing import Any
+
+from distributed.comm import get_address_host
 
 from sweep.tasks.progress import HANGUP
 from sweep.tasks.streams import ForgivingStream
@@ -21,4 +24,7 @@ def dask_setup(worker: Any) -> None:
             signal.signal(HANGUP, signal.SIG_IGN)
         # What a user's function prints would fail its block where nobody reads it any more.
         sys.stdout, sys.stderr = ForgivingStream(sys.stdout), ForgivingStream(sys.stderr)
+        if get_address_host(worker.address) == get_address_host(worker.scheduler.address):
+            # The driver compiles the same kernels, and says once that they can't be cached.
+            logging.getLogger("sweep").setLevel(logging.ERROR)
     import sweep.model.shot  # noqa: F401
