@@ -49,7 +49,7 @@ lint: $(READY)
 	$(BIN)/mypy --disable-error-code arg-type --disable-error-code index benchmarks
 
 # Once for all processes of tests, which would each compile the same.
-$(KERNELS): $(READY) $(shell grep -rl --include='*.py' numba sweep)
+$(KERNELS): $(READY) sweep/kernels.py $(shell grep -rl --include='*.py' njit sweep)
 	$(MAKE) compile-grids compile-flights
 	touch $@
 

@@ -5,7 +5,7 @@ from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-COMPILING = ("numba",)
+COMPILING = ("numba", "sweep.kernels")
 """Modules whose names, as decorators, make compiled functions."""
 INTERNALS = ("intrinsic(", "register_model", "lower_builtin", "_nrt", "forceinline", "llvmlite.ir")
 

@@ -17,8 +17,9 @@ from matplotlib.ticker import FuncFormatter, LogLocator
 from sweep.analysis import canvas, labels
 from sweep.analysis.opening import ACCURACY, read_attributes
 from sweep.analysis.tables import Block, Page
-from sweep.storage.locations import Location, beside, zarr_store
+from sweep.storage.locations import Location, beside
 from sweep.storage.opening import CHECKED
+from sweep.storage.sound import readable
 
 TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 
@@ -487,8 +488,8 @@ def _note(dataset: xr.Dataset, settings: Sequence[Setting]) -> str:
 
 def opened(store: Location) -> tuple[xr.Dataset, list[Setting]]:
     """Return the store as a dataset, read whole, and its settings; NotAStoreError if it is none."""
-    read_attributes(store, ACCURACY)
-    with xr.open_zarr(zarr_store(store), **CHECKED) as dataset:
+    study_id = read_attributes(store, ACCURACY)["study_id"]
+    with xr.open_zarr(readable(store, study_id), **CHECKED) as dataset:
         whole = dataset.load()
     return whole, settings_in(whole)
 

@@ -18,7 +18,8 @@ from sweep.model.outputs import RUNNING
 from sweep.spec import SceneSpec, Spec
 from sweep.storage import opening
 from sweep.storage.locations import JOURNAL, Location, located
-from sweep.storage.opening import CHECKED, NotAStoreError, read_lines, read_receipts, readable
+from sweep.storage.opening import CHECKED, NotAStoreError, read_lines, read_receipts
+from sweep.storage.sound import readable
 
 BATCH = "batch"
 PIECE = 2**20
@@ -152,7 +153,7 @@ def refuse_lost(path: Location) -> None:
         name = record.get("object", "")
         if f"{name}/".partition("/c/")[0] in names:
             with suppress(OSError):
-                if opening.digest(path, [name]) == record["digest"]:
+                if opening.has_digest(path, [name], record["digest"]):
                     continue
             raise NotAStoreError(
                 f"{path} has lost {name}, of a coordinate: "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -40,12 +41,25 @@ from sweep.cli.terminal import (
 )
 from sweep.messages import PrintableStream, as_command
 from sweep.storage.locations import Location
+from sweep.tasks.streams import forgiving_output
 
 #: Errors of a file or folder that is not to be used: no permission, no room, something in the way.
 UNUSABLE = {
     errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.ENOTDIR, errno.EEXIST,
     errno.EISDIR, errno.ENAMETOOLONG,
 }  # fmt: skip
+
+
+#: Errors of a disk that takes no more.
+FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+
+
+def _make_output_printable() -> None:
+    """Filter what is written to standard output and error from here on."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is not None and not isinstance(stream, PrintableStream):
+            setattr(sys, name, PrintableStream(stream))
 
 
 class Commands(click.Group):
@@ -56,17 +70,19 @@ class Commands(click.Group):
         cmd.short_help = " ".join((cmd.help or "").split("\n\n")[0].split())
         super().add_command(cmd, name)
 
-    def main(self, *args: Any, **kwargs: Any) -> Any:
+    def main(self, *args: Any, **options: Any) -> Any:
         """Run the command line; whatever it prints, a traceback too, is printable.
 
-        Streams stay wrapped, as Python prints the traceback of an error after this function.
+        The exit code does not depend on anybody hearing what it says. Streams stay wrapped, as
+        Python prints the traceback of an error after this function.
         """
-        for name in ("stdout", "stderr"):
-            stream = getattr(sys, name)
-            if stream is not None and not isinstance(stream, PrintableStream):
-                setattr(sys, name, PrintableStream(stream))
-        with as_command():
-            return super().main(*args, **kwargs)
+        try:
+            with forgiving_output():
+                _make_output_printable()
+                with as_command():
+                    return super().main(*args, **options)
+        finally:
+            _make_output_printable()
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run a command; what is not a mistake of the user's keeps its traceback."""
@@ -86,23 +102,37 @@ class Commands(click.Group):
             from sweep.spec import SpecError
             from sweep.storage.locations import ObjectStoreError, worded
             from sweep.storage.opening import ReplacedError
+            from sweep.storage.sound import DamagedChunkError
             from sweep.tasks.progress import StoreError, TaskError
 
             told = (
-                ObjectStoreError, ReplacedError, SceneError, SpecError, StoreError, TaskError,
-                UnsupportedShot,
+                DamagedChunkError, ObjectStoreError, ReplacedError, SceneError, SpecError,
+                StoreError, TaskError, UnsupportedShot,
             )  # fmt: skip
             said = worded(error)
             if line := remedy(said):
                 tell(line, err=True)
             elif isinstance(said, told):
                 tell(str(said), err=True)
-            elif isinstance(said, OSError) and said.filename and said.errno in UNUSABLE:
-                place = f"{said.filename}: {said.strerror}"
-                tell(f"{place}: mend that, or name another place", err=True)
+            elif isinstance(said, OSError) and (line := _unusable(said)):
+                tell(line, err=True)
             else:
                 raise
             ctx.exit(MISTAKE)
+
+
+def _unusable(error: OSError) -> str:
+    """Words for a file, folder or disk that is not to be used; empty for any other error."""
+    from sweep.storage.locations import reason
+
+    if error.errno in (errno.EMFILE, errno.ENFILE):
+        return f"{error.strerror}: raise their limit, `ulimit -n`, and try again"
+    if error.filename and error.errno in UNUSABLE:
+        why = reason(error, Path(os.fsdecode(error.filename)))
+        return f"{os.fsdecode(error.filename)}: {why}: mend that, or name another place"
+    if error.errno in FULL:  # writing, which names no file
+        return f"{error.strerror}: make room where the output goes, or name another place"
+    return ""
 
 
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})

@@ -18,6 +18,7 @@ from rich.filesize import decimal
 
 from sweep.messages import command_line, one_line, printable
 from sweep.storage.locations import Location, located
+from sweep.tasks.streams import is_terminal
 
 if TYPE_CHECKING:
     import numpy as np
@@ -91,7 +92,10 @@ class StorePath(click.ParamType):
 
 def shown(path: Location) -> Location:
     """Return a place as short as it can be written from here."""
-    here = Path.cwd()
+    try:
+        here = Path.cwd()
+    except OSError:  # removed meanwhile
+        return path
     if isinstance(path, Path) and path.is_relative_to(here):
         return path.relative_to(here)
     return path
@@ -209,7 +213,7 @@ def folded(text: str, hanging: int = 2, *, err: bool = False) -> str:
 
     Lines break between words, and commands in backquotes, which are copied, stay whole.
     """
-    if not (sys.stderr if err else sys.stdout).isatty():
+    if not is_terminal(sys.stderr if err else sys.stdout):
         return text
     width = shutil.get_terminal_size().columns
     whole = re.sub(r"`[^`]*`", lambda found: found[0].replace(" ", "\xa0"), text)
@@ -253,8 +257,11 @@ def conclude(outcome: Outcome, store: Location) -> None:
     from sweep.tasks.progress import duration
 
     if outcome.blocks_done and (outcome.store / "zarr.json").exists():
-        _print_summary(outcome.store)
-        tell_accuracy(outcome.store)
+        try:
+            _print_summary(outcome.store)
+            tell_accuracy(outcome.store)
+        except Exception as error:  # the study is computed all the same
+            tell(f"no table of the results: {_described(error)}", err=True)
     for scanner, rays in outcome.rays.items():
         told = f"{rays:,} rays cast" if rays else "eyepoints were there, no ray cast"
         click.echo(f"{scanner}: {told}")
@@ -278,6 +285,15 @@ def conclude(outcome: Outcome, store: Location) -> None:
         retry = command_line("resume", store, retry_failed=True)
         click.echo(f"{retry}  tries failed blocks again.", err=True)
     sys.exit(INCOMPLETE)
+
+
+def _described(error: Exception) -> str:
+    """Text of an error, with its kind where that is no error of this program's."""
+    from sweep.storage.opening import StoreError
+    from sweep.storage.sound import DamagedChunkError
+
+    is_told = isinstance(error, StoreError | DamagedChunkError)
+    return str(error) if is_told else f"{type(error).__name__}: {error}"
 
 
 def _print_summary(store: Location) -> None:
@@ -502,7 +518,7 @@ def ask_before(study: Spec | SceneSpec, store: Location, *, yes: bool) -> None:
     """Ask before a study begins that is larger than most; leave where that is declined."""
     if yes or not (why := _excess(*_size(study, store))):
         return
-    if not (sys.stdin.isatty() and sys.stderr.isatty()):
+    if not (is_terminal(sys.stdin) and is_terminal(sys.stderr)):
         click.echo(f"This study takes {why}: say --yes to begin it.", err=True)
         sys.exit(MISTAKE)
     click.confirm(f"This study takes {why}. Begin it?", abort=True, err=True)

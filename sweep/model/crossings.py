@@ -12,8 +12,7 @@ costs one polynomial in x, which vectorises.
 
 import math
 
-from numba import njit
-
+from sweep.kernels import njit
 from sweep.model.marcum import excess_crossing
 
 STRETCH = 256

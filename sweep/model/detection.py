@@ -4,8 +4,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from sweep.kernels import njit
 from sweep.model.marcum import marcum_q1, marcum_q1_pair
 
 RAYLEIGH_DEVIATION = math.sqrt(2 - math.pi / 2)

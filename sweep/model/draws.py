@@ -16,8 +16,8 @@ from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from sweep.kernels import njit
 from sweep.model import philox
 from sweep.model.alarms import TAPS, noise_filter
 from sweep.model.marcum import at_least_one

@@ -3,8 +3,8 @@
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from sweep.kernels import njit
 from sweep.model.detection import echo_of, found_pair
 from sweep.model.preparation import Shots
 from sweep.model.segments import Runs, runs_of

@@ -30,9 +30,9 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.polynomial import Chebyshev
 
+from sweep.kernels import njit
 from sweep.model.window import Window, samples
 
 _STEPS = 2048

@@ -16,8 +16,8 @@ polynomial: some thirty Gauss points stand for sixty thousand bins.
 import math
 
 import numpy as np
-from numba import njit
 
+from sweep.kernels import njit
 from sweep.model.crossings import (
     added_crossings,
     any_crossing,

@@ -31,9 +31,9 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from scipy.special import i0
 
+from sweep.kernels import njit
 from sweep.model.elementary import sincos_cycles
 from sweep.model.window import COSINE_SUMS, Window, samples
 

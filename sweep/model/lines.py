@@ -12,9 +12,9 @@ import math
 from functools import lru_cache
 
 import numpy as np
-from numba import njit
 from scipy.special import gammaln
 
+from sweep.kernels import njit
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.elementary import (
     fraction_of_cycle,

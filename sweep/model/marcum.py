@@ -19,9 +19,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
+from sweep.kernels import njit
 from sweep.model.elementary import exact_product
 
 _LARGEST_SERIES_PRODUCT = 30.0

@@ -29,8 +29,8 @@ strongest up peak goes with the strongest down peak, and so on, by the reading
 import math
 
 import numpy as np
-from numba import njit
 
+from sweep.kernels import njit
 from sweep.model.groups import FIRST, LAST
 from sweep.model.waveform import BELOW, FOLD_PENALTY, READINGS, SIGNED
 

@@ -13,7 +13,8 @@ import hashlib
 import math
 
 import numpy as np
-from numba import njit
+
+from sweep.kernels import njit
 
 # Streams, one per physical cause; of those of a segment three: up, Doppler, down. The numbers are
 # part of every stored draw: add, never change.

@@ -23,8 +23,8 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from sweep.kernels import njit
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.footprint import beamlets
 from sweep.model.ground import Footprints

@@ -14,8 +14,8 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from sweep.kernels import njit
 from sweep.model.effects.catalogue import DEFAULTS, SHARED
 from sweep.model.effects.effect import Effect, Realisation, Scene
 from sweep.model.ground import Plane

@@ -29,8 +29,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from sweep.kernels import njit
 from sweep.model import philox, waveform
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection import echo_of, is_end

@@ -4,8 +4,8 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 
+from sweep.kernels import njit
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection import echo_of, found_pair
 from sweep.model.marcum import excess_crossing

@@ -11,8 +11,8 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from sweep.kernels import njit
 from sweep.model import line_shape
 from sweep.model.crossings import MOST_TERMS, crossing_series
 from sweep.model.detection import found_pair

@@ -16,9 +16,9 @@ all that lines can lift to a level, and what it takes to be sure of the largest.
 import math
 
 import numpy as np
-from numba import njit
 from numpy.polynomial.chebyshev import cheb2poly, chebfit
 
+from sweep.kernels import njit
 from sweep.model.detection import mark
 from sweep.model.elementary import sincos_cycles
 from sweep.model.line_shape import CELLS, POINTS, kernel

@@ -25,8 +25,8 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 
+from sweep.kernels import njit
 from sweep.model import alarms, waveform
 from sweep.model.detection import found_pair
 from sweep.model.marcum import marcum_q1_pair

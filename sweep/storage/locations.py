@@ -151,9 +151,15 @@ class ObjectPath:
         return None if head is None else float(head["last_modified"].timestamp())
 
     def read_bytes(self) -> bytes:
-        """Return the object whole."""
+        """Return the object whole; once more where the body of the answer is cut."""
+        from obstore.exceptions import BaseError
+
         with in_words(self):
-            return bytes(self.client.get(self.key).bytes())
+            answer = self.client.get(self.key)
+            try:
+                return bytes(answer.bytes())
+            except BaseError:
+                return bytes(self.client.get(self.key).bytes())
 
     def write_bytes(self, content: bytes) -> None:
         """Put an object, whole, in the place of whatever is there."""
@@ -268,6 +274,8 @@ def explained(text: str, root: str) -> tuple[int, str]:
         )
     if "imed out" in text or "Timeout" in text:
         return errno.ETIMEDOUT, f"{at} does not answer in time: try again, or look at the network"
+    if "body error" in text:
+        return errno.EIO, f"{at} cuts its answers short: try again, or look at the network"
     if "error sending request" in text or "onnect" in said:
         return errno.ECONNREFUSED, (
             f"{at} can't be reached: is it up, and are AWS_ENDPOINT_URL and the network right?"
@@ -540,3 +548,28 @@ def _delete(path: Path) -> None:
     else:
         with suppress(OSError):
             path.unlink()
+
+
+#: Words for a disk that has room, but takes no further file.
+NO_INODES = "No inodes left on device"
+
+
+def reason(error: OSError, place: object) -> str:
+    """Words for why a place can't be written or read.
+
+    The system says "no space" also where a disk has room, but no inode for a further file.
+    """
+    words = error.strerror or str(error)
+    if error.errno == errno.ENOSPC and isinstance(place, Path) and _lacks_inodes(place):
+        return NO_INODES
+    return words
+
+
+def _lacks_inodes(place: Path) -> bool:
+    """Tell whether the disk of a place, which need not exist, has no inodes left."""
+    while not place.exists() and place != place.parent:
+        place = place.parent
+    with suppress(OSError):
+        disk = os.statvfs(place)
+        return disk.f_files > 0 and disk.f_favail == 0 and disk.f_bavail > 0
+    return False

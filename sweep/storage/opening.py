@@ -167,7 +167,7 @@ def _document(path: Location) -> dict[str, Any]:
     try:
         if isinstance(path, Path) and not (path / "zarr.json").is_file():
             raise FileNotFoundError
-        document = json.loads((path / "zarr.json").read_bytes())
+        document = _parsed(path / "zarr.json")
         if "attributes" in document:
             return dict(document)
     except ObjectStoreError:
@@ -186,6 +186,22 @@ def _document(path: Location) -> dict[str, Any]:
     raise NotAStoreError(
         f"{path} is not a Zarr store of sweep's: {run} computes a spec into one{_near(path)}"
     )
+
+
+def _parsed(path: Location) -> Any:
+    """Parse a file of JSON; once more from an object store, whose answer may have been cut."""
+    try:
+        return json.loads(path.read_bytes())
+    except ValueError:
+        if isinstance(path, Path):
+            raise
+        return json.loads(path.read_bytes())
+
+
+def has_digest(path: Location, objects: list[str], known: str) -> bool:
+    """Tell whether stored objects have a digest; read once more from an object store if not."""
+    is_same = digest(path, objects) == known
+    return is_same or (isinstance(path, ObjectPath) and digest(path, objects) == known)
 
 
 def listed_attributes(path: Location) -> dict[str, Any]:
@@ -530,7 +546,13 @@ def _contents(path: ObjectPath, names: list[str]) -> Iterator[tuple[str, bytes]]
     """Objects of a log with their names, some of them in memory at a time."""
     for start in range(0, len(names), REQUESTS):
         some = names[start : start + REQUESTS]
-        yield from zip(some, each(path, lambda name: (path / name).read_bytes(), some), strict=True)
+        yield from zip(some, each(path, lambda name: _whole_lines(path / name), some), strict=True)
+
+
+def _whole_lines(segment: ObjectPath) -> bytes:
+    """Read an object of a log; once more where its last line is cut, as an answer may have been."""
+    content = segment.read_bytes()
+    return content if content.endswith(b"\n") else segment.read_bytes()
 
 
 def raw_lines(path: Location) -> Iterator[bytes]:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import gc
 import traceback
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -23,8 +25,9 @@ from sweep.tasks.clusters import kubernetes, machines
 from sweep.tasks.progress import ClusterError
 
 if TYPE_CHECKING:
-    from distributed import Client
+    from distributed import Client, Security
 
+#: Time in which a scheduler has to answer [s].
 CONNECT_TIMEOUT = 15.0
 
 
@@ -91,18 +94,34 @@ def _reached(address: str, cluster: AnyCluster) -> Client:
     """Make a client that is not Dask's default: one that fails to connect would stay it."""
     from distributed import Client
 
+    security = machines.security_of(cluster)
+    # A client that fails to connect takes half a minute more to be closed.
+    with ThreadPoolExecutor(1) as pool:  # this thread may have a loop that runs, as a notebook's
+        try:
+            pool.submit(asyncio.run, _check_scheduler(address, security)).result()
+        except (OSError, ValueError, ImportError) as error:
+            raise ClusterError(f"no Dask scheduler answers at {address}: {error}") from error
+        except Exception as error:  # whatever decoding of another protocol raises
+            raise ClusterError(
+                f"what answers at {address} is no Dask scheduler ({type(error).__name__})"
+            ) from error
     try:
-        return Client(
-            address,
-            timeout=CONNECT_TIMEOUT,
-            security=machines.security_of(cluster),
-            set_as_default=False,
-        )
+        return Client(address, timeout=CONNECT_TIMEOUT, security=security, set_as_default=False)
     except (OSError, ValueError) as error:
         # Collected here, as one that goes while another is made waits for ever for that one's lock.
         traceback.clear_frames(error.__traceback__)
         gc.collect()
         raise ClusterError(f"no Dask scheduler answers at {address}: {error}") from error
+
+
+async def _check_scheduler(address: str, security: Security | None) -> None:
+    """Ask a scheduler who it is; raises where none answers in time."""
+    from distributed import Security, rpc
+
+    arguments = (security or Security()).get_connection_args("client")
+    async with asyncio.timeout(CONNECT_TIMEOUT + 1.0):  # the other one has words
+        async with rpc(address, timeout=CONNECT_TIMEOUT, connection_args=arguments) as scheduler:
+            await scheduler.identity()
 
 
 def _started(cluster: Local | Batch | SSH, bounds: Bounds, processes: bool) -> Any:

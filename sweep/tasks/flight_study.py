@@ -24,7 +24,7 @@ from sweep.model.outputs import (
 )
 from sweep.model.resolution import by_tolerance, effects_tolerance
 from sweep.storage.locations import Location, eyepoints_path
-from sweep.storage.opening import open_group
+from sweep.storage.sound import open_arrays
 from sweep.tasks.eyepoint_study import (
     SIZES,
     EyepointStudy,
@@ -462,7 +462,7 @@ class FlightStudy(GrowingStudy):
 
     def _open_eyepoints(self, scanner: str) -> Mapping[str, Any]:
         """Arrays of a scanner's eyepoints by name, opened once; their weights read."""
-        group = open_group(eyepoints_path(self.path, self.spec.geometry_id(scanner)))
+        group = open_arrays(eyepoints_path(self.path, self.spec.geometry_id(scanner)))
         arrays: dict[str, Any] = {name: group[name] for name in SHOTS | BEAMLETS | CYCLES}
         return arrays | {"weight": np.asarray(group["weight"][...])}  # type: ignore[index]
 

@@ -1,10 +1,17 @@
-"""Start of a local worker: leave Ctrl-C to the client, and import the model early."""
+"""Start of a worker: leave signals to the client, go on without output, import the model early."""
 
 from __future__ import annotations
 
+import logging
 import signal
+import sys
 import threading
 from typing import Any
+
+from distributed.comm import get_address_host
+
+from sweep.tasks.progress import HANGUP
+from sweep.tasks.streams import ForgivingStream
 
 
 def dask_setup(worker: Any) -> None:
@@ -12,4 +19,12 @@ def dask_setup(worker: Any) -> None:
     # A terminal sends Ctrl-C to every process of the group; the workers have blocks to finish.
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)
+        # The same of one that is closed; a worker ends with its nanny.
+        if HANGUP is not None and getattr(worker, "nanny", None) is not None:
+            signal.signal(HANGUP, signal.SIG_IGN)
+        # What a user's function prints would fail its block where nobody reads it any more.
+        sys.stdout, sys.stderr = ForgivingStream(sys.stdout), ForgivingStream(sys.stderr)
+        if get_address_host(worker.address) == get_address_host(worker.scheduler.address):
+            # The driver compiles the same kernels, and says once that they can't be cached.
+            logging.getLogger("sweep").setLevel(logging.ERROR)
     import sweep.model.shot  # noqa: F401

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import signal
 import sys
 import threading
@@ -9,10 +10,11 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any, cast
 
 from sweep.messages import PrintableError, printable
 from sweep.storage.opening import StoreError as StoreError
+from sweep.tasks.streams import ForgivingStream, is_terminal
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
@@ -29,7 +31,13 @@ BROAD = 100
 #: Seconds before anything is shown of what is mostly over by then.
 LATE = 2.0
 
+#: Signals that end a run once its running blocks are done; the second one ends it at once.
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+#: Signal of a terminal that is closed, which comes several times; there is none on some systems.
+HANGUP = getattr(signal, "SIGHUP", None)
+
+_log = logging.getLogger("sweep")
 
 
 class TaskError(PrintableError):
@@ -83,8 +91,44 @@ class Progress:
 def chosen(progress: bool | Progress) -> Progress:
     """Return the progress asked for: none, the one given, or a display on standard error."""
     if progress is True:
-        return Bar() if sys.stderr.isatty() else Lines()
-    return Progress() if progress is False else progress
+        return Bar() if is_terminal(sys.stderr) else Lines()
+    if progress is False:
+        return Progress()
+    return progress if isinstance(progress, _Guarded) else _Guarded(progress)
+
+
+class _Guarded(Progress):
+    """A listener of the user's, which is told nothing more once it has raised an error."""
+
+    def __init__(self, listener: Progress) -> None:
+        self._listener, self._has_failed = listener, False
+
+    def _tell(self, method: str, *values: Any, **named: Any) -> None:
+        if self._has_failed:
+            return
+        try:
+            getattr(self._listener, method)(*values, **named)
+        except Exception as error:
+            self._has_failed = True
+            _log.warning(
+                "the listener to the progress failed in %s (%s: %s): the run goes on without it",
+                method, type(error).__name__, error,
+            )  # fmt: skip
+
+    def begin(self, **facts: Any) -> None:
+        self._tell("begin", **facts)
+
+    def advance(self, **facts: Any) -> None:
+        self._tell("advance", **facts)
+
+    def at_work(self, **facts: Any) -> None:
+        self._tell("at_work", **facts)
+
+    def say(self, text: str) -> None:
+        self._tell("say", text)
+
+    def end(self) -> None:
+        self._tell("end")
 
 
 @contextmanager
@@ -178,7 +222,7 @@ class Lines(_Counting):
 
     def say(self, text: str) -> None:
         """Print a line of its own."""
-        print(printable(text), file=sys.stderr, flush=True)
+        print(printable(text), file=ForgivingStream(sys.stderr), flush=True)
 
     def end(self) -> None:
         """Say how far it is."""
@@ -199,7 +243,7 @@ class Bar(_Counting):
         from rich.table import Column
 
         super().__init__()
-        self.console = Console(stderr=True)
+        self.console = Console(file=cast("IO[str]", ForgivingStream(sys.stderr)))
 
         def words(text: str) -> TextColumn:
             return TextColumn(text, table_column=Column())  # folded where others would be cut
@@ -236,7 +280,11 @@ class Bar(_Counting):
 
 
 class Interrupts:
-    """Ctrl-C once: finish what runs and stop; twice: stop at once; in the main thread only."""
+    """Ctrl-C once: finish what runs and stop; twice: stop at once; in the main thread only.
+
+    A closed terminal counts as one Ctrl-C, however often it is told; not where the process was
+    started to ignore it, as by nohup.
+    """
 
     def __init__(self) -> None:
         self.stopping = False
@@ -244,15 +292,18 @@ class Interrupts:
 
     def __enter__(self) -> Interrupts:
         if threading.current_thread() is threading.main_thread():
-            self._before = {number: signal.signal(number, self._handle) for number in SIGNALS}
+            numbers = list(SIGNALS)
+            if HANGUP is not None and signal.getsignal(HANGUP) is not signal.SIG_IGN:
+                numbers.append(HANGUP)
+            self._before = {number: signal.signal(number, self._handle) for number in numbers}
         return self
 
     def __exit__(self, *_: object) -> None:
         for number, handler in self._before.items():
-            signal.signal(number, handler)
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        if self.stopping:
+        if self.stopping and number != HANGUP:
             raise KeyboardInterrupt
         self.stopping = True
 

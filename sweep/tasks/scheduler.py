@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 from itertools import chain, takewhile
 from typing import TYPE_CHECKING, Any
 
+from sweep.storage.opening import NotAStoreError
 from sweep.tasks.journal import Receipt
 from sweep.tasks.progress import SchedulerLost, StoreError, duration
 from sweep.tasks.worker import NOT_HERE, TICK, Answer, BlockQueue, Job, Seen, failure, work
@@ -41,6 +42,8 @@ LEASE = 30.0
 #: Seconds in which a file server shows here what a worker has written: Linux's NFS keeps what it
 #: knows of a folder for as long.
 LATENCY = 60.0
+
+SAME_PLACE = "workers have to see the store's folder, under the same path"
 
 Say = Callable[[str], None]
 
@@ -289,6 +292,8 @@ class Scheduler:
             return
         self._unfit[worker] = self._slots.threads.get(worker, 1)
         if self._waits and sum(self._unfit.values()) >= self._slots.hoped:
+            if isinstance(why, NotAStoreError):  # the driver has it
+                raise StoreError(f"no worker is left: {worker} on {host}: {why}; {SAME_PLACE}")
             raise why
         self._say(f"worker {worker} on {host} is left out: {why}")
 

@@ -38,7 +38,7 @@ from sweep.spec.clusters import (
 )
 from sweep.spec.rules import near_miss
 from sweep.spec.sections import Execution
-from sweep.storage.locations import Location, ObjectStoreError
+from sweep.storage.locations import NO_INODES, Location, ObjectStoreError, reason
 from sweep.storage.opening import read_receipts
 from sweep.tasks import journal, store
 from sweep.tasks.journal import Failure, Journal, Lock, Look, Receipt, given_up
@@ -79,6 +79,8 @@ HOPELESS = 20
 REMEDIES = {
     errno.ENOSPC: "make room on its disk",
     errno.EDQUOT: "make room in your quota",
+    errno.EMFILE: "raise the limit of open files, `ulimit -n`",
+    errno.ENFILE: "raise the machine's limit of open files",
     errno.EROFS: "have its disk mounted for writing",
     errno.EACCES: "have the permission to write there",
     errno.EPERM: "have the permission to write there",
@@ -353,15 +355,20 @@ class Outcome:
 
     @property
     def why(self) -> str:
-        """Why the run ended before its blocks did."""
-        if self.stopped:
-            return self.stopped
+        """Why blocks are missing, in words; empty if the study is complete."""
         if self.complete:
             return ""
+        if self.stopped:
+            return self.stopped
         if not self.failures:
             retry = option("retry_failed")
-            return f"{self.left_out} blocks failed before; {retry} tries them again"
-        return f"{len(self.failures)} blocks failed, the first with {self.failures[0].error}"
+            return f"{_blocks(self.left_out)} failed before; {retry} tries them again"
+        return f"{_blocks(len(self.failures))} failed, the first with {self.failures[0].error}"
+
+
+def _blocks(number: int) -> str:
+    """Put a number of blocks into words."""
+    return f"{number:,} block{'' if number == 1 else 's'}"
 
 
 class Absence:
@@ -568,8 +575,10 @@ def unwritable(path: Location, error: OSError) -> str:
         return f"the store can't be written: {error.strerror}"
     if not _is_there(path):
         return f"{path} is no longer there: have its disk back, or its folder"
-    remedy = REMEDIES.get(error.errno or 0, "see to its disk")
-    return f"the store can't be written ({error.strerror or error}): {remedy}"
+    words, remedy = reason(error, path), REMEDIES.get(error.errno or 0, "see to its disk")
+    if words == NO_INODES:
+        remedy = "remove files from its disk, or have one with more inodes"
+    return f"the store can't be written ({words}): {remedy}"
 
 
 def _is_there(path: Location) -> bool:

@@ -43,6 +43,7 @@ from sweep.storage.locations import (
     located,
     names_below,
     put_whole,
+    reason,
     settle,
     successor,
 )
@@ -93,7 +94,10 @@ def create(
     try:
         if isinstance(path, Path):
             with draft(path, replace=replace) as building:
-                _build_new(building, study, recipe)
+                try:
+                    _build_new(building, study, recipe)
+                except OSError as error:  # told before the draft goes, and makes room
+                    raise OSError(error.errno, reason(error, building), str(building)) from error
                 if durable:
                     sync(building)
         else:
@@ -379,7 +383,9 @@ def refuse_damaged(path: Location) -> None:
 def wrong_with(place: Location, damage_of: Callable[[bytes], str]) -> str:
     """Damage of an object in words, by what it holds; empty where there is none."""
     try:
-        return damage_of(place.read_bytes())
+        what = damage_of(place.read_bytes())
+        # Once more from an object store, whose answer may have been cut.
+        return damage_of(place.read_bytes()) if what and isinstance(place, ObjectPath) else what
     except (FileNotFoundError, NotADirectoryError):
         return "is missing"
     except OSError as error:

@@ -23,7 +23,7 @@ from sweep.spec.rules import Mistake
 from sweep.spec.sections import parameter_rules
 from sweep.storage import opening
 from sweep.storage.locations import Location, located, real
-from sweep.storage.opening import open_group
+from sweep.storage.sound import open_arrays
 from sweep.tasks import store
 from sweep.tasks.eyepoint_study import EyepointStudy
 from sweep.tasks.flight_study import FlightStudy
@@ -171,7 +171,7 @@ class Reuse:
 
     @cached_property
     def _arrays(self) -> Any:
-        return open_group(self._path)
+        return open_arrays(self._path)
 
     def remark(self) -> str:
         """Remark on what is not simply taken from it; empty where all of it is."""

@@ -17,7 +17,8 @@ from sweep.model.accuracy import Accuracy
 from sweep.model.outputs import PROMISED
 from sweep.model.unsupported import UnsupportedShot
 from sweep.storage.locations import PACKED, Location, files_below, located
-from sweep.storage.opening import open_group, read_receipts
+from sweep.storage.opening import read_receipts
+from sweep.storage.sound import open_arrays
 from sweep.tasks import journal, studies
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.grid_study import GridStudy, evaluate_points, select, with_few_draws
@@ -144,7 +145,7 @@ def pieces(
     store: Location, study: Study, names: Sequence[str], blocks: np.ndarray
 ) -> Iterator[tuple[tuple[slice, ...], list[np.ndarray]]]:
     """Slices of some arrays, all cut alike, that each block has written, and their values."""
-    group = open_group(store)
+    group = open_arrays(store)
     arrays: list[Any] = [group[name] for name in names]
     for block in blocks:
         if (place := study.regions(int(block)).get(names[0])) is not None:
@@ -199,7 +200,7 @@ def scene_summary(store: str | Location) -> list[SceneRow]:
         for scanner in study.scanners
         for place in (places if apart else [()])
     }
-    group: Any = open_group(path)
+    group: Any = open_arrays(path)
     for block in np.flatnonzero(receipted(path, study)).tolist():
         _, part = study.part(block)
         regions = study.regions(block)
@@ -297,7 +298,7 @@ def rays_table(store: str | Location, done: np.ndarray | None = None) -> list[Er
         return [row for row in rows if row.missed]
     if not isinstance(study, FlightStudy) or not study.spec.rays_by_tolerance:
         return []
-    found, group = [], open_group(path)
+    found, group = [], open_arrays(path)
     for name in study.scanners:
         errors, tolerance = {name: f"{name}/beamlets_error"}, study.spec.accuracy.tolerance
         for row in _rows(path, study, done, errors, f"{name}/beamlets", np.asarray(tolerance)):

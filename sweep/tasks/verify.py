@@ -7,7 +7,6 @@ be made again, to the same bytes. A copy is checked value by value as it is made
 from __future__ import annotations
 
 import math
-import re
 import tempfile
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -15,7 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import google_crc32c
 import numpy as np
 import zarr
 
@@ -36,7 +34,8 @@ from sweep.storage.locations import (
     settle,
     zarr_store,
 )
-from sweep.storage.opening import digest, digest_of, open_group, read_lines, read_sealed, sealed
+from sweep.storage.opening import digest, digest_of, has_digest, read_lines, read_sealed, sealed
+from sweep.storage.sound import CHUNK, chunk_damage, open_arrays
 from sweep.tasks import journal, store, studies
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.journal import LOGS, RECIPE, committed, read_recipe
@@ -51,9 +50,6 @@ if TYPE_CHECKING:
 #: Blocks that are read at a time, and by how many threads: reading is waiting.
 BATCH = 256
 THREADS = 4
-
-#: Name of a chunk: its array, and its place in it.
-CHUNK = re.compile(r"(.+)/c((?:/\d+)*)")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -199,25 +195,17 @@ def _of_blocks(path: Location, study: Study, shown: Progress) -> Iterator[Damage
 def _of_block(path: Location, study: Study, block: int, known: bytes) -> list[Damage]:
     objects = store.block_objects(study, block)
     try:
-        if digest(path, objects) == known.decode():
+        if has_digest(path, objects, known.decode()):
             return []
     except OSError:
         pass  # told below, object by object
     found = [
         Damage(name, what, block)
         for name in objects
-        if (what := wrong_with(path / name, _of_chunk))
+        if (what := wrong_with(path / name, chunk_damage))
     ]
     count = f"one of its {len(objects)} chunks"
     return found or [Damage(count, "is whole but not the one that was committed", block)]
-
-
-def _of_chunk(content: bytes) -> str:
-    """Damage of a chunk in words, by the checksum that Zarr's codec put at its end."""
-    if not content:
-        return "is empty"
-    checksum = google_crc32c.value(content[:-4]).to_bytes(4, "little")
-    return "" if content[-4:] == checksum else "fails its checksum"
 
 
 def _mark(path: Location, damages: list[Damage]) -> str:
@@ -338,7 +326,7 @@ def _pack(path: Location, output: Location, study: Study, shown: Progress) -> No
         root = (template / "zarr.json").read_bytes()
         for name in files_below(template).keys() - {"zarr.json", store.LIST}:
             put_whole(output / name, (template / name).read_bytes())
-    names, arrays = sorted(study.owners()), open_group(path)
+    names, arrays = sorted(study.owners()), open_arrays(path)
     shown.begin(points=len(names), done=0, unit="arrays")
     try:
         for name in names:

@@ -175,3 +175,30 @@ def test_ctrl_c_stays_what_it_is_where_batch_systems_are_used():
     code = "import signal, sweep.tasks.clusters.batch; print(signal.getsignal(signal.SIGINT))"
     told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert told.stdout.strip() == str(signal.default_int_handler)
+
+
+def test_a_batch_system_is_used_from_any_thread(tmp_path):
+    """Signals are the main thread's, and dask_jobqueue sets one as it is imported."""
+    code = f"""
+import sys
+from concurrent.futures import ThreadPoolExecutor
+sys.path.insert(0, {str(Path(__file__).parents[1] / "tasks")!r})
+from small import small
+import sweep
+from sweep.tasks.progress import ClusterError
+
+cluster = {{"kind": "slurm", "worker": {{"memory": "1 GB"}}, "job": {{"walltime": "10 min"}},
+           "scheduler": {{"host": "127.0.0.1", "dashboard": "127.0.0.1:0"}}, "workers": 1}}
+with ThreadPoolExecutor(1) as pool:
+    asked = pool.submit(sweep.run, small(), store="s.zarr", cluster=cluster, progress=False)
+    try:
+        asked.result()
+    except ClusterError as error:
+        print(error)
+"""
+    told = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path,
+        env=os.environ | {"PATH": "/nowhere"},
+    )  # fmt: skip
+    assert "no workers could be started" in told.stdout and "sbatch" in told.stdout
+    assert "signal" not in told.stdout

@@ -63,6 +63,21 @@ def test_a_disk_that_is_full_from_the_start_is_left_as_it_was(disk):
     assert list(disk.iterdir()) == []
 
 
+def test_a_disk_without_inodes_is_not_told_as_a_full_one(disk):
+    store = disk / "small.zarr"
+    assert mount("-o", "remount,size=16M,nr_inodes=300", str(disk))
+    outcome = run(small(), store=store, progress=False, scheduler="none")
+    assert not outcome.complete and "No space left" not in outcome.stopped
+    assert "(No inodes left on device): remove files from its disk" in outcome.stopped
+    committed_is_whole(store)
+    other = disk / "other.zarr"
+    with pytest.raises(StoreError, match="can't be made: No inodes left on device"):
+        run(small(), store=other, progress=False, scheduler="none")
+    assert not other.exists()
+    assert mount("-o", "remount,nr_inodes=9000", str(disk))
+    assert resume(store, progress=False, scheduler="none").complete
+
+
 def at_block(number, happening):
     """The model, with something that happens, once, before a block."""
     happened = []

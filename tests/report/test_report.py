@@ -247,6 +247,7 @@ def test_a_place_of_a_flight_without_computed_shots_has_no_panel_over_time(scene
     store = tmp_path / "scene.zarr"
     shutil.copytree(scene_store, store)
     shutil.rmtree(store / "four" / "flags" / "c" / "0")  # of the first of two places
+    (store / ".sweep" / "receipts.jsonl").unlink()  # what is committed has to be there
     found, _ = flights.recordings(SceneStudy.of(store))
     for chart in (flights.along(found), flights.errors(found)):
         assert {panel.when["cloud"] for panel in chart.panels} == {found[1].words}

@@ -7,6 +7,7 @@ from collections import Counter
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 PASS, ERROR, SLOW, DROP, DENY = "pass", "error", "slow", "drop", "deny"
+CUT, SHORT = "cut", "short"  # bodies: less than announced, or half of it announced as all
 
 DENIED = b"<Error><Code>AccessDenied</Code><Message>Access Denied</Message></Error>"
 
@@ -59,6 +60,14 @@ def _handler(faulty, port):
                 self.close_connection = True
                 self.connection.close()
                 return None
+            if fate == SHORT:
+                headers = {k: v for k, v in answer.getheaders() if k.lower() != "content-length"}
+                # within a line: a log that is cut between two lines is a log
+                return self._reply(answer.status, headers, content[: len(content) // 2 + 3])
+            if fate == CUT:
+                self.close_connection = True
+                headers = {**dict(answer.getheaders()), "Content-Length": str(len(content))}
+                return self._reply(answer.status, headers, content[: len(content) // 2])
             return self._reply(answer.status, dict(answer.getheaders()), content)
 
         def _reply(self, status, headers, content):

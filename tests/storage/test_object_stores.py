@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from click.testing import CliRunner
-from faulty import DENY, DROP, ERROR, PASS, SLOW
+from faulty import CUT, DENY, DROP, ERROR, PASS, SHORT, SLOW
 from six_blocks import BLOCKS, six
 from small import evaluated, logged, quiet, tree
 
@@ -315,3 +315,40 @@ def test_plain_zarr_libraries_read_it(faults, place, undisturbed):
     expected = xr.open_zarr(undisturbed)
     assert set(dataset.data_vars) == set(expected.data_vars)
     np.testing.assert_array_equal(dataset.pd_shot.values, expected.pd_shot.values)
+
+
+@pytest.fixture(scope="module")
+def read_only_place(server):
+    return f"s3://bucket/cut_bodies/{time.time_ns()}/small.zarr"
+
+
+@pytest.mark.parametrize("fate", [CUT, SHORT])
+@pytest.mark.parametrize("part", ["small.zarr/zarr.json", "range/c/0", "pd_shot/c/", "receipts"])
+def test_a_body_that_is_cut_is_read_once_more(faults, read_only_place, part, fate):
+    if not located(read_only_place).exists():
+        assert quiet(six(), read_only_place).complete
+    cut: set[str] = set()
+
+    def once(number, method, path):
+        if method != "GET" or part not in path or "list-type" in path or path in cut:
+            return PASS
+        cut.add(path)
+        return fate
+
+    faults.fate = once
+    dataset = sweep.open(read_only_place)
+    assert np.isfinite(dataset.pd_shot.compute()).all() and cut
+    cut.clear()
+    (report,) = verify(read_only_place, progress=False)
+    assert cut and report.sound and report.complete
+    assert dataset.blocks_committed == dataset.blocks
+
+
+@pytest.mark.parametrize("fate", [CUT, SHORT])
+def test_a_body_that_is_cut_each_time_is_told(faults, read_only_place, fate):
+    if not located(read_only_place).exists():
+        assert quiet(six(), read_only_place).complete
+    faults.fate = lambda number, method, path: fate if path.endswith("/zarr.json") else PASS
+    done = CliRunner().invoke(main, ["status", read_only_place])
+    assert done.exit_code == 2 and "Traceback" not in done.output
+    assert ("is damaged" if fate == SHORT else "cuts its answers short") in done.output

@@ -5,6 +5,7 @@ import errno
 import os
 import shutil
 import signal
+import socket
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -14,7 +15,8 @@ import pytest
 from distributed import Client
 from small import copied, receipts, small, threads, tree
 
-from sweep.tasks import progress, scheduler, session, store, worker
+from sweep.storage.opening import NotAStoreError
+from sweep.tasks import cluster, progress, scheduler, session, store, worker
 from sweep.tasks.driver import resume, run
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.progress import ClusterError, Progress, StoreError
@@ -262,3 +264,37 @@ def test_a_signal_is_heard_while_kernels_compile(tmp_path, monkeypatch, number):
         compiled.set()
     assert told.lines[0].startswith("loading the model") and time.monotonic() - begun < 50
     assert outcome.stopped == "interrupted" and outcome.blocks_done == 0
+
+
+def test_an_address_at_which_no_scheduler_answers_is_told_in_time(tmp_path, monkeypatch):
+    monkeypatch.setattr(cluster, "CONNECT_TIMEOUT", 1.0)
+    begun = time.monotonic()
+    with pytest.raises(ClusterError, match=r"answers at tcp://127\.0\.0\.1:1: Timed out trying"):
+        run(small(), store=tmp_path / "s.zarr", scheduler="tcp://127.0.0.1:1", progress=False)
+    assert time.monotonic() - begun < 20 and not (tmp_path / "s.zarr").exists()
+
+
+def test_what_is_no_scheduler_is_told_as_that(tmp_path):
+    def answer(server):
+        connection, _ = server.accept()
+        with connection:
+            connection.sendall(b"HTTP/1.1 400 Bad Request\r\n\r\n" + bytes(100))
+            connection.recv(1000)
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        threading.Thread(target=answer, args=(server,), daemon=True).start()
+        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+        with pytest.raises(ClusterError, match=r"what answers at .* is no Dask scheduler"):
+            run(small(), store=tmp_path / "s.zarr", scheduler=address, progress=False)
+    assert not (tmp_path / "s.zarr").exists()
+
+
+def test_an_only_worker_that_does_not_see_the_folder_is_named(tmp_path, monkeypatch):
+    def unseen(path, study_id):
+        raise NotAStoreError(f"there is no store at {path}")
+
+    monkeypatch.setattr(worker, "study", unseen)
+    with Client(processes=False, n_workers=1, dashboard_address=None) as client:
+        words = r"no worker is left: inproc://.* on .*: there is no store at .*same path"
+        with pytest.raises(StoreError, match=words):
+            run(small(), store=tmp_path / "s.zarr", client=client, progress=False)

@@ -18,8 +18,9 @@ from sweep.model.pairing import FLAGS, TRUE
 from sweep.scenes.eyepoint_arrays import from_arrays
 from sweep.spec import Mistake, SpecError
 from sweep.spec.rules import near_miss
-from sweep.storage.locations import PACKED, Location, eyepoints_path, located, zarr_store
+from sweep.storage.locations import PACKED, Location, eyepoints_path, located
 from sweep.storage.opening import CHECKED, NotAStoreError
+from sweep.storage.sound import readable
 from sweep.units import QuantityError
 
 if TYPE_CHECKING:
@@ -502,8 +503,8 @@ def read_eyepoints(store_path: Location, scanner: xr.Dataset, index: np.ndarray)
             f"the eyepoints of the study are not at {path}: they are kept beside its store; "
             "running the study again casts them anew"
         )
-    read_attributes(path, "eyepoints")
-    dataset = xr.open_zarr(zarr_store(path), chunks=None, **CHECKED)
+    study_id = read_attributes(path, "eyepoints")["study_id"]
+    dataset = xr.open_zarr(readable(path, study_id), chunks=None, **CHECKED)
     chosen = dataset.isel(shot=np.asarray(index))
     arrays = {name: np.asarray(chosen[name].values) for name in (*SHOTS, *BEAMLETS)}
     return from_arrays(arrays, np.asarray(dataset["weight"].values))

@@ -16,7 +16,8 @@ that test can hit what its box missed; the triangles themselves stay float64.
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+
+from sweep.kernels import njit
 
 WIDTH = 8
 """Children of a node: one vector of float64 with AVX-512, two with AVX2."""

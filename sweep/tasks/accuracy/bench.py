@@ -23,10 +23,10 @@ from time import thread_time
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from scipy import fft
 from scipy.stats import qmc
 
+from sweep.kernels import njit
 from sweep.model import shot, truth
 from sweep.model import window as windows
 from sweep.model.accuracy import Accuracy

@@ -9,6 +9,9 @@ from __future__ import annotations
 import asyncio
 import shlex
 import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from distributed.core import Status
@@ -16,12 +19,32 @@ from distributed.core import Status
 from sweep.spec.clusters import Batch, Bounds, Slurm
 from sweep.tasks.clusters import machines
 
-_ON_CTRL_C = signal.getsignal(signal.SIGINT)
-from dask_jobqueue import PBSCluster, SLURMCluster  # noqa: E402
-from dask_jobqueue.pbs import PBSJob  # noqa: E402
-from dask_jobqueue.slurm import SLURMJob  # noqa: E402
 
-signal.signal(signal.SIGINT, _ON_CTRL_C)  # dask_jobqueue has it end the program as it is imported
+@contextmanager
+def _signals_kept() -> Iterator[None]:
+    """Have this thread set no handlers of signals.
+
+    dask_jobqueue sets one as it is imported, by which Ctrl-C ends the program at once. In any
+    thread but the main one that is an error.
+    """
+    set_handler, thread = signal.signal, threading.get_ident()
+
+    def set_by_others(number: Any, handler: Any) -> Any:
+        if threading.get_ident() == thread:
+            return signal.getsignal(number)
+        return set_handler(number, handler)
+
+    signal.signal = set_by_others  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        signal.signal = set_handler
+
+
+with _signals_kept():
+    from dask_jobqueue import PBSCluster, SLURMCluster
+    from dask_jobqueue.pbs import PBSJob
+    from dask_jobqueue.slurm import SLURMJob
 
 #: Seconds until a running cluster submits again what was not taken.
 PAUSE = 15.0

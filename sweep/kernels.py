@@ -1,0 +1,287 @@
+"""Compilation of kernels by numba, and the folder in which compiled kernels are cached.
+
+A compiled kernel has the kernels that it calls built in, and the constants that it reads. The cache
+of numba looks at the file of the kernel alone, and would go on with old code after a change of
+another file. Kernels are therefore cached in a folder named by a fingerprint of all files of the
+model, and of the libraries and settings that compile them:
+
+    BASE/sweep-kernels-UID/FINGERPRINT
+
+BASE is `NUMBA_CACHE_DIR` if it is set, else the user's cache, else the folder for temporary files.
+Compiled kernels are code that is run: the folder is used only if nobody else can write to it.
+
+The folder may be removed at any time, by whomever: kernels are compiled again. Folders of other
+fingerprints are removed once no process has used them for a month.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import logging
+import os
+import re
+import shutil
+import stat
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import llvmlite
+import numba
+import numpy as np
+from numba.core.caching import FunctionCache
+from numba.core.dispatcher import Dispatcher
+from numba.core.sigutils import normalize_signature
+from platformdirs import user_cache_dir
+
+#: Time without any use after which the kernels of another fingerprint are removed [s].
+UNUSED_SECONDS_MAX = 30 * 86400.0
+
+#: Time after which the date of use of a folder is renewed [s].
+USE_RENEWAL_SECONDS = 86400.0
+
+#: Settings of numba that have no part in the code that it compiles.
+SETTINGS_WITHOUT_EFFECT = ("NUMBA_CACHE_DIR", "NUMBA_NUM_THREADS")
+
+_numba_settings: Any = numba.config
+_MODEL = Path(__file__).parent / "model"
+_FINGERPRINT = re.compile("[0-9a-f]{32}")
+
+_log = logging.getLogger("sweep")
+_declaring = threading.RLock()
+
+
+class CacheFolder(NamedTuple):
+    """Folder in which this process caches kernels."""
+
+    path: Path | None  # None where kernels are not cached
+    reason: str = ""  # why they are not cached
+
+
+class _CacheState:
+    """State of the kernel cache of this process."""
+
+    reads = True  # False once a file of the model has changed since it was fingerprinted
+    writes = True
+
+
+def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Compile a function as `numba.njit` does, and cache it by the fingerprint of the model.
+
+    A kernel may read constants and call kernels of its own file and of the model, and no others:
+    the cache does not notice changes of other files.
+
+    Parameters
+    ----------
+    **options
+        Those of `numba.njit`.
+
+    Examples
+    --------
+    >>> @njit(cache=True, error_model="numpy")
+    ... def halve(x):
+    ...     return x / 2
+    >>> halve(3)
+    1.5
+    """
+    is_cached = options.pop("cache", False)
+
+    def declare(function: Callable[..., Any]) -> Any:
+        kernel = numba.njit(**options)(function)
+        if is_cached and isinstance(kernel, Dispatcher):  # else compilation is disabled
+            _enable_cache(kernel)
+        return kernel
+
+    return declare
+
+
+class KernelCache(FunctionCache):
+    """Cache of a kernel, without which computing goes on.
+
+    A file that is damaged, cut short or out of reach counts as absent.
+    """
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Return the kernel compiled for a signature, or None."""
+        if not _CacheState.reads:
+            return None
+        try:
+            result = super().load_overload(sig, target_context)
+        except Exception:  # whatever unpickling of damaged bytes raises
+            return None
+        # Two processes that save different signatures at once may take the same file for them.
+        if result is None or tuple(result.signature.args) != tuple(normalize_signature(sig)[0]):
+            return None
+        _date_use(Path(self.cache_path).parent)
+        return result
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Save a compiled kernel; log once where that can't be done."""
+        if not _CacheState.writes:
+            return
+        folder = Path(self.cache_path).parent
+        try:
+            try:
+                super().save_overload(sig, data)
+            except FileNotFoundError:  # the folder was removed meanwhile: it is made again
+                super().save_overload(sig, data)
+            except OSError:
+                raise
+            except Exception:  # the index is damaged, which unpickling can raise anything of
+                self.flush()
+                super().save_overload(sig, data)
+        except OSError as error:
+            _CacheState.writes = False
+            _warn_uncached(f"{folder} can't be written ({error.strerror or error})")
+        else:
+            _date_use(folder)
+            _remove_unused(folder)
+
+
+def _enable_cache(kernel: Any) -> None:
+    """Have a kernel cached in the folder of the fingerprint, if there is one."""
+    folder = cache_folder()
+    if folder.path is None:
+        _warn_uncached(folder.reason)
+        return
+    if _has_changed(kernel.py_func.__code__.co_filename):
+        # The modules of this process are of different states: no fingerprint is theirs.
+        _CacheState.reads = _CacheState.writes = False
+    with _declaring, _cache_dir(str(folder.path)):
+        try:
+            kernel_cache = KernelCache(kernel.py_func)
+        except RuntimeError:  # numba has no place to cache it in
+            return
+    if folder.path in Path(kernel_cache.cache_path).parents:
+        kernel._cache = kernel_cache
+
+
+@contextmanager
+def _cache_dir(path: str) -> Iterator[None]:
+    """Set numba's cache folder while a kernel is declared; that of other functions stays."""
+    before = _numba_settings.CACHE_DIR
+    _numba_settings.CACHE_DIR = path
+    try:
+        yield
+    finally:
+        _numba_settings.CACHE_DIR = before
+
+
+@cache
+def cache_folder() -> CacheFolder:
+    """Return the folder in which this process caches compiled kernels."""
+    with _declaring:
+        if not (fingerprint := _fingerprint()):
+            return CacheFolder(None, "the sources of the model are not files")
+        reasons = []
+        for base_of in (_named_base, user_cache_dir, tempfile.gettempdir):
+            try:
+                base = base_of()
+                if os.path.isabs(base):  # the user's is not without a home
+                    root = Path(base) / f"sweep-kernels-{os.getuid()}"
+                    _make_private(root)
+                    return CacheFolder(root / fingerprint)
+            except OSError as error:
+                reasons.append(
+                    f"{error.filename}: {error.strerror}"
+                    if error.filename
+                    else error.strerror or str(error)
+                )
+        return CacheFolder(None, "; ".join(reasons))
+
+
+def _named_base() -> str:
+    """Folder that numba is told to cache in; empty where it is told none."""
+    named = _numba_settings.CACHE_DIR
+    return os.path.abspath(named) if named else ""
+
+
+def _make_private(root: Path) -> None:
+    """Make a folder that nobody else can write to; OSError where that can't be had."""
+    root.parent.mkdir(parents=True, exist_ok=True)
+    with suppress(FileExistsError):
+        root.mkdir(mode=0o700)
+    status = root.lstat()
+    if (
+        not stat.S_ISDIR(status.st_mode)
+        or status.st_uid != os.getuid()
+        or status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    ):
+        raise PermissionError(errno.EPERM, "others can write there", str(root))
+    tempfile.TemporaryFile(dir=root).close()
+
+
+@cache
+def _sources() -> dict[str, tuple[str, int, int]]:
+    """Name, size and time of change of each file of the model, by its path."""
+    return {
+        str(path): (path.relative_to(_MODEL).as_posix(), status.st_size, status.st_mtime_ns)
+        for path in sorted(_MODEL.rglob("*.py"))
+        for status in [path.stat()]
+    }
+
+
+@cache
+def _fingerprint() -> str:
+    """Digest of all that compiled kernels follow from; empty where sources are not files."""
+    digest = hashlib.sha256()
+    parts = [numba.__version__, llvmlite.__version__, np.__version__]
+    parts += [
+        f"{name}={value}"
+        for name, value in sorted(os.environ.items())
+        if name.startswith("NUMBA_") and name not in SETTINGS_WITHOUT_EFFECT
+    ]
+    digest.update(repr(parts).encode())
+    for path, (name, *_) in _sources().items():
+        content = Path(path).read_bytes()
+        digest.update(f"{name}\0{len(content)}\0".encode())
+        digest.update(content)
+    return digest.hexdigest()[:32] if _sources() else ""
+
+
+def _has_changed(path: str) -> bool:
+    """Tell whether a file of the model is another than when it was fingerprinted."""
+    if (known := _sources().get(path)) is None:
+        return False
+    try:
+        status = os.stat(path)
+    except OSError:
+        return True
+    return known[1:] != (status.st_size, status.st_mtime_ns)
+
+
+@cache
+def _date_use(folder: Path) -> None:
+    """Date the use of a folder of kernels, so that others let it be; once a process."""
+    with suppress(OSError):
+        if time.time() - folder.stat().st_mtime > USE_RENEWAL_SECONDS:
+            os.utime(folder)
+
+
+@cache
+def _remove_unused(used: Path) -> None:
+    """Remove the folders of other fingerprints that nobody has used for a month; once a process.
+
+    Where one is in use all the same, its process has its kernels in memory, or compiles them anew.
+    """
+    with suppress(OSError):
+        folders = {path for path in used.parent.iterdir() if _FINGERPRINT.fullmatch(path.name)}
+        for folder in folders - {used}:
+            if time.time() - folder.stat().st_mtime > UNUSED_SECONDS_MAX:
+                shutil.rmtree(folder, ignore_errors=True)
+
+
+@cache
+def _warn_uncached(reason: str) -> None:
+    """Log that each process has to compile anew, and the remedy."""
+    _log.warning(
+        "compiled kernels are not cached, so that each start takes a minute more: %s. "
+        "NUMBA_CACHE_DIR names another folder for them, of your own and with room",
+        reason,
+    )

@@ -1,0 +1,127 @@
+"""Output to a terminal, a pipe or a log that may be full, gone or missing.
+
+Words of a program must not end its computing: a stream that fails goes silent.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import Any
+
+#: Descriptors of standard input, output and error.
+STANDARD = (0, 1, 2)
+
+
+class ForgivingStream(io.TextIOBase):
+    """Text stream around another, which may be None; silent once that one has failed."""
+
+    def __init__(self, stream: Any) -> None:
+        self._stream = stream
+        self.error: Exception | None = None  # why it is silent
+
+    @property
+    def encoding(self) -> str:  # type: ignore[override]
+        """Encoding of the stream inside."""
+        return getattr(self._stream, "encoding", None) or "utf-8"
+
+    def isatty(self) -> bool:
+        """Tell whether the stream inside is a terminal."""
+        return is_terminal(self._stream)
+
+    def fileno(self) -> int:
+        """Return the descriptor of the stream inside; UnsupportedOperation if it has none."""
+        try:
+            return int(self._stream.fileno())
+        except (AttributeError, OSError, ValueError, TypeError):
+            raise io.UnsupportedOperation("fileno") from None
+
+    def writable(self) -> bool:
+        """Tell that text can be written."""
+        return True
+
+    def write(self, text: str) -> int:
+        """Write text, or drop it."""
+        if not isinstance(text, str):
+            raise TypeError(f"a stream of text takes no {type(text).__name__}")
+        if self._stream is None or self.error is not None:
+            return len(text)
+        try:
+            try:
+                self._stream.write(text)
+            except UnicodeEncodeError:
+                known = text.encode(self.encoding, "backslashreplace")
+                self._stream.write(known.decode(self.encoding))
+        except BlockingIOError:  # a reader that is late: the next text may pass
+            pass
+        except Exception as error:
+            self._go_silent(error)
+        return len(text)
+
+    def flush(self) -> None:
+        """Pass on what is written, or drop it."""
+        if self._stream is None or self.error is not None:
+            return
+        with suppress(BlockingIOError):
+            try:
+                self._stream.flush()
+            except BlockingIOError:
+                raise
+            except Exception as error:
+                self._go_silent(error)
+
+    def finish(self) -> None:
+        """Pass on the last that is written, so that nothing is left to fail after this."""
+        self.flush()
+        try:
+            if self._stream is not None:
+                self._stream.flush()
+        except Exception as error:
+            self._go_silent(error)
+
+    def _go_silent(self, error: Exception) -> None:
+        self.error = error
+        with suppress(OSError, ValueError):
+            if (number := self.fileno()) in STANDARD:
+                # What the stream holds still is written as the program ends, which fails as well.
+                nothing = os.open(os.devnull, os.O_WRONLY)
+                os.dup2(nothing, number)
+                os.close(nothing)
+
+
+def is_terminal(stream: Any) -> bool:
+    """Tell whether a stream, which may be missing, closed or of any kind, is a terminal."""
+    try:
+        return bool(stream.isatty())
+    except Exception:
+        return False
+
+
+@contextmanager
+def forgiving_output() -> Iterator[None]:
+    """Have standard output and error of this process go silent where they fail."""
+    _open_standard_descriptors()
+    before = sys.stdout, sys.stderr
+    output, errors = (ForgivingStream(stream) for stream in before)
+    sys.stdout, sys.stderr = output, errors
+    try:
+        yield
+    finally:
+        output.finish()
+        if output.error is not None and not isinstance(output.error, BrokenPipeError):
+            errors.write(f"standard output can't be written: {output.error}\n")
+        errors.finish()
+        sys.stdout, sys.stderr = before
+
+
+def _open_standard_descriptors() -> None:
+    """Open those that are closed: the next file would get their number, and others' output."""
+    for number in STANDARD:
+        try:
+            os.fstat(number)
+        except OSError:
+            with suppress(OSError):
+                os.open(os.devnull, os.O_RDWR)
