@@ -30,6 +30,9 @@ LOGARITHMIC = {
 """Units of power that are logarithms: the SI unit, and its value at 0 dB. 30 dBm is 1 W, and
 -155 dB/Hz is 10^-15.5 /Hz; of a laser's noise it is also written as dBc/Hz."""
 
+NONE = "none"
+"""Text of a share or number of nothing, which has no value."""
+
 _NUMBER = r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d{1,4})?"
 _POWER = r"(?P<base>\d{1,6})(?:\^|\*\*)(?P<exponent>\d{1,3})"
 _UNIT = r"(?:(?<=\s)1\s*/|[^\d\s.+\-]).*"
@@ -373,3 +376,21 @@ def _near_miss(name: str, si_unit: str, example: str) -> str:
     close = same or get_close_matches(name, names, n=10, cutoff=0.5)
     close.sort(key=lambda known: (len(known) != len(name), known[0] != name[0]))
     return f"did you mean '{close[0]}'?" if close else f"write e.g. '{example}'"
+
+
+def number_text(value: float, form: str = ".4g") -> str:
+    """Return a number as text; ``none`` for nan.
+
+    >>> number_text(0.25), number_text(float("nan"))
+    ('0.25', 'none')
+    """
+    return f"{value:{form}}" if value == value else NONE
+
+
+def percent(share: float, form: str = ".3g") -> str:
+    """Return a share in percent; ``none`` for nan, the share of nothing.
+
+    >>> percent(0.25), percent(float("nan"))
+    ('25 %', 'none')
+    """
+    return f"{100 * share:{form}} %" if share == share else NONE

@@ -225,3 +225,9 @@ def test_units_of_decibels_mean_what_the_field_means_by_them(written, si_unit, v
 def test_a_number_with_a_comma_or_groups_is_told_as_it_is_written_here(written, words):
     with pytest.raises(QuantityError, match=re.escape(words)):
         read_quantity(written, si_unit="m", example="")
+
+
+def test_shares_and_numbers_of_nothing_are_none():
+    assert units.percent(0.256, ".1f") == "25.6 %"
+    assert units.percent(math.nan) == units.number_text(math.nan) == "none"
+    assert units.number_text(0.5) == "0.5"

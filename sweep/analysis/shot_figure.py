@@ -15,18 +15,19 @@ from matplotlib.figure import Figure as Sheet
 
 from sweep.analysis import canvas, labels
 from sweep.analysis.selection import GRAZING_ANGLE
-from sweep.analysis.tables import Block, Page, percent
+from sweep.analysis.tables import Block, Page
 from sweep.model import shot as model
 from sweep.model import waveform, window
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.catalogue import CORE, EFFECTS
 from sweep.model.eyepoints import Eyepoints
 from sweep.model.returns import beamlet_lines
-from sweep.model.segments import spectrum as segment_spectrum
+from sweep.model.segments import whole_spectrum
 from sweep.model.shot import prepare
 from sweep.model.threshold import WAYS
 from sweep.spec import Spec
 from sweep.spec.sections import parameter_rules
+from sweep.units import percent
 
 Parameters = Mapping[str, float | int | str]
 
@@ -35,7 +36,7 @@ NAMES = ("up-chirp", "Doppler", "down-chirp")
 
 @dataclass(frozen=True)
 class Group:
-    """Adjacent bins above the threshold: the first, the last, and the strongest of them."""
+    """Places of adjacent bins above the threshold: the first, the last, and the strongest."""
 
     first: int
     last: int
@@ -46,13 +47,15 @@ class Group:
 class Segment:
     """Spectrum of a segment and what is found in it.
 
-    Frequencies and carrier are in Hz; |X| of each bin in V, of the signal alone, and with noise
+    Bins are in the order of their frequencies, those of a complex record with signs. Frequencies
+    and carrier are in Hz; |X| of each bin in V, of the signal alone, and with noise
     where that is drawn. The SNR and the probability of detection are those of the strongest
     bin.
     """
 
     name: str
     slope: float
+    bins: np.ndarray
     frequency: np.ndarray
     signal: np.ndarray
     magnitude: np.ndarray
@@ -64,7 +67,7 @@ class Segment:
 
     @property
     def peak(self) -> int:
-        """Strongest bin."""
+        """Place of the strongest bin."""
         return int(np.argmax(self.magnitude))
 
 
@@ -144,8 +147,7 @@ def simulated_shot(
 
 
 def _segment(prepared: model.Shots, found: np.ndarray, k: int, seed: int | None) -> Segment:
-    bins, signal = segment_spectrum(prepared, 0, k)
-    bins = bins - prepared.fft_size if prepared.complex_record else bins
+    bins, signal = prepared.signed_bins, whole_spectrum(prepared, 0, k)
     magnitude, looks = np.abs(signal), prepared.looks
     if seed is not None:
         noise = np.array([
@@ -167,13 +169,14 @@ def _segment(prepared: model.Shots, found: np.ndarray, k: int, seed: int | None)
     return Segment(
         name=NAMES[k],
         slope=segment.slope,
+        bins=bins,
         frequency=bins * float(prepared.sample_rate[0]) / prepared.fft_size,
         signal=signal,
         magnitude=magnitude,
         beat=np.asarray(beat).item(),
         carrier=carrier,
         groups=groups(magnitude, float(prepared.threshold[0])),
-        snr=float(found[2] / prepared.bin_deviation[0]) ** 2 / 2,
+        snr=float(prepared.snr(found[2])[0]),
         pd=float(found[0]),
     )
 
@@ -395,7 +398,7 @@ def _segments(shot: Shot) -> Block:
     rows = [
         (
             segment.name, f"{segment.beat / 1e6:+.6f}",
-            f"{segment.frequency[segment.peak] / 1e6:.6f}", segment.peak,
+            f"{segment.frequency[segment.peak] / 1e6:.6f}", int(segment.bins[segment.peak]),
             f"{shot.dbv(segment.magnitude[segment.peak]):.1f}",
             f"{10 * math.log10(segment.snr):.2f}" if segment.snr > 0 else "-",
             f"{segment.pd:.6g}", len(segment.groups),

@@ -27,6 +27,7 @@ from sweep.analysis.selection import (
 from sweep.model.looks import Looks
 from sweep.model.shot import evaluate
 from sweep.model.threshold import tnr_of
+from sweep.units import percent
 
 if TYPE_CHECKING:
     from sweep.spec import Spec
@@ -75,11 +76,6 @@ def written(cell: Cell) -> str:
     if isinstance(cell, float):
         return "-" if math.isnan(cell) else f"{cell:.5g}"
     return str(cell)
-
-
-def percent(value: float, form: str = ".3f") -> str:
-    """Return a fraction in percent; nothing for nan."""
-    return "-" if math.isnan(value) else f"{100 * value:{form}} %"
 
 
 def aligned(columns: Sequence[str], rows: Sequence[Sequence[Cell]]) -> str:
@@ -350,5 +346,5 @@ def _written(value: Cell, form: str) -> Cell:
     if not form:
         return value
     if form.endswith("%"):
-        return percent(float(value), form[:-1])
+        return percent(float(value), form[:-1]) if value == value else "-"
     return format(value, form) if value == value else "-"

@@ -19,6 +19,7 @@ from rich.filesize import decimal
 from sweep.messages import command_line, one_line, printable
 from sweep.storage.locations import Location, located
 from sweep.tasks.streams import is_terminal
+from sweep.units import number_text, percent
 
 if TYPE_CHECKING:
     import numpy as np
@@ -316,8 +317,8 @@ def _print_grid(store: Location) -> None:
             [
                 row.part,
                 f"{row.points:,}",
-                f"{100 * row.detected:.1f} %",
-                f"{row.pd_shot:.4g}",
+                percent(row.detected, ".1f"),
+                number_text(row.pd_shot),
                 f"{row.pd_doppler:.4g}" if row.pd_doppler == row.pd_doppler else "-",
             ]
             for row in rows
@@ -339,8 +340,8 @@ def _print_scene(store: Location) -> None:
             [
                 row.part,
                 f"{row.shots:,}",
-                f"{row.pd:.4g}",
-                f"{100 * row.true / max(row.shots, 1):.1f} %",
+                number_text(row.pd),
+                percent(row.true / row.shots, ".1f") if row.shots else "-",
                 f"{row.false:,}",
                 f"{100 * row.solved / row.cycles:.1f} %" if row.cycles else "-",
             ]
@@ -624,8 +625,8 @@ def _effect_cells(row: EffectRow) -> list[str]:
     cost, forced = row.cost, "" if row.mode == "auto" else f" ({row.mode})"
     return [
         row.name.replace("_", " ") + forced,
-        f"{100 * row.share:.3g} %",
-        f"{100 * cost:.2g} %" if cost == cost else "-",
+        percent(row.share),
+        percent(cost, ".2g") if cost == cost else "too short to measure" if row.share else "-",
         f"{row.bound:.2g}",
         "nowhere, but forced on"
         if row.bound == 0 and row.mode == "on"

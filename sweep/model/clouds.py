@@ -21,6 +21,7 @@ from sweep.model.eyepoints import Eyepoints, seen_ground
 from sweep.model.geometry.mesh import Surface
 from sweep.model.ground import Footprints
 from sweep.model.groups import Groups, groups
+from sweep.model.leaked_peaks import leaked_peaks
 from sweep.model.marcum import at_least_one
 from sweep.model.noisy_spectra import Methods
 from sweep.model.outputs import POINTS, STATISTICS
@@ -128,6 +129,9 @@ def _groups(
             bins[blind] = -1
         found.neighbours[blind] = found.pd[blind] = np.nan
         found.exempted[blind] = found.leakage[blind] = 0.0
+    if shots.fading is not None and shots.leakage:
+        for part, leaks in leaked_peaks(shots, found, np.flatnonzero(seen)):
+            found.leakage[part] = leaks.mean_leakage()
     return shots, ground.beamlets, found
 
 
@@ -147,7 +151,7 @@ def _statistics(shots: Shots, found: Groups) -> dict[str, np.ndarray]:
         "pd_shot": both,
         "pfa_up": alarm[:, 0],
         "pfa_down": alarm[:, 1],
-        "snr_up": (found.magnitude[:, 0, 0] / shots.bin_deviation) ** 2 / 2,
+        "snr_up": shots.snr(found.magnitude[:, 0, 0]),
         "surfaces_seen": above.sum(axis=1),
     }
 

@@ -291,8 +291,8 @@ def _deviate(chance):
 def echo_of(magnitude, first, last, level, beside):
     """First and last bin of the echo about a group of bins first .. last of a run.
 
-    Those of half the group's largest magnitude that join on to it, and a main lobe on either side;
-    the group itself where ``beside`` is 0.
+    Those of half the group's largest magnitude that join on to it, and a main lobe on either side,
+    up to the next group; the group itself where ``beside`` is 0.
     """
     if beside == 0:
         return first, last
@@ -301,7 +301,10 @@ def echo_of(magnitude, first, last, level, beside):
         first -= 1
     while last < magnitude.size - 1 and floor <= magnitude[last + 1] < level:
         last += 1
-    return max(first - beside, 0), min(last + beside, magnitude.size - 1)
+    for _ in range(beside):
+        first -= 1 if first > 0 and magnitude[first - 1] < level else 0
+        last += 1 if last < magnitude.size - 1 and magnitude[last + 1] < level else 0
+    return first, last
 
 
 @njit(cache=True, error_model="numpy")

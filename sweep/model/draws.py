@@ -183,12 +183,18 @@ class Seen(NamedTuple):
         return cls(low, low, none, real, *bins, others, stretch, *leaked)
 
 
-def seen_spectra(shots: Shots) -> Iterator[tuple[np.ndarray, Seen]]:
-    """Points of some shots, and their spectra; as many at once as memory holds."""
+def seen_spectra(
+    shots: Shots, points: np.ndarray | None = None
+) -> Iterator[tuple[np.ndarray, Seen]]:
+    """Yield points of some shots, all or those of ``points``, and their spectra.
+
+    As many at once as memory holds.
+    """
     sigma, is_real = shots.bin_deviation, shots.real_ends > 0
     # Without leakage none but the peak is looked at.
     floor = shots.floor + np.zeros(shots.size) if shots.leakage else np.full(shots.size, np.inf)
-    for runs in runs_of(shots, least=np.minimum(shots.threshold, floor * sigma), leakage=False):
+    least = np.minimum(shots.threshold, floor * sigma)
+    for runs in runs_of(shots, points=points, least=least, leakage=False):
         count, start, peak = (c.T.ravel() for c in (runs.bins, runs.start, runs.peak))
         run = np.repeat(np.arange(count.size), count)  # of each bin, point by point
         number = np.arange(run.size) - (np.cumsum(count) - count)[run]

@@ -59,7 +59,7 @@ from sweep.model.interpolation import interpolator, phasors, sub_bin
 from sweep.model.looks import BINARY
 from sweep.model.philox import STREAM_LASER_PHASE, STREAM_RECORD, normals, uniforms
 from sweep.model.preparation import Parameters, Shots
-from sweep.model.segments import spectrum as segment_spectrum
+from sweep.model.segments import whole_spectrum
 from sweep.model.shot import fit
 
 VALUES = ("pfa_bin", "false_alarms", "range", "radial_velocity", "range_2", "radial_velocity_2")
@@ -104,7 +104,7 @@ def signal_of(
 
     ``echoes``: strongest bins of the echoes of several surfaces, where there are several.
     """
-    magnitude = _magnitude(shots, i, segment)
+    magnitude = whole_spectrum(shots, i, segment)
     if (laser := _laser(shots, i))["line_width"] > 0:  # as it is before its phase walks
         kept = seen_line(window=shots.window, looks=shots.looks.added, **laser)[0][0]
         magnitude = magnitude / math.sqrt(kept)
@@ -157,7 +157,7 @@ def signal_of(
 
 def index_of_zero(shots: Shots) -> int:
     """Index of the bin at frequency 0 in a spectrum."""
-    return shots.fft_size // 2 if shots.complex_record else 0
+    return int(shots.index_of_bin(np.zeros((), int)))
 
 
 def turn_of(shots: Shots, middle: int) -> int:
@@ -175,16 +175,6 @@ def unrolled(shots: Shots, values: np.ndarray, middle: int) -> np.ndarray:
         return values
     values = np.roll(values, turn_of(shots, middle) - 1, axis=-1)
     return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(1, 1)])
-
-
-def _magnitude(shots: Shots, i: int, segment: int) -> np.ndarray:
-    """|X| of all bins of a segment, without noise [V]."""
-    bins, magnitude = segment_spectrum(shots, i, segment)
-    if not shots.complex_record:
-        return magnitude
-    whole = np.zeros(shots.fft_size)
-    whole[(bins + index_of_zero(shots)) % shots.fft_size] = magnitude
-    return whole
 
 
 def _between(shots: Shots, magnitude: np.ndarray, k: int) -> float:
@@ -339,9 +329,7 @@ class View(NamedTuple):
         """Return indices of the echoes' strongest bins in a segment; none where echoes are one."""
         bins = np.empty(0, np.int64) if self.echoes is None else self.echoes[segment]
         bins = bins[bins >= 0]
-        if self.shots.complex_record:
-            bins = (bins + self.shots.fft_size // 2) % self.shots.fft_size
-        return bins
+        return self.shots.index_of_bin(bins)
 
 
 class Found(NamedTuple):

@@ -81,7 +81,8 @@ OUTPUTS: dict[str, Output] = {
     ),
     **_by_segment(
         "snr_{}", "signal-to-noise ratio", shot=None,
-        comment="power of the strongest bin over the mean noise power of a bin, after the FFT.",
+        comment="mean power of the signal in the strongest bin over the mean noise power of a bin, "
+        "after the FFT; the pedestal of a laser's phase noise under the line is signal.",
     ),
     "beamlets": Output("1", "number of beamlets that were simulated"),
     "beamlets_error": Output(
@@ -272,7 +273,10 @@ STATISTICS: dict[str, Output] = _over(("shot",), {
     "pd_shot": Output("1", "probability that up- and down-chirp both detect the strongest surface"),
     "pfa_up": Output("1", "probability of a false alarm, up-chirp, noise and leakage"),
     "pfa_down": Output("1", "probability of a false alarm, down-chirp, noise and leakage"),
-    "snr_up": Output("1", "signal-to-noise ratio, up-chirp, strongest bin"),
+    "snr_up": Output(
+        "1", "signal-to-noise ratio, up-chirp, strongest bin",
+        "as of a grid: with the pedestal of a laser's phase noise under the line",
+    ),
     "surfaces_seen": Output("1", "groups of bins above the threshold, up-chirp", dtype="int16"),
     "beamlets": Output("1", "beamlets, each a ray that was cast", dtype="int32"),
     "beamlets_error": Output(

@@ -204,6 +204,29 @@ class Shots:
         """Bins of a spectrum: 0..N/2 of a real record, -N/2..N/2 - 1 of a complex one."""
         return self.fft_size if self.complex_record else self.fft_size // 2 + 1
 
+    def signed_bin(self, number: np.ndarray) -> np.ndarray:
+        """Return bins by their frequency over that of bin 1: 0..N/2, or -N/2..N/2 - 1.
+
+        A complex record's bins may be numbered from anywhere on, past N and below 0.
+        """
+        if not self.complex_record:
+            return np.asarray(number)
+        half = self.fft_size // 2
+        return np.asarray((np.asarray(number) + half) % self.fft_size - half)
+
+    def index_of_bin(self, number: np.ndarray) -> np.ndarray:
+        """Return places of bins in a spectrum whose bins are in the order of their frequencies.
+
+        Those of frequency 0 stand at 0, of a complex record at N/2.
+        """
+        zero = self.fft_size // 2 if self.complex_record else 0
+        return self.signed_bin(number) + zero
+
+    @property
+    def signed_bins(self) -> np.ndarray:
+        """All bins of a spectrum in the order of their frequencies, (bins,)."""
+        return self.signed_bin(np.arange(self.bins) - self.index_of_bin(np.zeros((), int)))
+
     @property
     def chirp_rate(self) -> np.ndarray:
         """Chirp rate S = B/T [Hz/s]."""
@@ -280,6 +303,15 @@ class Shots:
     def line_deviation(self) -> np.ndarray:
         """Noise sigma of a bin that holds lines, per quadrature [V], (n,)."""
         return self._deviation(self.noise_variance + self.pedestal)
+
+    def snr(self, magnitude: np.ndarray) -> np.ndarray:
+        """Mean power of a bin's signal over the mean power of its noise, (..., n).
+
+        ``magnitude`` is |X| of the lines in the bin [V]. The pedestal that a laser's phase noise
+        leaves under them is signal as well: it fades with them, and detects with them.
+        """
+        lines = np.square(magnitude / self.bin_deviation) / 2
+        return np.asarray(lines + self.pedestal / self.noise_variance)
 
     @cached_property
     def threshold(self) -> np.ndarray:

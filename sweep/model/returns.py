@@ -5,7 +5,8 @@ peaks, pairs the peaks (:mod:`sweep.model.pairing`) and reports range and radial
 bins and interpolated between them.
 
 The two ways to draw are those of :mod:`sweep.model.draws`, with the same random numbers: the
-strongest group is detected, and a false alarm raised, in the very draws that are counted there.
+strongest group is detected in the very draws that are counted there, and so are false alarms of
+noise.
 Against ``probabilities`` peaks stay in their noiseless bins, and the interpolated position has a
 normal error of the standard error that is reported. ``noise`` is added to ``peak_bin`` and its two
 neighbours, so that another may be the largest, or to all bins of a group's echo.
@@ -20,12 +21,17 @@ segments, which share what their speckles do. Against probabilities the down seg
 follows from the up segment's draw, and a detected peak's power is drawn for each segment alone.
 
 Standard errors are those of noise and, in quadrature, what the lines in a group make by their
-spread (:func:`interpolation.spread_error`). A segment and draw has one false peak at most, the
-largest, placed uniformly over bins 1..N/2 outside the listed groups (a leaking bin in its own
-place). Groups beyond the ``most`` strongest are neither detected nor false alarms.
+spread (:func:`interpolation.spread_error`).
+
+Of noise alone a segment and draw has one false peak at most, the largest, in any of the bins
+searched outside the listed groups, uniformly. False peaks of leaked signal lie in their own bins,
+the strongest of them where there are many: by their noise, or against probabilities by the bins'
+own (:mod:`sweep.model.leaked_peaks`). Groups beyond the ``most`` strongest are neither detected nor
+false alarms.
 """
 
 import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -49,6 +55,14 @@ from sweep.model.draws import (
 from sweep.model.estimators import Deviation, resolved_deviation
 from sweep.model.groups import BIN, FIRST, LAST, Groups
 from sweep.model.interpolation import interpolator, spread_error, sub_bin, sub_bin_error
+from sweep.model.leaked_peaks import (
+    LeakedPeaks,
+    draw_leaked,
+    leaked_peaks,
+    leaking_points,
+    list_peak,
+    peaks_in_noise,
+)
 from sweep.model.marcum import at_least_one
 from sweep.model.pairing import (
     ABSENT,
@@ -110,23 +124,36 @@ def draw_returns(
 
     ``method`` is ``probabilities`` or ``noise``; any range of draws can be computed alone.
     """
-    noisy, n = method == "noise", shots.size
+    noisy = method == "noise"
     known, drawn = known_of(shots, found), Drawn.nothing(found, draws)
     one = np.exp(shots.looks.log_alarm(known.levels[:, 1:2]))
-    how = How.of(shots, first_draw, noisy)
-    tables = interpolator(shots.window, shots.fft_size)
-    counted = np.nan_to_num(shots.counted_bins(found.exempted.T).T)
-    nothing = np.arange(n), Seen.nothing(n)._replace(others=counted)
-    for part, seen in seen_spectra(shots) if noisy else [nothing]:
-        some = Known(*(column[part] for column in known))
-        quiet = 1 - at_least_one(one[part], seen.others)
-        alarm = 1 - quiet if noisy else 1 - quiet * (1 - some.alarm)
+    how, tables = How.of(shots, first_draw, noisy), interpolator(shots.window, shots.fft_size)
+    for part, seen, leaks in _spectra(shots, found, noisy):
+        of_part = Known(*(column[part] for column in known))
+        of_part = of_part._replace(alarm=at_least_one(one[part], seen.others))
         own = Drawn(*(column[part] for column in drawn))
-        of_part = how._replace(rule=echo_filter(shots, seen))
-        _draw(keys[part], of_part, some._replace(alarm=alarm), seen, tables, own)
+        rule = how._replace(rule=echo_filter(shots, seen))
+        _draw(keys[part], rule, of_part, seen, leaks, tables, own)
         for column, values in zip(drawn, own, strict=True):
             column[part] = values
     return measured(shots, known, drawn)
+
+
+def _spectra(
+    shots: Shots, found: Groups, noisy: bool
+) -> Iterator[tuple[np.ndarray, Seen, LeakedPeaks]]:
+    """Yield some points at a time, with their spectra and the bins of their leaked signal."""
+    if noisy:
+        for part, seen in seen_spectra(shots):
+            yield part, seen, peaks_in_noise(shots, found, part, seen)
+        return
+    counted = np.nan_to_num(shots.counted_bins(found.exempted.T).T)
+    leaking = leaking_points(shots, found)
+    for part, leaks in leaked_peaks(shots, found, leaking):
+        yield part, Seen.nothing(part.size)._replace(others=counted[part]), leaks
+    quiet = np.setdiff1d(np.arange(shots.size), leaking)
+    nothing = Seen.nothing(quiet.size)._replace(others=counted[quiet])
+    yield quiet, nothing, LeakedPeaks.nothing(quiet.size)
 
 
 class How(NamedTuple):
@@ -189,7 +216,7 @@ class Known(NamedTuple):
     levels: np.ndarray
     """(n, 3): sigma [V]; over it, the threshold and the noise of bins that hold lines."""
     alarm: np.ndarray
-    """(n, 3): probability of a false alarm in bins that are not drawn one by one."""
+    """(n, 3): probability of a false alarm by noise alone."""
     third: np.ndarray
     """(n, 2): as of :func:`sweep.model.pairing.confirm`."""
     beside: np.ndarray
@@ -245,7 +272,8 @@ def known_of(shots: Shots, found: Groups) -> Known:
     square = (weight * apart**2).sum(axis=-1) / total
     return Known(
         bins, found.pd, found.neighbours, np.sqrt(np.maximum(square - mean**2, 0.0)), lines,
-        amplitude, np.stack([shots.bin_deviation, *noise_levels(shots)], axis=1), found.leakage,
+        amplitude, np.stack([shots.bin_deviation, *noise_levels(shots)], axis=1),
+        np.zeros(found.leakage.shape),
         np.stack([np.broadcast_to(part, shots.size) for part in _third(shots)], axis=1),
         np.ascontiguousarray(np.moveaxis(beside, 0, 1)), _searched(shots),
         np.empty((shots.size, 0)) if shots.fading is None else shots.fading.mixing().T.copy(),
@@ -263,14 +291,22 @@ def _third(shots: Shots) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _searched(shots: Shots) -> np.ndarray:
-    """First and last bin searched, as of :class:`Known`: 1..N/2; of a complex record 0..N - 1."""
-    whole = (0, shots.fft_size - 1) if shots.complex_record else (1, shots.fft_size // 2)
+    """First and last bin searched for alarms, as of :class:`Known`.
+
+    Of a complex record 0..N - 1. Of a real one those whose noise is circular, which are all but a
+    few next to DC and Nyquist; 1..N/2 where noise is taken to be so in all.
+    """
+    least, half = shots.searched_from, shots.fft_size // 2
+    last = half - least if shots.real_ends else half
     found = np.empty((shots.size, 3, 2), np.int64)
-    found[:] = whole
+    found[:] = (0, shots.fft_size - 1) if shots.complex_record else (least, last)
     if shots.band is not None:
         first, number = shots.band[:, 0].T, shots.band[:, 1].T
-        found[..., 0] = first if shots.complex_record else np.maximum(first, 1)
-        found[..., 1] = first + number - 1
+        if shots.complex_record:
+            found[..., 0], found[..., 1] = first, first + number - 1
+        else:
+            found[..., 0] = np.maximum(first, least)
+            found[..., 1] = np.minimum(first + number - 1, half - least)
     return found
 
 
@@ -389,20 +425,25 @@ def _fitted(shots: Shots, drawn: Drawn) -> Told:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _draw(keys, how, known, seen, tables, out):
+def _draw(keys, how, known, seen, leaks, tables, out):
     """All draws of all points: peaks of the three segments, and which make returns."""
     n, draws, most = out.flags.shape
     peaks, which = np.zeros((3, most + 1, 4)), np.empty((3, most + 1), np.int64)
     number, pairs = np.empty(3, np.int64), np.empty((most + 1, 4), np.int64)
-    up = np.zeros(most, np.bool_)
+    up, fading = np.zeros(most, np.bool_), np.ones((most, 3))
     for i in range(n):
+        fades = known.mixing.shape[1] > 0 and (how.noisy or leaks.total[i].max() > 0.0)
         for d in range(draws):
             address = keys[i, 0], keys[i, 1], how.first_draw + d
+            if fades:
+                for g in range(most):
+                    fading[g] = fading_factors(address[:2], address[2], g, known.mixing[i])
             for s in range(3):
                 if s != 1 or how.doppler:
                     number[s] = draw_peaks(
-                        address, (i, s), how, known, seen, tables, peaks[s], which[s], up
-                    )
+                        address, (i, s), how, known, seen, leaks, fading, tables, peaks[s],
+                        which[s], up,
+                    )  # fmt: skip
             report((i, d), how, known, (peaks, which, number), pairs, out)
 
 
@@ -441,11 +482,12 @@ def report(at, how, known, found, pairs, out):
 
 
 @njit(cache=True, error_model="numpy")
-def draw_peaks(address, at, how, known, seen, tables, peaks, which, up):
+def draw_peaks(address, at, how, known, seen, leaks, fading, tables, peaks, which, up):
     """Peaks (most + 1, 4) of a segment in a draw and their groups; returns how many there are.
 
-    ``address``: key of the point and number of the draw; ``at``: point and segment; ``up``
-    (most,): whether a group is detected in the up segment, which comes first.
+    ``address`` is the key of the point and the number of the draw, ``at`` point and segment.
+    ``fading`` (most, 3) are factors on the groups' magnitudes, by segment. ``up`` (most,) tells
+    which groups are detected in the up segment, which comes first.
     """
     (a, b, draw), (i, s) = address, at
     sigma, beta, under_lines = known.levels[i]
@@ -454,9 +496,9 @@ def draw_peaks(address, at, how, known, seen, tables, peaks, which, up):
         if bins[BIN, g] < 0:
             break
         if how.noisy and how.beside > 0:
-            there = look_at_all(address, at, g, how, known, seen, tables, peaks[count])
+            there = look_at_all(address, at, g, how, known, seen, fading, tables, peaks[count])
         elif how.noisy:
-            there = look(address, at, g, how, known, seen, tables, peaks[count])
+            there = look(address, at, g, how, known, seen, fading, tables, peaks[count])
         else:
             chance = known.beside[i, 1 if up[g] else 0, g] if s == 2 else known.pd[i, s, g]
             uniform = philox.uniform(a, b, draw, philox.STREAM_DETECTION[s], g)
@@ -468,6 +510,8 @@ def draw_peaks(address, at, how, known, seen, tables, peaks, which, up):
                     chances, levels = (uniform / chance, known.pd[i, s, g]), (beta, under_lines)
                     ratio = faded_ratio(ratio, levels, chances, how.looks, how.apart)
                 error = sub_bin_error(delta, ratio / under_lines, tables) / math.sqrt(how.looks)
+                if not known.mixing.shape[1]:  # with the pedestal that is under the lines
+                    ratio = math.sqrt(ratio * ratio + 2.0 * (under_lines * under_lines - 1.0))
                 normal, _ = philox.normal_pair(a, b, draw, philox.STREAM_NOISE[s], g)
                 fine = bins[BIN, g] + delta + error * normal
                 put(peaks[count], bins[BIN, g], fine, error, ratio, spread, how, tables)
@@ -476,38 +520,61 @@ def draw_peaks(address, at, how, known, seen, tables, peaks, which, up):
         if there:
             which[count] = g
             count += 1
-    place, largest = -1, beta
-    for n in range(seen.stretch[i, s, 0], seen.stretch[i, s, 1]):
-        re, im = philox.normal_pair(a, b, draw, philox.STREAM_NOISE[s], seen.aside[n])
-        ratio = math.hypot(seen.leaked[n] + re, im)
-        if ratio >= largest:
-            place, largest = seen.low[i, s] + seen.aside[n], ratio
+    room = peaks.shape[0] - count
+    false, ratios, number = np.empty(room, np.int64), np.zeros(room), 0
+    if how.noisy:
+        number = list_noisy(address, at, seen, leaks, fading[:, s], beta, false, ratios)
+    else:
+        number = draw_leaked(address, at, leaks, fading, beta, how.looks, false, ratios)
     stream = philox.STREAM_NOISE_MAXIMUM[s] if how.noisy else philox.STREAM_FALSE_ALARM[s]
     words = philox.words4(a, b, draw, stream, philox.FIRST_BLOCK)
     chance = philox.to_uniform(words[0])
     if chance < known.alarm[i, s]:
         ratio = max(largest_of(seen.others[i, s], chance, how.looks), beta)
-        if place < 0 or ratio > largest:
-            ends = known.searched[i, s, 0], known.searched[i, s, 1]
-            place = free_bin(philox.to_uniform(words[1]), bins, ends, 2 * how.half, how.signed)
-            largest = ratio
-    if place >= 0:
-        error = sub_bin_error(0.0, largest, tables) / math.sqrt(how.looks)
-        put(peaks[count], place, place, error, largest, 0.0, how, tables)
+        ends = known.searched[i, s, 0], known.searched[i, s, 1]
+        barred = leaks.barred_bin[leaks.barred_stretch[i, s, 0] : leaks.barred_stretch[i, s, 1]]
+        chance = philox.to_uniform(words[1])
+        place = free_bin(chance, bins, barred, ends, 2 * how.half, how.signed)
+        number = list_peak((place, ratio), false, ratios, number)
+    for n in range(number):
+        error = sub_bin_error(0.0, ratios[n], tables) / math.sqrt(how.looks)
+        put(peaks[count], false[n], false[n], error, ratios[n], 0.0, how, tables)
         which[count] = FALSE
         count += 1
     return count
 
 
 @njit(cache=True, error_model="numpy")
-def look(address, at, g, how, known, seen, tables, peak):
+def list_noisy(address, at, seen, leaks, fading, level, bins, ratios):
+    """List the strongest peaks of bins of leaked signal with their noise; return their number.
+
+    Adjacent bins that cross make one peak, the largest. ``fading`` (most,): factors on the groups'
+    magnitudes. Results are bins, and |X| / sigma.
+    """
+    (a, b, draw), (i, s) = address, at
+    number, before, peak, largest = 0, np.int64(-2), np.int64(-1), 0.0
+    for n in range(seen.stretch[i, s, 0], seen.stretch[i, s, 1]):
+        re, im = philox.normal_pair(a, b, draw, philox.STREAM_NOISE[s], seen.aside[n])
+        ratio = math.hypot(seen.leaked[n] * fading[leaks.echo[n]] + re, im)
+        if ratio < level:
+            continue
+        place = seen.low[i, s] + seen.aside[n]
+        if place != before + 1:
+            number = list_peak((peak, largest), bins, ratios, number)
+            peak, largest = np.int64(-1), 0.0
+        before = place
+        if ratio > largest:
+            peak, largest = place, ratio
+    return list_peak((peak, largest), bins, ratios, number)
+
+
+@njit(cache=True, error_model="numpy")
+def look(address, at, g, how, known, seen, fading, tables, peak):
     """Look at a group's strongest bin with its noise: True, and its peak, where it crosses."""
     (a, b, draw), (i, s) = address, at
     sigma, beta, under_lines = known.levels[i]
     centre, stream = known.bins[i, s, BIN, g], philox.STREAM_NOISE[s]
-    m = known.magnitude[i, s, g] / sigma
-    if known.mixing.shape[1]:
-        m = m * fading_factors((a, b), draw, g, known.mixing[i])[s]
+    m = known.magnitude[i, s, g] / sigma * fading[g, s]
     k = centre - seen.low[i, s]
     re, im = philox.normal_pair(a, b, draw, stream, k)
     if is_end(centre, how.ends):
@@ -537,7 +604,7 @@ def look(address, at, g, how, known, seen, tables, peak):
 
 
 @njit(cache=True, error_model="numpy")
-def look_at_all(address, at, g, how, known, seen, tables, peak):
+def look_at_all(address, at, g, how, known, seen, fading, tables, peak):
     """Look at all bins of a group's echo with their noise: True, and its peak, where any crosses.
 
     The peak is the largest of them.
@@ -549,9 +616,7 @@ def look_at_all(address, at, g, how, known, seen, tables, peak):
     first, last = known.bins[i, s, FIRST, g] - low, known.bins[i, s, LAST, g] - low
     first, last = echo_of(run, first, last, beta, how.beside)
     count, best = last - first + 1, 0
-    factor, room = 1.0, np.empty((4, count + how.rule[0].shape[1]))
-    if known.mixing.shape[1]:
-        factor = fading_factors((a, b), draw, g, known.mixing[i])[s]
+    factor, room = fading[g, s], np.empty((4, count + how.rule[0].shape[1]))
     numbers = ECHO * (1 + g)
     draw_noise((a, b, draw, philox.STREAM_NOISE[s]), numbers, low + first, count, how.rule, room)
     for k in range(count):
@@ -589,8 +654,8 @@ def put(peak, whole, fine, error, ratio, spread, how, tables):
 
 
 @njit(cache=True, error_model="numpy")
-def free_bin(chance, bins, ends, size, signed):
-    """Bin outside the groups and their neighbours, uniformly with a given probability.
+def free_bin(chance, bins, barred, ends, size, signed):
+    """Bin outside the groups, their neighbours and ``barred`` bins, uniformly with a probability.
 
     One of those from the first to the last of ``ends``; of a complex record, of N = ``size`` bins,
     as far round as they go on.
@@ -611,8 +676,25 @@ def free_bin(chance, bins, ends, size, signed):
         spans[g, 0] = max(spans[g, 0] - 1, end)
         end = max(min(spans[g, 1] + 2, last + 1), spans[g, 0])
         spans[g, 1], free = end, free - (end - spans[g, 0])
-    place = first + int(chance * free)
-    for g in range(number):
-        if place >= spans[g, 0]:
-            place += spans[g, 1] - spans[g, 0]
+    outside = np.empty(barred.size, np.int64)  # barred bins that are searched, and in no group
+    count = 0
+    for k in range(barred.size):
+        place = first + (barred[k] - first) % size if signed else barred[k]
+        inside = place < first or place > last
+        for g in range(number):
+            inside |= spans[g, 0] <= place < spans[g, 1]
+        if not inside:
+            outside[count] = place
+            count += 1
+    rank = int(chance * max(free - count, 1))
+    before, place = -1, first + rank
+    passed = 0
+    while passed != before:  # as many barred bins below it are passed over
+        before, place = passed, first + rank + passed
+        for g in range(number):
+            if place >= spans[g, 0]:
+                place += spans[g, 1] - spans[g, 0]
+        passed = 0
+        for k in range(count):
+            passed += outside[k] <= place
     return min(place, last)

@@ -129,7 +129,7 @@ def find(shots: Shots, *, every_bin: bool = False) -> np.ndarray:
     width = (shots.sample_rate / shots.fft_size) + np.zeros(shots.size)
     for runs in runs_of(shots, every_bin=every_bin, keep=False):
         for s in np.flatnonzero(shots.segments):
-            frequency = _bin(shots, runs.low[s] + runs.peak[s]) * width[runs.part]
+            frequency = shots.signed_bin(runs.low[s] + runs.peak[s]) * width[runs.part]
             found[s][:, runs.part] = (
                 runs.pd[s], runs.miss[s], runs.magnitude[s],
                 np.where(runs.inside[s], frequency, np.nan), runs.exempted[s], runs.leakage[s],
@@ -192,7 +192,9 @@ def _of_looks(shots: Shots, runs: Runs, leakage: bool) -> Runs:
 def spectrum(shots: Shots, i: int, segment: int, *, level: float = 0.0) -> tuple:
     """Bins of a segment in which the echo stands above a level, and |X| there, without noise.
 
-    Bins below the level [V, summed over the record] may be left out; 0 gives all.
+    Bins rise from one to the next. Those of a complex record go on past Nyquist:
+    :meth:`sweep.model.preparation.Shots.signed_bin` tells their frequencies. Bins below the level
+    [V, summed over the record] may be left out; 0 gives all.
     """
     shots = replace(shots, leak_amplitude=None)
     (runs,) = runs_of(
@@ -203,12 +205,15 @@ def spectrum(shots: Shots, i: int, segment: int, *, level: float = 0.0) -> tuple
     return np.arange(low, low + magnitude.size), magnitude
 
 
-def _bin(shots: Shots, number: np.ndarray) -> np.ndarray:
-    """Bins by their frequency: of complex records -N/2 .. N/2."""
-    if not shots.complex_record:
-        return number
-    half = shots.fft_size // 2
-    return (number + half) % shots.fft_size - half
+def whole_spectrum(shots: Shots, i: int, segment: int) -> np.ndarray:
+    """|X| of all bins of a segment without noise [V], (bins,), in the order of their frequencies.
+
+    Bins are those of :attr:`sweep.model.preparation.Shots.signed_bins`.
+    """
+    bins, magnitude = spectrum(shots, i, segment)
+    found = np.zeros(shots.bins)
+    found[shots.index_of_bin(bins)] = magnitude
+    return found
 
 
 def view(shots: Shots) -> int:

@@ -117,7 +117,7 @@ def statistics(shots: Shots, found: np.ndarray | None = None) -> dict[str, np.nd
     """
     found = find(shots) if found is None else found
     pd, miss, magnitude, _, exempted, leakage = np.moveaxis(found, 1, 0)
-    snr = (magnitude / shots.bin_deviation) ** 2 / 2
+    snr = shots.snr(magnitude)
     alarms = _false_alarms(shots, exempted)
     reported = report(shots, found)
     pd_shot, miss_shot = chances(shots, pd, miss, magnitude)

@@ -29,6 +29,7 @@ from sweep.model.looks import COMBINE, NUMBER, VOTES, Looks
 from sweep.model.shot import prepare
 from sweep.model.threshold import WAYS, tnr_of
 from sweep.report.page import Table
+from sweep.units import percent
 
 MOST_PARTS = 6
 """Values that a chart offers to choose from, at the most."""
@@ -226,7 +227,7 @@ def budget_panel(
 
 def budget_chart(panels: Sequence[Panel], caption: Sequence[str]) -> Chart:
     """Shares of sources of noise, a panel at a time."""
-    told = ", ".join(f"{line.name} {line.y[0]:.3g} % at first" for line in panels[0].lines)
+    told = ", ".join(f"{line.name} {percent(line.y[0] / 100)} at first" for line in panels[0].lines)
     alt = f"Shares of noise sources in the noise variance at the ADC. {told}."
     return Chart("Noise by source", alt, caption, panels, {"part": "Shown for"})
 

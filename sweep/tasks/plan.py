@@ -274,11 +274,16 @@ MOST_TILES = 1024
 #: Tiles of a flight that are looked at, of each scanner, and places along its axes.
 FLIGHT_TILES, FLIGHT_PLACES = 16, 12
 
-#: Tiles on which an effect's cost is measured, points of each, draws of a point, and rounds, of
-#: which the best counts; in flights scanners and places along the axes, and shots of each.
-COST_TILES, COST_POINTS, COST_DRAWS, ROUNDS, COST_LOOKS = 4, 24, 20, 3, 3
+#: Tiles on which an effect's cost is measured, points of each, and draws of a point; in flights
+#: scanners and places along the axes, and shots of each. Rounds: of short work, and of long.
+COST_TILES, COST_POINTS, COST_DRAWS, COST_LOOKS = 4, 24, 20, 3
+ROUNDS, LEAST_ROUNDS = 5, 3
 
-#: Time [s] after which an effect's cost is known well enough from one round, point or tile less.
+#: Spread of an effect's cost over the rounds, relative to it, up to which the cost is known. It is
+#: about twice the error of the median.
+REPRODUCIBLE = 0.1
+
+#: Time [s] of a round of measuring an effect's cost that is long enough.
 COST_SECONDS = 0.1
 
 
@@ -292,7 +297,7 @@ class EffectRow:
     where: str  # the part of the study that holds these
     bound: float  # largest change that it may make anywhere: of pd, log10 pfa or a magnitude
     at: str  # where that is
-    cost: float  # share of a point's time that it takes where it is simulated; nan where it is not
+    cost: float  # share of a point's time that it takes where it is simulated; nan: not known
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -466,44 +471,62 @@ def _sampling(spec: Spec, selection: EffectSelection) -> Callable[[int], _Sample
     return sample
 
 
-def _fastest(measure: Callable[[], float]) -> float:
-    """Time [s], the least of rounds: the first may load what is compiled."""
-    found, begun = math.inf, time.process_time()
-    for number in range(ROUNDS):
-        found = min(found, measure())
-        if number and time.process_time() - begun > COST_SECONDS:
-            break
-    return found
-
-
 def _seconds_of(
     spec: Spec, parameters: Mapping[str, Value], number: int, effects: Collection[str]
 ) -> float:
     """Time of some points [s] with some effects."""
-    return _fastest(lambda: sum(timed(spec, parameters, number, effects, most_draws=COST_DRAWS)))
+    return sum(timed(spec, parameters, number, effects, most_draws=COST_DRAWS))
+
+
+Clock = Callable[[], float]
+"""Measure some work once: its time [s]."""
 
 
 def _cost(spec: Spec, sample: Callable[[int], _Sample], tiles: np.ndarray, name: str) -> float:
     """Share of the time of points that an effect takes, from points with it and without."""
 
-    def measured(tile: int) -> tuple[float, float]:
+    def clocks(tile: int) -> tuple[Clock, Clock]:
         parameters, number, effects = sample(tile)
         without = tuple(n for n in effects if n != name)
-        with_it = _seconds_of(spec, parameters, number, effects)
-        return with_it, _seconds_of(spec, parameters, number, without)
+        return (
+            lambda: _seconds_of(spec, parameters, number, effects),
+            lambda: _seconds_of(spec, parameters, number, without),
+        )
 
-    return _share(map(measured, _spread(tiles.tolist(), COST_TILES)))
+    return reproducible_share(map(clocks, _spread(tiles.tolist(), COST_TILES)))
 
 
-def _share(times: Iterable[tuple[float, float]]) -> float:
-    """Share of the time that an effect takes, from times with it and without, few if these tell."""
-    spent = total = 0.0
-    for with_it, without in times:
-        spent += max(with_it - without, 0.0)
-        total += with_it
+def reproducible_share(clocks: Iterable[tuple[Clock, Clock]]) -> float:
+    """Share of the time that an effect takes; nan where rounds of measuring disagree on it.
+
+    Parameters
+    ----------
+    clocks
+        Clocks of the same work with the effect and without. As many are read as take
+        :data:`COST_SECONDS` together.
+
+    Returns
+    -------
+    float
+        Median over rounds, each of which takes one reading with the effect and one without by
+        turns. nan if the rounds differ by more than :data:`REPRODUCIBLE` of it.
+    """
+    measured, total = [], 0.0
+    for with_it, without in clocks:
+        without()  # loads what is compiled
+        total += with_it()
+        measured.append((with_it, without))
         if total > COST_SECONDS:
             break
-    return spent / total if total else math.nan
+    shares, begun = [], time.process_time()
+    for number in range(ROUNDS):
+        if number >= LEAST_ROUNDS and time.process_time() - begun > ROUNDS * COST_SECONDS:
+            break
+        times = np.array([(with_it(), without()) for with_it, without in measured])
+        whole, rest = times.sum(axis=0) if measured else (0.0, 0.0)
+        shares.append((whole - rest) / whole if whole > 0 else math.nan)
+    middle = float(np.median(shares))
+    return middle if np.ptp(shares) <= REPRODUCIBLE * middle else math.nan
 
 
 class _Look(NamedTuple):
@@ -543,18 +566,20 @@ def _flight_cost(study: FlightStudy, looks: Sequence[_Look], name: str) -> float
     """Share of the time of shots that an effect takes, from cycles with it and without."""
     nothing, flag = np.uint32(0), np.uint32(1 << NAMES.index(name))
 
-    def measured(look: _Look) -> tuple[float, float]:
+    def clocks(look: _Look) -> tuple[Clock, Clock]:
         each = study.scanners[look.part.scanner].shots_a_cycle
         having = np.flatnonzero((look.selected.flags & flag).reshape(-1, each).any(axis=1))
         for number in (1, -(-COST_POINTS // each)):
             cycles = np.array(_spread(having, number))
-            with_it = _seconds(study, look, cycles, less=nothing)
-            if with_it > COST_SECONDS / 2:  # so few tell enough
+            if _seconds(study, look, cycles, less=nothing) > COST_SECONDS / 2:  # so few tell enough
                 break
-        return with_it, _seconds(study, look, cycles, less=flag)
+        return (
+            lambda: _seconds(study, look, cycles, less=nothing),
+            lambda: _seconds(study, look, cycles, less=flag),
+        )
 
     there = [look for look in looks if (look.selected.flags & flag).any()]
-    return _share(map(measured, _spread(there, COST_LOOKS)))
+    return reproducible_share(map(clocks, _spread(there, COST_LOOKS)))
 
 
 def _spread(items: Sequence[Any] | np.ndarray, most: int) -> list[Any]:
@@ -568,12 +593,9 @@ def _seconds(study: FlightStudy, look: _Look, cycles: np.ndarray, *, less: np.ui
     each = study.scanners[look.part.scanner].shots_a_cycle
     some = look.some((cycles[:, None] * each + np.arange(each)).ravel(), less=less)
 
-    def once() -> float:
-        begun = time.process_time()
-        study.look(*some)
-        return time.process_time() - begun
-
-    return _fastest(once)
+    begun = time.process_time()
+    study.look(*some)
+    return time.process_time() - begun
 
 
 def _numbers(selection: EffectSelection, tile: int, most: int | None = None) -> np.ndarray:

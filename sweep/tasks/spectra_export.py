@@ -96,8 +96,6 @@ def _dataset(
 ) -> xr.Dataset:
     import xarray as xr
 
-    from sweep.model.noisy_spectra import index_of_zero
-
     width = float(shots.sample_rate[0]) / shots.fft_size
     there = [name for name, is_there in zip(SEGMENTS, shots.segments, strict=True) if is_there]
     of_signal = ("draw", "segment") if len(found) > 1 else ("segment",)
@@ -123,7 +121,7 @@ def _dataset(
         "radial_velocity": ((), float(shots.radial_velocity[-1])),
         "draw": (("draw",), numbers),
         "segment": (("segment",), np.array(there, dtype=object)),
-        "frequency": (("frequency",), (np.arange(shots.bins) - index_of_zero(shots)) * width),
+        "frequency": (("frequency",), shots.signed_bins * width),
     }
     variables = {
         name: (dims, values, dict(zip(("units", "long_name"), TOLD[name], strict=True)))

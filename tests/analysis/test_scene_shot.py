@@ -104,6 +104,18 @@ def test_views_reach_over_all_detections_but_not_to_those_far_away():
     signal = np.full(4000, 1e-9)
     signal[1000] = 1.0
     groups = tuple(Group(k, k, k) for k in (950, 1000, 1140, 3900))
-    segment = Segment("up-chirp", 1, np.arange(4000.0), signal, signal, 0.0, 0.0, groups, 1.0, 1.0)
+    segment = Segment(
+        "up-chirp",
+        1,
+        np.arange(4000),
+        np.arange(4000.0),
+        signal,
+        signal,
+        0.0,
+        0.0,
+        groups,
+        1.0,
+        1.0,
+    )
     view = shot_figure.around_detections(segment)
     assert 900 < view.start < 950 and 1140 < view.stop < 1200

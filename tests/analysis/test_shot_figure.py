@@ -73,6 +73,33 @@ def test_peaks_stand_where_the_beats_are_and_as_high_as_the_statistics_say(one):
     assert up.snr == pytest.approx(one.outputs["snr_up"], rel=1e-12)
 
 
+@pytest.mark.parametrize("velocity", [32.0, -32.0])
+def test_bins_of_complex_records_have_the_signs_and_the_places_of_their_frequencies(
+    velocity,
+):
+    """Beats by hand: f_d = 2 v / lambda and f_r = (B/T) 2R/c, folded into -fs/2 .. fs/2."""
+    parameters = study({}).parameters() | {
+        "instrument.receiver.record": "complex", "instrument.processing.fft_size": 2**14,
+        "instrument.processing.bins_counted": "half", "target.range": 6000.0, 
+        "target.radial_velocity": velocity, "instrument.laser.power": 100.0,
+    }  # fmt: skip
+    shot = shot_figure.simulated(parameters)
+    width, half = 600e6 / 2**14, 2**13
+    doppler, far = 2 * velocity / 1550e-9, 2e12 * 2 * 6000.0 / 299792458.0
+    for segment, beat in zip(shot.segments, (doppler - far, doppler, doppler + far), strict=True):
+        expected = (beat / width + half) % 2**14 - half
+        own = segment.bins[segment.peak]
+        assert own == pytest.approx(expected, abs=3)
+        assert segment.frequency[segment.peak] == own * width
+        assert segment.bins[0] == -half and segment.bins[-1] == half - 1
+        assert segment.bins[[g.peak for g in segment.groups]].tolist() == [own]
+    rows = shot_figure._segments(shot).rows
+    assert [row[3] for row in rows] == [s.bins[s.peak] for s in shot.segments]
+    assert [float(row[2]) for row in rows] == pytest.approx(
+        [row[3] * width / 1e6 for row in rows], abs=1e-6
+    )
+
+
 def test_drawn_noise_has_the_noise_level_and_crosses_the_threshold_as_rarely_as_it_should():
     parameters = study({}).parameters() | {
         "instrument.processing.tnr": 4.0,

@@ -162,6 +162,9 @@ def test_draws_and_points_keep_to_the_band(method, record, table_4_1):
         assert band[0][i] - 10 < far.min() and far.max() < band[1][i] + 10
 
 
+NONE = np.empty(0, np.int64)
+
+
 @pytest.mark.parametrize("signed", [False, True])
 def test_false_peaks_fall_on_every_free_bin_of_the_band_alike(signed):
     bins = np.full((3, 2), -1)
@@ -171,5 +174,5 @@ def test_false_peaks_fall_on_every_free_bin_of_the_band_alike(signed):
     chances = (np.arange(100 * len(expected)) + 0.5) / (100 * len(expected))
     if signed:
         bins[:, 0] += 2 * 512  # runs of complex records count from further on
-    found = [free_bin(u, bins, (first, last), 512, signed) for u in chances]
+    found = [free_bin(u, bins, NONE, (first, last), 512, signed) for u in chances]
     assert found == np.repeat(expected, 100).tolist()

@@ -48,7 +48,7 @@ from sweep.model.window import Window, samples
 
 MASKED_FROM = 0.5
 """Share of the threshold from which on a bin's line has it masked: less raises few alarms."""
-_PHASES = 16
+PHASES = 16
 """Phases of the line over which alarms are averaged."""
 
 PATH, ISOLATION = TELESCOPE + "leak_path", TELESCOPE + "isolation"
@@ -155,12 +155,34 @@ def alarm(looks: Looks, line: Line, bins: np.ndarray, *, scale: float, level: fl
     ``scale`` and ``level`` are half of the line's amplitude and the threshold, over the noise.
     """
     one, other = scale * line.terms[:, bins]
-    phases = np.pi * (np.arange(_PHASES) + 0.5) / _PHASES  # its magnitude has this period
+    phases = np.pi * (np.arange(PHASES) + 0.5) / PHASES  # its magnitude has this period
     quiet = [
         np.log1p(-np.minimum(looks.excess(np.abs(one * t + other * t.conjugate()), level), 1.0))
         for t in np.exp(1j * phases)
     ]
     return float(-np.expm1(np.sum(quiet, axis=1)).mean())
+
+
+def bins_of_line(
+    shots: Shots, i: int, line: Line, *, scale: float, echo: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Tell which bins of a segment of point i a line masks, and in which it raises alarms.
+
+    ``scale`` is half of the line's amplitude [V], ``echo`` the bins of the echo. Results are bool,
+    (bins,): bins that are masked; bins that are searched for alarms, masked or not; bins in which
+    the line may raise one.
+    """
+    deviation, level, floor = (
+        float(np.broadcast_to(v, shots.size)[i])
+        for v in (shots.bin_deviation, shots.threshold, shots.floor)
+    )
+    most = scale * line.most
+    masked, searched = most >= MASKED_FROM * level, np.ones(line.most.size, bool)
+    if not shots.complex_record:
+        first = shots.searched_from
+        searched[:first] = searched[searched.size - first :] = False
+    searched[echo % shots.fft_size if shots.complex_record else echo] = False
+    return masked, searched, searched & ~masked & (most >= floor * deviation)
 
 
 def raised(
@@ -190,17 +212,20 @@ def beside_leak(shots: Shots, runs: Any) -> Any:
     pd, miss, exempted, leakage = (
         v.copy() for v in (runs.pd, runs.miss, runs.exempted, runs.leakage)
     )
-    deviation, under, level, floor = (
+    deviation, under, level = (
         np.broadcast_to(v, shots.size)[runs.part]
-        for v in (shots.bin_deviation, shots.line_deviation, shots.threshold, shots.floor)
+        for v in (shots.bin_deviation, shots.line_deviation, shots.threshold)
     )
-    first, size, rule = shots.searched_from, shots.fft_size, shots.echo_rule
+    size, rule = shots.fft_size, shots.echo_rule
     for s, i in np.argwhere(runs.bins > 0):
         stretch = slice(runs.start[s, i], runs.start[s, i] + runs.bins[s, i])
         at = runs.low[s, i] + np.arange(runs.bins[s, i])
         at = at % size if shots.complex_record else at
         (scale, line), peak = line_of(shots, int(runs.part[i]), s), runs.peak[s, i]
-        masked, echo = scale * line.most >= MASKED_FROM * level[i], runs.exempt[stretch]
+        echo = runs.exempt[stretch]
+        masked, searched, alarms = bins_of_line(
+            shots, int(runs.part[i]), line, scale=scale, echo=at[echo]
+        )
         echoes = float(
             at[peak] / size * np.broadcast_to(shots.sample_rate, shots.size)[runs.part[i]]
         )
@@ -218,13 +243,8 @@ def beside_leak(shots: Shots, runs: Any) -> Any:
             pd[s, i], miss[s, i] = found_pair(
                 seen, echo, peak, runs.low[s, i], rule, (under[i], level[i])
             )
-        searched = np.ones(masked.size, bool)
-        if not shots.complex_record:
-            searched[:first] = searched[masked.size - first :] = False
-        searched[at[echo]] = False
         exempted[s, i] += np.count_nonzero(masked & searched)
         if shots.waveform[s].leaks:
-            alarms = searched & ~masked & (scale * line.most >= floor[i] * deviation[i])
             chance = alarm(
                 shots.looks, line, np.flatnonzero(alarms), scale=scale / deviation[i],
                 level=level[i] / deviation[i],

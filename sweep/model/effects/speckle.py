@@ -29,7 +29,9 @@ bins as two correlated ones do, with the correlation
 
 over the beam's power, which is what Doppler shifts that differ by 1/dt or more destroy. It is in
 closed form, as beamlets that are enough for the power of a bin may be too few for it. It acts on
-the detection; leaked signal keeps its mean power.
+the detection. In the closed form of a segment's leakage the echo keeps its mean power; where false
+peaks are drawn, and in the probabilities of a flight, its leaked signal fades with it
+(:mod:`sweep.model.leaked_peaks`).
 """
 
 import math

@@ -1,0 +1,424 @@
+"""False peaks that leaked signal raises: in which bins, how often, and how large.
+
+Each bin of a segment outside the echoes raises a false peak for two reasons, which are drawn apart.
+Noise alone does so in all bins searched alike. Leaked signal of amplitude a (over the noise per
+quadrature sigma) raises bin k in further draws, with the probability that it adds to noise,
+
+    c_k(z) = (Q_1(a_k, z) - e^(-z^2 / 2)) / (1 - e^(-z^2 / 2)),
+
+at the threshold z = b. The two together leave the bin below any level z with the probability
+
+    (1 - e^(-z^2 / 2)) (1 - c_k(z)) = 1 - Q_1(a_k, z)
+
+that Rice's law has for signal and noise. So a bin is found at its own place and as large as in
+drawn noise, and the probability of leakage of a segment is 1 - prod (1 - c_k(b)).
+
+Bins are independent. With the rates r_k = -ln(1 - c_k), the first bin in which a peak is raised is
+the one where the sum of rates exceeds a number from the exponential distribution. The search goes
+on from the next bin with another such number.
+
+An echo in developed speckle fades as a whole, and its leaked signal with it. A bin fades with the
+echo whose strongest bin is nearest. The probability of leakage is then the mean over speckle.
+
+A line of leaked light (:mod:`sweep.model.effects.circulator_leak`) raises peaks in its own bins, by
+the magnitudes that it has there at one of some phases.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from sweep.kernels import njit
+from sweep.model import philox
+from sweep.model.draws import Seen, seen_spectra
+from sweep.model.effects.circulator_leak import PHASES, bins_of_line, line_of
+from sweep.model.groups import Groups
+from sweep.model.looks import Looks
+from sweep.model.marcum import excess_crossing, marcum_q1_pair
+from sweep.model.preparation import Shots
+
+RATES = 1024
+"""Amplitudes at which the rates of a point are known."""
+
+SURE = 12.0
+"""Amplitude above the threshold [sigma] from where on a bin surely crosses it."""
+
+FAINTEST = 1e-2
+"""Amplitude [sigma] at which tables begin: below, rates go by its square."""
+
+SELDOM = 1e-9
+"""Probability of leakage in a segment below which none is drawn."""
+
+LINE = 1 << 24
+"""Numbers of the random numbers of the line, from which they count apart from the echoes'."""
+
+POINTS_WITH_LINE = 4
+"""Points whose bins of a line of leaked light are held at a time: a hundred million numbers."""
+
+HALVINGS = 40
+"""Steps by which the magnitude of a raised peak is found, to 1e-11 of it."""
+
+_PANELS = np.array([0.0, 0.125, 0.25, 0.5, 1.0, 2.0, 3.0, 4.5, 6.5, 9.0, 12.0, 16.0, 21.0, 28.0])
+_NODE, _WEIGHT = np.polynomial.legendre.leggauss(8)
+SPECKLE_POWER = (_PANELS[:-1, None] + np.diff(_PANELS)[:, None] * 0.5 * (_NODE + 1)).ravel()
+"""Powers of speckle, of mean 1, over which probabilities are averaged."""
+SPECKLE_WEIGHT = (np.diff(_PANELS)[:, None] * 0.5 * _WEIGHT).ravel() * np.exp(-SPECKLE_POWER)
+
+CLASS_WIDTH = 0.02
+"""Width of the classes of amplitudes, in logarithms, that are averaged over speckle together."""
+
+
+class LeakedPeaks(NamedTuple):
+    """Bins of some points in which signal may raise false peaks, by point and segment (m, 3)."""
+
+    stretch: np.ndarray
+    """(m, 3, 2) int64: first of a segment's bins of leaked echo in the next three, and the end."""
+    bin: np.ndarray
+    """int64, numbered as :attr:`sweep.model.groups.Groups.bin`."""
+    amplitude: np.ndarray
+    """ln(|X| / sigma)"""
+    echo: np.ndarray
+    """int64: the group with which the bin fades."""
+    total: np.ndarray
+    """(m, 3): sum of the rates of these bins without fading."""
+    line_stretch: np.ndarray
+    """(m, 3, 2) int64: likewise of the bins of a line of leaked light."""
+    line_bin: np.ndarray
+    line_amplitude: np.ndarray
+    """(PHASES, bins)"""
+    line_total: np.ndarray
+    """(m, 3): largest sum of the rates of these bins, at any of the phases."""
+    barred_stretch: np.ndarray
+    """(m, 3, 2) int64: likewise of the bins in which noise alone raises no peak."""
+    barred_bin: np.ndarray
+    """int64"""
+    rates: np.ndarray
+    """(m, RATES): logarithms of the rates, at equal steps of the amplitude's logarithm."""
+    scale: np.ndarray
+    """(m, 2): logarithm of the first of these amplitudes, and the step."""
+
+    @classmethod
+    def nothing(cls, points: int) -> "LeakedPeaks":
+        """No leaked signal."""
+        none, bins, sums = np.zeros((points, 3, 2), np.int64), np.empty(0, np.int64), (points, 3)
+        return cls(
+            none, bins, np.empty(0), bins, np.zeros(sums), none, bins, np.empty((PHASES, 0)),
+            np.zeros(sums), none, bins, np.zeros((points, 1)), np.zeros((points, 2)),
+        )  # fmt: skip
+
+    def mean_leakage(self) -> np.ndarray:
+        """Probability of leakage, the mean over developed speckle and over the line's phase.
+
+        Returns
+        -------
+        numpy.ndarray
+            (m, 3), by point and segment.
+        """
+        found = np.empty(self.total.shape)
+        _average(self, SPECKLE_POWER, SPECKLE_WEIGHT, found)
+        return found
+
+
+def leaking_points(shots: Shots, found: Groups) -> np.ndarray:
+    """Points whose groups leak so much that false peaks of leaked signal are drawn, int64."""
+    return np.flatnonzero((found.leakage > SELDOM).any(axis=1))
+
+
+def echo_of_bins(shots: Shots, found: Groups, part: np.ndarray, seen: Seen) -> np.ndarray:
+    """Group with which each bin of leaked signal fades: the one of the nearest strongest bin."""
+    bins, point, segment = _leaked_bins(seen)
+    groups = found.bin[part[point], segment]
+    apart = np.abs(bins[:, None] - groups)
+    if shots.complex_record:
+        apart = np.minimum(apart % shots.fft_size, -apart % shots.fft_size)
+    return np.where(groups < 0, np.iinfo(np.int64).max, apart).argmin(axis=1)
+
+
+def peaks_in_noise(shots: Shots, found: Groups, part: np.ndarray, seen: Seen) -> LeakedPeaks:
+    """Bins whose noise is drawn together with their signal: noise alone raises no peak there."""
+    return LeakedPeaks.nothing(part.size)._replace(
+        echo=echo_of_bins(shots, found, part, seen),
+        barred_stretch=seen.stretch,
+        barred_bin=_leaked_bins(seen)[0],
+    )
+
+
+def leaked_peaks(
+    shots: Shots, found: Groups, points: np.ndarray
+) -> Iterator[tuple[np.ndarray, LeakedPeaks]]:
+    """Yield some points at a time of ``points``, and the bins of their leaked signal."""
+    echoes_alone = replace(shots, leak_amplitude=None)
+    step = max(points.size, 1) if shots.leak_amplitude is None else POINTS_WITH_LINE
+    for first in range(0, points.size, step):
+        for part, seen in seen_spectra(echoes_alone, points[first : first + step]):
+            echo = echo_of_bins(shots, found, part, seen)
+            leaks = LeakedPeaks.nothing(part.size)
+            if shots.leak_amplitude is not None:
+                seen, echo, leaks = _with_line(shots, part, seen, echo)
+            level, floor = (
+                np.broadcast_to(v, shots.size)[part]
+                for v in (shots.threshold / shots.bin_deviation, shots.floor)
+            )
+            rates, scale = _rates(shots.looks, level, floor)
+            leaks = leaks._replace(
+                stretch=seen.stretch, bin=_leaked_bins(seen)[0],
+                amplitude=np.empty(seen.aside.size), echo=echo, rates=rates, scale=scale,
+            )  # fmt: skip
+            _sum_rates(seen.leaked, leaks)
+            yield part, leaks
+
+
+def _leaked_bins(seen: Seen) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the number of each bin of leaked signal, its point, and its segment."""
+    number = np.diff(seen.stretch.reshape(-1, 2)).ravel()
+    run = np.repeat(np.arange(number.size), number)
+    return seen.low.ravel()[run] + seen.aside, run // 3, run % 3
+
+
+def _with_line(
+    shots: Shots, part: np.ndarray, seen: Seen, echo: np.ndarray
+) -> tuple[Seen, np.ndarray, LeakedPeaks]:
+    """Return spectra without the bins that a line of leaked light masks, and the line's peaks.
+
+    ``echo`` is :func:`echo_of_bins`, and is returned for the bins that are left.
+    """
+    kept = np.ones(seen.aside.size, bool)
+    stretches = np.zeros((3, part.size, 3, 2), np.int64)  # of leaked, raised and masked bins
+    raised, hidden, amplitudes = [], [], [np.empty((PHASES, 0))]
+    turns = np.exp(1j * np.pi * (np.arange(PHASES) + 0.5) / PHASES)[:, None]
+    ends = np.zeros(3, np.int64)
+    for j, i in enumerate(part.tolist()):
+        deviation = float(np.broadcast_to(shots.bin_deviation, shots.size)[i])
+        for s in range(3):
+            stretches[:, j, s] = ends[:, None]
+            if not shots.segments[s]:
+                continue
+            scale, line = line_of(shots, i, s)
+            start, low = seen.start[j, s], seen.low[j, s]
+            own = low + np.flatnonzero(seen.echo[start : start + seen.bins[j, s]])
+            masked, _, raising = bins_of_line(shots, i, line, scale=scale, echo=own)
+            leaked = slice(*seen.stretch[j, s])
+            places = low + seen.aside[leaked]
+            kept[leaked] = ~masked[places % shots.fft_size if shots.complex_record else places]
+            raised.append(np.flatnonzero(raising))
+            hidden.append(np.flatnonzero(masked))
+            one, other = (scale / deviation) * line.terms[:, raised[-1]]
+            amplitudes.append(np.abs(one * turns + other * turns.conj()))
+            ends += np.array([kept[leaked].sum(), raised[-1].size, hidden[-1].size])
+            stretches[:, j, s, 1] = ends
+    none = np.empty(0, np.int64)
+    return (
+        seen._replace(stretch=stretches[0], aside=seen.aside[kept], leaked=seen.leaked[kept]),
+        echo[kept],
+        LeakedPeaks.nothing(part.size)._replace(
+            line_stretch=stretches[1], line_bin=np.concatenate([none, *raised]),
+            line_amplitude=np.concatenate(amplitudes, axis=1),
+            barred_stretch=stretches[2], barred_bin=np.concatenate([none, *hidden]),
+        ),
+    )  # fmt: skip
+
+
+def _rates(looks: Looks, level: np.ndarray, floor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return :attr:`LeakedPeaks.rates` and ``scale`` of points, by threshold and floor [sigma]."""
+    rates, scale = np.empty((level.size, RATES)), np.empty((level.size, 2))
+    _fill_rates(level, np.maximum(floor, FAINTEST), rates, scale)
+    if looks.several:
+        for j in range(level.size):
+            amplitude = np.exp(scale[j, 0] + scale[j, 1] * np.arange(RATES))
+            added = np.minimum(looks.excess(amplitude, float(level[j])), 1 - 1e-16)
+            rates[j] = np.log(np.maximum(-np.log1p(-added), 1e-300))
+    return rates, scale
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fill_rates(level, floor, rates, scale):
+    """Fill in the rates of one record at the amplitudes of each point."""
+    for j in range(level.size):
+        b = level[j]
+        scale[j, 0] = math.log(min(floor[j], b + 1.0))
+        scale[j, 1] = (math.log(b + SURE) - scale[j, 0]) / (RATES - 1)
+        stays = -math.expm1(-0.5 * b * b)
+        for k in range(RATES):
+            a, rate = math.exp(scale[j, 0] + scale[j, 1] * k), 0.0
+            if stays > 0.0 and a < b:
+                rate = -math.log1p(-excess_crossing(a, b) / stays)
+            elif stays > 0.0:
+                rate = -math.log(max(marcum_q1_pair(a, b)[1], 1e-300) / stays)
+            rates[j, k] = math.log(max(rate, 1e-300))
+
+
+@njit(cache=True, error_model="numpy")
+def _rate(amplitude, rates, scale):
+    """Rate of a bin by the logarithm of its amplitude [sigma]."""
+    place = (amplitude - scale[0]) / scale[1]
+    if place <= 0.0:
+        return math.exp(rates[0] + 2.0 * (amplitude - scale[0]))
+    k = int(place)
+    if k >= rates.size - 1:
+        return math.exp(rates[rates.size - 1])
+    return math.exp(rates[k] + (place - k) * (rates[k + 1] - rates[k]))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _sum_rates(amplitude, leaks):
+    """Take the logarithms of amplitudes [sigma], and sum up rates, into the fields of leaks."""
+    for k in range(amplitude.size):
+        leaks.amplitude[k] = math.log(amplitude[k])
+    for p in range(leaks.line_amplitude.shape[0]):
+        for k in range(leaks.line_amplitude.shape[1]):
+            leaks.line_amplitude[p, k] = math.log(max(leaks.line_amplitude[p, k], 1e-300))
+    for j in range(leaks.total.shape[0]):
+        rates, scale = leaks.rates[j], leaks.scale[j]
+        for s in range(3):
+            leaks.total[j, s] = leaks.line_total[j, s] = 0.0
+            for k in range(leaks.stretch[j, s, 0], leaks.stretch[j, s, 1]):
+                leaks.total[j, s] += _rate(leaks.amplitude[k], rates, scale)
+            for p in range(leaks.line_amplitude.shape[0]):
+                whole = 0.0
+                for k in range(leaks.line_stretch[j, s, 0], leaks.line_stretch[j, s, 1]):
+                    whole += _rate(leaks.line_amplitude[p, k], rates, scale)
+                leaks.line_total[j, s] = max(leaks.line_total[j, s], whole)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _average(leaks, powers, weights, out):
+    """Average leakage over speckle, of each echo its own, and over phases of the line."""
+    classes = int(40.0 / CLASS_WIDTH)
+    number, mean = np.zeros(classes), np.zeros(classes)
+    for j in range(out.shape[0]):
+        rates, scale = leaks.rates[j], leaks.scale[j]
+        for s in range(3):
+            begin, end = leaks.stretch[j, s]
+            quiet, echoes = 1.0, 0
+            for k in range(begin, end):
+                echoes = max(echoes, leaks.echo[k] + 1)
+            for g in range(echoes):
+                number[:], mean[:] = 0.0, 0.0
+                for k in range(begin, end):
+                    if leaks.echo[k] == g:
+                        place = int((leaks.amplitude[k] - scale[0]) / CLASS_WIDTH)
+                        place = min(max(place, 0), classes - 1)
+                        number[place] += 1.0
+                        mean[place] += leaks.amplitude[k]
+                raised = 0.0
+                for node in range(powers.size):
+                    whole, shift = 0.0, 0.5 * math.log(powers[node])
+                    for c in range(classes):
+                        if number[c] > 0.0:
+                            middle = mean[c] / number[c] + shift
+                            whole += number[c] * _rate(middle, rates, scale)
+                    raised -= weights[node] * math.expm1(-whole)
+                quiet *= 1.0 - raised
+            phases, alarm = leaks.line_amplitude.shape[0], 0.0
+            for p in range(phases):
+                whole = 0.0
+                for k in range(leaks.line_stretch[j, s, 0], leaks.line_stretch[j, s, 1]):
+                    whole += _rate(leaks.line_amplitude[p, k], rates, scale)
+                alarm -= math.expm1(-whole) / phases
+            out[j, s] = 1.0 - quiet * (1.0 - alarm)
+
+
+@njit(cache=True, error_model="numpy")
+def list_peak(peak, bins, ratios, number):
+    """Put a peak (bin, |X| / sigma) into a list of the strongest; return how many it holds.
+
+    A bin of -1 is none. The list has room for as many peaks as ``bins``.
+    """
+    bin_, ratio = peak
+    if bin_ < 0:
+        return number
+    at = number
+    while at > 0 and ratios[at - 1] < ratio:
+        at -= 1
+    if at >= bins.size:
+        return number
+    number = min(number + 1, bins.size)
+    for k in range(number - 1, at, -1):
+        bins[k], ratios[k] = bins[k - 1], ratios[k - 1]
+    bins[at], ratios[at] = bin_, ratio
+    return number
+
+
+@njit(cache=True, error_model="numpy")
+def draw_leaked(address, at, leaks, fading, level, looks, bins, ratios):
+    """List the strongest peaks that leaked signal raises in a segment; return their number.
+
+    ``address``: key of the point, number of the draw; ``at``: point and segment; ``fading`` (most,
+    3): factors on the echoes' magnitudes, by segment; ``level``: threshold [sigma]; ``looks``:
+    records whose powers are averaged. Results are bins, and |X| / sigma; of averaged powers those
+    of one record as sure as these.
+    """
+    (a, b, draw), (i, s) = address, at
+    number = _list_raised(
+        address, s, 0, leaks.stretch[i, s], leaks.bin, leaks.amplitude, leaks.echo, fading[:, s],
+        leaks.total[i, s], leaks.rates[i], leaks.scale[i], (level, looks), bins, ratios, 0,
+    )  # fmt: skip
+    if leaks.line_total[i, s] > 0.0:
+        turn = philox.uniform(a, b, draw, philox.STREAM_LEAKAGE[s], LINE)
+        phase = int(turn * leaks.line_amplitude.shape[0])
+        number = _list_raised(
+            address, s, LINE + 1, leaks.line_stretch[i, s], leaks.line_bin,
+            leaks.line_amplitude[phase], np.zeros(leaks.line_bin.size, np.int64), np.ones(1),
+            leaks.line_total[i, s], leaks.rates[i], leaks.scale[i], (level, looks), bins, ratios,
+            number,
+        )  # fmt: skip
+    return number
+
+
+@njit(cache=True, error_model="numpy")
+def _list_raised(
+    address, s, first, stretch, bins, amplitude, echo, fading, total, rates, scale, law,
+    listed, ratios, number,
+):  # fmt: skip
+    """Go from one bin that is raised to the next; adjacent ones make one peak, the largest.
+
+    Random numbers are those from ``first`` on of the segment's stream; ``total`` is the sum of the
+    rates of all bins without fading; ``law`` the threshold and the number of looks.
+    """
+    (a, b, draw), stream, (level, looks) = address, philox.STREAM_LEAKAGE[s], law
+    left, brightest = -math.log1p(-philox.uniform(a, b, draw, stream, first)), 0.0
+    for g in range(fading.size):
+        brightest = max(brightest, fading[g])
+    if brightest <= 1.0 and left > total:
+        return number
+    many = math.sqrt(float(looks))
+    z = level * many
+    before, peak, largest = np.int64(-2), np.int64(-1), 0.0
+    for k in range(stretch[0], stretch[1]):
+        own = amplitude[k] + math.log(fading[echo[k]])
+        left -= _rate(own, rates, scale)
+        if left > 0.0:
+            continue
+        if bins[k] != before + 1:
+            number = list_peak((peak, largest), listed, ratios, number)
+            peak, largest = np.int64(-1), 0.0
+        before, signal = bins[k], math.exp(own) * many
+        chance = philox.uniform(a, b, draw, stream, first + 1) * _added(signal, z)
+        least = max(largest, ratios[number - 1] if number == ratios.size else 0.0)
+        if least * many < z or _added(signal, least * many) > chance:
+            peak, largest = bins[k], _exceeded(signal, z, chance) / many
+        first += 2
+        left = -math.log1p(-philox.uniform(a, b, draw, stream, first))
+    return list_peak((peak, largest), listed, ratios, number)
+
+
+@njit(cache=True, error_model="numpy")
+def _added(signal, level):
+    """Probability that a bin's signal raises it above a level where noise alone does not."""
+    return excess_crossing(signal, level) / -math.expm1(-0.5 * level * level)
+
+
+@njit(cache=True, error_model="numpy")
+def _exceeded(signal, level, chance):
+    """Magnitude [sigma], from a level on, that a bin exceeds by its signal with a probability."""
+    low, high = level, max(signal, level) + SURE
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        if _added(signal, middle) > chance:
+            low = middle
+        else:
+            high = middle
+    return 0.5 * (low + high)

@@ -1,0 +1,209 @@
+"""False peaks of leaked signal: their places, sizes and numbers by all three methods of drawing.
+
+Whole spectra share no code with the others from the lines' spectrum on: they have noise in every
+bin, and groups of flagged bins.
+"""
+
+import math
+from functools import lru_cache, partial
+
+import numpy as np
+import pytest
+from engine import keys, prepared
+from small_scenes import flight, instrument, observed, plate
+
+from sweep.model import leaked_peaks as leaked
+from sweep.model import outputs
+from sweep.model.clouds import cloud
+from sweep.model.effects import circulator_leak
+from sweep.model.effects.catalogue import CORE, DEFAULTS
+from sweep.model.geometry.mesh import Surface
+from sweep.model.groups import groups
+from sweep.model.pairing import FALSE_ALARM
+
+NUMBER = {"probabilities": 8000, "noise": 8000, "spectra": 1500}
+"""Draws of a method in a scene.
+
+Two samples of n and m independent draws have distributions whose largest difference exceeds
+sqrt(ln(2 / p) (n + m) / (2 n m)) with a probability of p at the most [Dvoretzky, Kiefer and
+Wolfowitz 1956; Wei and Dudley 2012]. Of one in a million that is 0.043 for 8,000 and 8,000, 0.076
+for 8,000 and 1,500. Peaks in uniformly drawn bins differ by the share of draws that have one,
+which is 0.15 here at the least.
+"""
+FALSE_SHARE = 0.15
+
+SIZE, HEIGHT, ROOF = 2**12, 400.0, 12.0
+RANGE_BIN = 299792458.0 * 600e6 / (4e12 * SIZE)
+NEAR = 2.5
+"""Bins up to which a point is the echo's own: noise moves peaks, and probabilities leave them."""
+
+HAMMING = {"window": "hamming"}
+RECORD = "instrument.receiver.record"
+SKIRTS = {"instrument.chirp.sinusoidal_error": 2.5e5, "instrument.chirp.error_periods": 1500.0}
+SCENES = {
+    "strong ground and a dim roof": ({**HAMMING, "power": 200.0}, {}),
+    "the same in speckle": ({**HAMMING, "power": 150.0, "effects": (*CORE, "fading")}, {}),
+    "near ground": ({**HAMMING, "power": 0.8, "height": 60.0, "roof": False}, {}),
+    "complex record": (
+        {**HAMMING, "power": 150.0, "effects": (*CORE, "fading")}, {RECORD: "complex"},
+    ),
+    "skirts of an uneven chirp": (
+        {**HAMMING, "power": 3.0, "effects": (*CORE, "chirp_nonlinearity")}, SKIRTS,
+    ),
+}  # fmt: skip
+
+
+def _allowed(n, m):
+    return math.sqrt(math.log(2e6) * (n + m) / (2 * n * m))
+
+
+def _flown(table_4_1, method, scene, *, draws=0, first=0):
+    """Points of a shot on the edge of a dim roof over bright ground, or on the ground alone."""
+    changes, further = SCENES[scene]
+    changes = dict(changes)
+    height, effects = changes.pop("height", HEIGHT), changes.pop("effects", CORE)
+    roof = plate(x=(0.0, 30.0), surface=1, height=ROOF)
+    bodies = [plate(x=(-1e3, 30.0)), *[roof] * changes.pop("roof", True)]
+    path = flight(position=(0.0, 0.0, height), velocity=(0.0, 0.0, -20.0))
+    law = {"fft_size": SIZE, "detection": "any_bin", "noise_bins": "correlated"}
+    table = instrument(table_4_1, **law, **changes)
+    speckle = "developed" if "fading" in effects else "none"
+    starts = {"probabilities": 0, "noise": 10**6, "spectra": 2 * 10**6}
+    got = cloud(
+        observed(path, bodies=bodies, number=7),
+        parameters=DEFAULTS | table | further | {"footprint.speckle": speckle},
+        surfaces=[Surface("ground", 0.5), Surface("roof", 0.005)], keys=keys(1), effects=effects,
+        method=method, draws=draws or NUMBER[method], first_draw=starts[method] + first,
+    )  # fmt: skip
+    return got, height
+
+
+@pytest.fixture(scope="module")
+def drawn(table_4_1):
+    """Distances and false points of the draws of a scene by a method, drawn once."""
+    return lru_cache(partial(_distances, table_4_1))
+
+
+def _distances(table_4_1, method, scene):
+    """Of each draw the distance [bins] of its furthest point from any echo; and its false points.
+
+    0 where all points are the echo's own, whole half bins elsewhere, as the ranges of up and down
+    peaks are. Draws are independent of each other.
+    """
+    got, height = _flown(table_4_1, method, scene)
+    found, there = got["range"][0], got["flags"][0] > 0
+    apart = np.minimum(np.abs(found - height), np.abs(found - height + ROOF)) / RANGE_BIN
+    apart = np.where(there & (apart > NEAR), np.rint(2 * apart) / 2, 0.0)
+    return apart.max(axis=1), (got["flags"][0] & FALSE_ALARM > 0).any(axis=1)
+
+
+def _difference(one, other):
+    places = np.unique(np.concatenate([one, other]))
+    shares = (np.searchsorted(np.sort(v), places, "right") / v.size for v in (one, other))
+    return np.abs(np.subtract(*shares)).max()
+
+
+@pytest.mark.parametrize("scene", list(SCENES))
+@pytest.mark.parametrize("method", ["noise", "spectra"])
+def test_points_are_as_far_from_the_echoes_as_in_drawn_noise(scene, method, drawn):
+    (by_chance, false), (in_noise, noisy) = drawn("probabilities", scene), drawn(method, scene)
+    assert false.mean() > FALSE_SHARE
+    allowed = _allowed(by_chance.size, in_noise.size)
+    assert _difference(by_chance, in_noise) < allowed
+    assert abs(false.mean() - noisy.mean()) < allowed
+
+
+@pytest.mark.parametrize("method", ["probabilities", "noise"])
+def test_any_split_of_draws_has_the_same_false_peaks(method, table_4_1):
+    whole, _ = _flown(table_4_1, method, "the same in speckle", draws=60)
+    assert (whole["flags"] & FALSE_ALARM > 0).any()
+    for first, number in ((0, 7), (7, 53)):
+        part, _ = _flown(table_4_1, method, "the same in speckle", draws=number, first=first)
+        for name in outputs.POINTS:
+            assert part[name].tobytes() == whole[name][:, first : first + number].tobytes(), name
+
+
+# One segment
+
+
+def _raised(leaks, level, draws, *, fading=None, room=3):
+    """Bins and sizes of the peaks raised in the up-chirp, a list for each draw."""
+    found = []
+    bins, ratios = np.empty(room, np.int64), np.empty(room)
+    (key,) = keys(1)
+    for d in range(draws):
+        ratios[:] = 0.0
+        factors = np.ones((1, 3)) if fading is None else np.full((1, 3), fading[d])
+        number = leaked.draw_leaked(
+            (key[0], key[1], d), (0, 0), leaks, factors, level, 1, bins, ratios
+        )
+        found.append((bins[:number].copy(), ratios[:number].copy()))
+    return found
+
+
+def _largest(bins, magnitudes, level):
+    """Strongest bin of each draw (n,) and its |X| / sigma, of magnitudes (n, bins); -1 for none."""
+    best = magnitudes.argmax(axis=1)
+    size = magnitudes.max(axis=1)
+    return np.where(size >= level, bins[best], -1), np.where(size >= level, size, 0.0)
+
+
+def _one_shot(table_4_1, effects=CORE, further=(), **changes):
+    law = {"fft_size": SIZE, "beamlets": 1, "radial_velocity": 20.0, "window": "hamming"}
+    parameters = DEFAULTS | table_4_1(**law | {"range": 400.0} | changes) | dict(further)
+    return prepared(parameters, effects)
+
+
+@pytest.mark.parametrize("fades", [False, True])
+def test_raised_peaks_are_where_and_as_large_as_signal_in_noise(fades, table_4_1):
+    """Rice's law by simulation, with the speckle of an echo common to its bins."""
+    draws, random = 6000, np.random.default_rng(8)
+    effects = (*CORE, "fading") if fades else CORE
+    speckle = {"footprint.speckle": "developed" if fades else "none"}
+    shots = _one_shot(table_4_1, effects, speckle, phases="incoherent", power=420.0)
+    found = groups(shots)
+    ((_, leaks),) = leaked.leaked_peaks(shots, found, np.zeros(1, np.int64))
+    level = float(shots.threshold[0] / shots.bin_deviation[0])
+    stretch = slice(*leaks.stretch[0, 0])
+    bins, signal = leaks.bin[stretch], np.exp(leaks.amplitude[stretch])
+    loud = signal > 0.5  # the rest crosses once in 1e15
+    bins, signal = bins[loud], signal[loud]
+    power = random.exponential(size=draws) if fades else np.ones(draws)
+    noise = random.standard_normal((draws, 2 * bins.size)).view(complex)
+    places, sizes = _largest(bins, np.abs(np.sqrt(power)[:, None] * signal + noise), level)
+    factors = np.sqrt(np.random.default_rng(9).exponential(size=draws)) if fades else None
+    peaks = _raised(leaks, level, draws, fading=factors)
+    own = np.array([b[0] if b.size else -1 for b, _ in peaks])
+    own_size = np.array([r[0] if r.size else 0.0 for _, r in peaks])
+    share = (places >= 0).mean()
+    assert 0.1 < share < 0.9
+    assert _difference(places, own) < _allowed(draws, draws)
+    assert _difference(sizes, own_size) < _allowed(draws, draws)
+    # The mean over speckle, or the closed form of a steady echo, is their share.
+    told = leaks.mean_leakage()[0, 0] if fades else found.leakage[0, 0]
+    assert share == pytest.approx(told, abs=5 * math.sqrt(0.25 / draws))
+
+
+def test_a_line_of_leaked_light_raises_peaks_in_its_own_bins(table_4_1, monkeypatch):
+    """Records of the line at a uniform phase, in noise; the echo itself leaks nothing."""
+    monkeypatch.setattr(circulator_leak, "MASKED_FROM", 0.8)  # for many alarms
+    draws, random = 4000, np.random.default_rng(4)
+    further = {circulator_leak.PATH: 40.0, circulator_leak.ISOLATION: 1e5}
+    shots = _one_shot(table_4_1, (*CORE, "circulator_leak"), further, range=1500.0, power=1.0)
+    found = groups(shots)
+    ((_, leaks),) = leaked.leaked_peaks(shots, found, np.zeros(1, np.int64))
+    level = float(shots.threshold[0] / shots.bin_deviation[0])
+    scale, line = circulator_leak.line_of(shots, 0, 0)
+    bins = leaks.line_bin[slice(*leaks.line_stretch[0, 0])]
+    one, other = scale / shots.bin_deviation[0] * line.terms[:, bins]
+    turn = np.exp(2j * np.pi * random.random(draws))[:, None]
+    noise = random.standard_normal((draws, 2 * bins.size)).view(complex)
+    places, _ = _largest(bins, np.abs(one * turn + other * turn.conj() + noise), level)
+    peaks = _raised(leaks, level, draws)
+    own = np.array([b[0] if b.size else -1 for b, _ in peaks])
+    assert (places >= 0).mean() > 0.1
+    assert _difference(places, own) < _allowed(draws, draws)
+    # Noise alone raises nothing where the line is masked.
+    hidden = leaks.barred_bin[slice(*leaks.barred_stretch[0, 0])]
+    assert (scale * line.most[hidden] >= 0.8 * shots.threshold[0]).all() and hidden.size
+    assert not set(hidden) & set(bins)
