@@ -218,7 +218,10 @@ def _over(dims: tuple[str, ...], outputs: dict[str, Output]) -> dict[str, Output
 _VECTOR = (XYZ,)
 
 SHOTS: dict[str, Output] = _over(("shot",), {
-    "time": Output("s", "start of the measurement"),
+    "time": Output(
+        "s", "start of the measurement, from the attribute time_origin on",
+        "which is the first time of the platform's table of waypoints, or 0",
+    ),
     "beam": Output("1", "number of the beam", dtype="int32"),
     "shot_cycle": Output("1", "number of the measurement cycle", dtype="int32"),
     "platform_position": Output("m", "position of the instrument", dims=_VECTOR),

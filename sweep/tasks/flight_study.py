@@ -173,7 +173,11 @@ class FlightStudy(GrowingStudy):
         return block - number + grid.number((*axes, 0, cycles))
 
     def attributes(self) -> dict[str, Any]:
-        """Title, question, spec, and what the numbers of scanners and surfaces mean."""
+        """Title, question, spec, meaning of the numbers of scanners and surfaces, and origins.
+
+        ``origin`` [m] and ``time_origin`` [s], the latter as a decimal with all its digits, are
+        where the scene's files have the zero of positions and times in the store.
+        """
         return {
             "kind": "scene",
             "title": self.spec.title,
@@ -183,6 +187,7 @@ class FlightStudy(GrowingStudy):
             "scanners": list(self.spec.scanners),
             "eyepoints": {name: self.spec.geometry_id(name) for name in self.spec.scanners},
             "origin": np.asarray(world_of(self.spec).origin, float).tolist(),
+            "time_origin": f"{self.spec.files.time_origin.normalize():f}",
         }
 
     def groups(self) -> dict[str, dict[str, Any]]:
