@@ -24,6 +24,7 @@ from sweep.model.groups import Groups, groups
 from sweep.model.marcum import at_least_one
 from sweep.model.noisy_spectra import Methods
 from sweep.model.outputs import POINTS, STATISTICS
+from sweep.model.own_motion import own_motion
 from sweep.model.preparation import Parameters, Shots, as_arrays
 from sweep.model.ray_error import ray_error
 from sweep.model.realisations import random_effects
@@ -82,10 +83,18 @@ def cloud(
                 # Probabilities are those of crossing the fixed threshold.
                 found = found._replace(pd=found.pd * np.nan, leakage=found.leakage * np.nan)
             drawn = spectra_returns(
-                shots, found, keys=keys[part], parameters=parameters, methods=methods, **numbers
+                shots,
+                found,
+                keys=keys[part],
+                parameters=parameters,
+                methods=methods,
+                motion=own_motion(seen),
+                **numbers,
             )
         else:
-            drawn = draw_returns(shots, found, keys=keys[part], method=method, **numbers)
+            drawn = draw_returns(
+                shots, found, keys=keys[part], method=method, motion=own_motion(seen), **numbers
+            )
         left = np.zeros(shots.size)
         if estimates_rays:
             left = ray_error(shots, rays, found.bin[:, :, 0], found.magnitude[:, :, 0])

@@ -240,6 +240,10 @@ SHOTS: dict[str, Output] = _over(("shot",), {
     "beam_turn_rate": Output(
         "rad s-1", "rate at which the direction of the reference beamlet turns"
     ),
+    "beam_turning": Output(
+        "s-1", "rate of change of beam_direction, by platform and scanner", dims=_VECTOR
+    ),
+    "platform_acceleration": Output("m s-2", "acceleration of the instrument", dims=_VECTOR),
     "beam_surface": Output("1", "surface that the reference beamlet hits", dtype="int16"),
 })  # fmt: skip
 """Geometry of each shot, the same for all draws and all radiometry: the truth of a point cloud."""
