@@ -520,6 +520,10 @@ def report(at, how, known, found, pairs, out):
         centres[0], centres[2] = peaks[0, u, FINE], peaks[2, v, FINE]
         if k >= 0:
             group[1], centres[1] = which[1, k], peaks[1, k, FINE]
+        for s in range(3):  # groups of complex records may lie whole FFT lengths from their peaks
+            if how.signed != 0.0 and group[s] >= 0:
+                apart = known.bins[i, s, BIN, group[s]] - centres[s]
+                centres[s] += 2 * how.half * math.floor(apart / (2 * how.half) + 0.5)
         own = out.peaks[i, d, r]
         for f in range(4):  # slices would compile an error message of shapes
             own[0, f], own[2, f] = peaks[0, u, f], peaks[2, v, f]
