@@ -255,6 +255,7 @@ def conclude(outcome: Outcome, store: Location) -> None:
     if outcome.blocks_done and (outcome.store / "zarr.json").exists():
         _print_summary(outcome.store)
         tell_accuracy(outcome.store)
+        tell_inconsistencies(outcome.store)
     for scanner, rays in outcome.rays.items():
         told = f"{rays:,} rays cast" if rays else "eyepoints were there, no ray cast"
         click.echo(f"{scanner}: {told}")
@@ -331,6 +332,14 @@ def _print_scene(store: Location) -> None:
             for row in scene_summary(store)
         ],
     )
+
+
+def tell_inconsistencies(store: Location, scanner: str | None = None) -> None:
+    """Print which quantities of a flight are off by far more than their standard errors."""
+    from sweep.analysis.consistency import inconsistencies
+
+    for sentence in inconsistencies(store, scanner):
+        tell(f"warning: {sentence}", err=True)
 
 
 def tell_accuracy(store: Location, done: np.ndarray | None = None) -> None:

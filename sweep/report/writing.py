@@ -16,6 +16,7 @@ import yaml
 
 from sweep.analysis import labels, noise_only
 from sweep.analysis.charts import Chart, Room
+from sweep.analysis.consistency import consistency
 from sweep.analysis.figures import SceneStudy, Study, held
 from sweep.analysis.opening import ACCURACY, GRID, SCENE, NotAStoreError, read_attributes
 from sweep.analysis.scenes.recording import INTERPOLATED, QUANTITIES, shown
@@ -222,7 +223,9 @@ def _scene_page(store: Location) -> Page:
              ("scanners", ", ".join(map(labels.coordinate, study.scanners)))]  # fmt: skip
     came_back = flights.returns(seen)
     sections = [
-        _answer(spec, groups, "shots", flights.came_back(came_back.frame, groups, fewer)),
+        _answer(spec, groups, "shots", [
+            *flights.came_back(came_back.frame, groups, fewer), *consistency_words(study.tree)
+        ]),
         _section("cloud", "Point cloud", [cloud],
                  [] if cloud else ["No shot has brought back a point."]),
         _section("flight", "Along the flight", flight),
@@ -230,6 +233,16 @@ def _scene_page(store: Location) -> Page:
         _section("tables", "Tables", [came_back, _cloud_points(seen)]),
     ]  # fmt: skip
     return _page(spec, attributes, "blocks", facts, sections, store)
+
+
+def consistency_words(tree: xr.DataTree) -> list[str]:
+    """Return sentences on errors against the standard errors that are stated."""
+    results = consistency(tree)
+    if words := [result.words for result in results if not result.is_consistent]:
+        return words
+    if not any(result.number for result in results):
+        return []
+    return ["Errors of points and of navigation agree with the standard errors that are stated."]
 
 
 def _section(anchor: str, title: str, items: Sequence[Made], words: Sequence[str] = ()) -> Section:
