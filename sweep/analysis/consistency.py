@@ -1,9 +1,8 @@
 """Errors against standard errors of a flight, by the truth in its store.
 
 A flight's store has the truth. Errors of its true points over their standard errors, and errors of
-velocity and altitude over their covariances, should be of size 1. Where they are far larger the
-errors come from what is not in the standard errors, such as relief within the beams' reach,
-speckle, or a body that turns.
+velocity and altitude over their covariances, should be of size 1. Far larger ones
+come from effects that the standard errors leave out, such as unstated relief or speckle.
 """
 
 from __future__ import annotations

@@ -63,7 +63,7 @@ def cloud(
     is ``probabilities``, ``noise`` or ``spectra``. `returns` is the number of groups that are
     looked at in a segment, and of points of a shot and draw; ``surfaces_seen`` counts no more.
     `effects` and `flags` are as of :func:`sweep.model.shot.prepare_cast`. `estimates_rays` asks for
-    ``beamlets_error``, which needs powers that add and is else 0. ``surface``, ``true_range`` and
+    ``beamlets_error``, which needs powers that add and is else nan. ``surface``, ``true_range`` and
     ``true_radial_velocity`` are those of the beamlet that a true or a misread point has seen: the
     error of a misread one shows.
     """
@@ -95,7 +95,7 @@ def cloud(
             drawn = draw_returns(
                 shots, found, keys=keys[part], method=method, motion=own_motion(seen), **numbers
             )
-        left = np.zeros(shots.size)
+        left = np.full(shots.size, np.nan)
         if estimates_rays:
             left = ray_error(shots, rays, found.bin[:, :, 0], found.magnitude[:, :, 0])
         computed = _statistics(shots, found) | _points(seen, drawn, shots.offset.shape[1])

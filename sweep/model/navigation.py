@@ -8,9 +8,11 @@ single beams, uncorrelated; covariances follow by linear propagation.
 The instrument does not know which of its points are true. Of each shot it takes the first, and
 strongest, that a Doppler peak confirms (:mod:`sweep.model.pairing`). False alarms that pass as
 confirmed, mispaired and misread points are used as if they were true; the test for one false beam
-is there to find them. Whatever its cause, a solution whose residuals contradict the errors of its
-points (a chi-square that true errors exceed once in a thousand) has the covariance that the
-residuals tell: over relief that nobody stated, or with a false point.
+is there to find them.
+
+The residuals of a solution may contradict the errors of its points: a chi-square that true errors
+exceed once in a thousand, over unstated relief or with a false point. Its covariance is then that
+which the residuals tell.
 
 A point whose standard error is not a number is left out; one under a millionth of a bin counts as
 that, to which the interpolation itself is good.

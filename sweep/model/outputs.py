@@ -87,7 +87,8 @@ OUTPUTS: dict[str, Output] = {
     "beamlets_error": Output(
         "1",
         "largest change of a probability of detection by more beamlets",
-        "summed over the segments; 0 where their number is given, and so part of what is asked",
+        "summed over the segments; nan where it is not estimated: their number is given, or their "
+        "amplitudes add",
     ),
     "noise_variance": Output(
         "V^2", "noise variance at the ADC, sigma_x^2", "of noise that is white within the bandwidth"
@@ -286,7 +287,7 @@ STATISTICS: dict[str, Output] = _over(("shot",), {
         "1", "largest change by more beamlets",
         "of pd in all three segments, or of a relative magnitude, whichever is more; "
         "estimated from the shot's own rays, where accuracy.tolerance says how many they are; "
-        "else 0",
+        "else nan: not checked",
     ),
 })  # fmt: skip
 """Probabilities of each shot, before any draw.

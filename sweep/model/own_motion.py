@@ -7,7 +7,7 @@ and accelerate at a, and ground that comes nearer along it at u. To first order 
 
     f_i (2/c) (v + a (t_i + t_c)) - r_i (2/c) (R - u t_i - (v + u) t_c - a (t_i^2 + ...) / 2)
 
-and the fit takes a = 0 and u = v. What it leaves of each beat,
+and the fit takes a = 0 and u = v. The rest of each beat,
 
     (2/c) f_i a (t_i + t_c)
     - (2/c) r_i [ (v - u) (t_i + t_c) - a (t_i^2 / 2 + 2 t_i t_c + 3/2 t_c^2) ],
@@ -15,15 +15,15 @@ and the fit takes a = 0 and u = v. What it leaves of each beat,
 moves range and velocity by the same fit, which is linear. For Table 4.1 11 m/s^2 move the range by
 0.55 m, and so does a beam that turns by 20 deg/s, through a = V.d'.
 
-**What the instrument knows.** By inertial sensors and its scanner it knows its velocity V, its
+**Known motion.** By inertial sensors and its scanner it knows its velocity V, its
 acceleration V' and the rate d' at which the beam d turns: so it knows a = V'.d + V.d' for ground at
 rest. It takes the ground to be level (:func:`own_motion`): then a beam that points down meets it at
 a range that falls by u = (V + R d').z / d.z. A beam that points nowhere near the ground is taken to
 meet a surface that faces it, along which nothing slides. Range and velocity are corrected for both.
 
-**What it does not know** is the slope of the ground and the motion of a body that is hit. By how
-much they move range and velocity is added to the standard errors in quadrature, in its true size:
-that of one draw of slopes, which points of other slopes share out between them.
+**Unknown motion.** The instrument does not know the slope of the ground or the motion of a body
+that is hit. The changes of range and velocity that these make are added to the standard errors in
+quadrature, in their true size.
 
 The angular acceleration is left out on both sides (:mod:`sweep.model.geometry.platform`).
 """

@@ -129,7 +129,7 @@ class Shots:
     line_tolerance: np.ndarray
     """Error of a bin by taking few lines for many, over sigma."""
     beamlets_error: np.ndarray
-    """Error of pd that the number of beamlets leaves; 0 where it was given."""
+    """Error of pd that the number of beamlets leaves; nan where it was not estimated."""
     echo_scale: np.ndarray
     """Echo power [W] for a relative echo of 1/sr."""
     beat_scale: np.ndarray
@@ -602,7 +602,7 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
         amplifier_bandwidth=p[RECEIVER + "amplifier_bandwidth"],
         leakage_floor=np.asarray(accuracy.leakage_floor, float),
         leakage_tolerance=accuracy.for_leakage,
-        beamlets_error=p.get(BEAMLETS_ERROR, np.asarray(0.0)),
+        beamlets_error=p.get(BEAMLETS_ERROR, np.asarray(np.nan)),
         line_tolerance=accuracy.for_lines / math.sqrt(looks.averaged),
         echo_scale=echo_scale,
         beat_scale=current_scale * p[RECEIVER + "transimpedance"],
