@@ -666,3 +666,15 @@ def test_a_folder_that_was_removed_ends_in_a_line(tmp_path, monkeypatch, command
     told = CliRunner().invoke(main, command.split(), catch_exceptions=False)
     assert told.exit_code == 2
     assert told.output == "the current folder was removed: go to another\n"
+
+
+def test_beamlets_that_are_given_are_said_not_to_be_checked(here):
+    """37 beamlets of a spec that never asked whether they are enough."""
+    told = "whether footprint.beamlets, given as 9, keeps accuracy.tolerance"
+    assert told in " ".join(sweep("plan", "small.yaml").stdout.split())
+    ran = sweep("run", "small.yaml", "--scheduler", "none")
+    assert told in " ".join(ran.stdout.split())
+    assert told in " ".join(sweep("status", "results/small.zarr").stdout.split())
+    counted = STUDY.replace("{beamlets: 9, speckle: none}", "{speckle: none}")
+    (here / "counted.yaml").write_text(counted)
+    assert "footprint.beamlets" not in sweep("plan", "counted.yaml").stdout

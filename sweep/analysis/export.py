@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from sweep.analysis import labels
+from sweep.analysis.consistency import consistency
 from sweep.analysis.figures import SceneStudy
 from sweep.analysis.scenes.recording import (
     INTERPOLATED,
@@ -21,6 +22,7 @@ from sweep.analysis.scenes.recording import (
     Recording,
     place,
 )
+from sweep.model.outputs import CLOSING
 from sweep.model.pairing import FLAGS, TRUE
 from sweep.spec import Mistake, SpecError
 from sweep.spec.rules import near_miss
@@ -33,28 +35,42 @@ ROW = np.dtype(
             "radial_velocity_standard_error", "snr", "pd", "true_range", "true_radial_velocity",
         )),
         ("surface", "<i2"), ("flags", "|u1"), ("beam", "<i4"), ("shot", "<u4"),
-        ("return_number", "|u1"), ("number_of_returns", "|u1"),
+        ("return_number", "|u1"), ("number_of_returns", "|u1"), ("scan_angle", "<f8"),
     ]
 )  # fmt: skip
-"""Every column, in the order of files; returns of a shot and draw are numbered from 1."""
+"""Every column, in the order of files; returns of a shot and draw are numbered from 1 as stored,
+confirmed and strong ones first. The scan angle is that of the beam from nadir [deg], below 0 on the
+left of the way that the platform goes over the ground (of the x axis where it goes nowhere)."""
 
 COLUMNS: tuple[str, ...] = ROW.names or ()
 UNITS = {n: QUANTITIES[n].units for n in COLUMNS if n in QUANTITIES and QUANTITIES[n].units != "1"}
 """Units of the columns that have any."""
+UNITS["scan_angle"] = "deg"
+
+REMARKS = dict.fromkeys(("radial_velocity", "true_radial_velocity"), CLOSING)
+"""What a value of a column means beyond its units."""
+
+MEANINGS = {name: "; ".join(filter(None, [UNITS.get(name), REMARKS.get(name)])) for name in COLUMNS}
+"""Units and remark of each column; empty for a pure number."""
 
 
 @dataclass(frozen=True)
 class PointTable:
-    """Points of one draw of a recording; the origin (3,) is added to their coordinates [m]."""
+    """Points of one draw of a recording, in the coordinates and times of the scene's files."""
 
     recording: Recording
     draw: int
     ranges: str
     origin: np.ndarray
+    """(3,): added to the coordinates in the store [m]."""
+    time_origin: float = 0.0
+    """Added to the times in the store [s]."""
+    projection: str = ""
+    """WKT of the coordinates' map projection; empty where none is known."""
 
     def parts(self) -> Iterator[np.ndarray]:
         """Rows (m,) of ROW, part by part."""
-        names = [name for name in COLUMNS if name != "number_of_returns"]
+        names = [name for name in COLUMNS if name not in ("number_of_returns", "scan_angle")]
         for part in self.recording.stretches():
             table = self.recording.points([*names, "returns"], part, self.draw, self.ranges)
             rows = np.zeros(table["x"].size, ROW)
@@ -62,9 +78,22 @@ class PointTable:
                 rows[name] = table[name]
             rows["return_number"] += 1
             rows["number_of_returns"] = table["returns"]
+            rows["scan_angle"] = self._scan_angles(part)[rows["shot"] - part.start]
+            rows["time"] += self.time_origin
             for axis, shift in zip("xyz", self.origin, strict=True):
                 rows[axis] += shift
             yield rows
+
+    def _scan_angles(self, part: slice) -> np.ndarray:
+        """Angle of each shot's beam from nadir [deg], (k,), below 0 on the left."""
+        beams, moving = (
+            self.recording.read(name, part) for name in ("beam_direction", "platform_velocity")
+        )
+        still = np.hypot(moving[:, 0], moving[:, 1]) < 1e-9 * np.linalg.norm(moving, axis=1)
+        ahead = np.where(still[:, None], [1.0, 0.0, 0.0], moving)
+        rightwards = beams[:, 0] * ahead[:, 1] - beams[:, 1] * ahead[:, 0]
+        angle = np.degrees(np.arctan2(np.hypot(beams[:, 0], beams[:, 1]), -beams[:, 2]))
+        return np.where(rightwards < 0, -angle, angle)
 
     def number(self) -> int:
         """Return the number of points."""
@@ -94,7 +123,7 @@ _PLY_TYPES = {
 def write_ply(table: PointTable, path: Path, remarks: Remarks) -> int:
     """Write a binary PLY file with the columns as properties; return the number of points."""
     number = table.number()
-    comments = list(remarks)
+    comments = [*remarks, *(f"{name}: {remark}" for name, remark in REMARKS.items())]
     for unit in dict.fromkeys(UNITS.values()):
         comments.append(f"{' '.join(n for n, own in UNITS.items() if own == unit)} in {unit}")
     header = [
@@ -117,7 +146,7 @@ def write_csv(table: PointTable, path: Path, remarks: Remarks) -> int:
     number = 0
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(labels.with_brackets(n, UNITS.get(n, "")) for n in COLUMNS)
+        writer.writerow(labels.with_brackets(n, MEANINGS[n]) for n in COLUMNS)
         for rows in table.parts():
             writer.writerows(rows.tolist())
             number += rows.size
@@ -131,7 +160,16 @@ INTEGERS = 2.0**31 - 1
 LARGEST_RETURN = 15
 """Largest coordinates, in steps from the offset, and numbers of returns in a LAS file."""
 
-_STANDARD = {"x", "y", "z", "time", "return_number", "number_of_returns"}
+_STANDARD = {"x", "y", "z", "time", "return_number", "number_of_returns", "scan_angle"}
+
+_SCAN_STEP = 0.006
+"""Step of scan angles in a LAS file [deg]."""
+
+_STORED_RETURN = "stored_return"
+"""Extra byte that holds the number of a return in the store, from 1."""
+
+_LARGEST_BEAM = 255
+"""Largest number of a beam that a LAS file's user data can hold."""
 
 UNCLASSIFIED, NOISE = 1, 7
 """Classes of LAS: points as they are, and points known to be false."""
@@ -140,19 +178,26 @@ UNCLASSIFIED, NOISE = 1, 7
 def write_las(table: PointTable, path: Path, remarks: Remarks, *, compressed: bool = False) -> int:
     """Write a LAS 1.4 file, point format 6, with the other columns as extra bytes.
 
-    Times since the flight's start stand as GPS times; false points have the class of noise;
-    intensity is the signal-to-noise ratio in hundredths of a decibel.
+    True returns of a shot are numbered by rising range, as the format asks. False points have the
+    class of noise and are numbered apart. The number of the beam stands as user data too (255 from
+    there on), times as GPS times; intensity is the signal-to-noise ratio in hundredths of a
+    decibel. The coordinates' projection is stated where it is known.
     """
     import laspy
 
     header = laspy.LasHeader(version="1.4", point_format=6)
     extra = [name for name in COLUMNS if name not in _STANDARD]
     header.add_extra_dims(
-        [laspy.ExtraBytesParams(n, ROW[n], description=UNITS.get(n, "")) for n in extra]
+        [
+            *(laspy.ExtraBytesParams(n, ROW[n], description=MEANINGS[n]) for n in extra),
+            laspy.ExtraBytesParams(_STORED_RETURN, "|u1", description="return_number in the store"),
+        ]
     )
     low, high = table.limits()
     found = bool(np.isfinite(low).all())
-    header.global_encoding.wkt = True  # as the format asks of these points
+    header.global_encoding.wkt = bool(table.projection)
+    if table.projection:
+        header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(table.projection))
     header.offsets = np.round((low + high) / 2) + 0.0 if found else np.zeros(3)
     header.scales = np.full(3, _step(float((high - low).max()) if found else 0.0))
     header.generating_software = "sweep"
@@ -177,14 +222,35 @@ def _las_points(rows: np.ndarray, header, extra: Sequence[str]):  # type: ignore
     for axis in "xyz":
         points[axis] = rows[axis]
     points["gps_time"] = rows["time"]
-    for name in ("return_number", "number_of_returns"):
-        points[name] = np.minimum(rows[name], LARGEST_RETURN)
+    for name, numbers in zip(("return_number", "number_of_returns"), _by_range(rows), strict=True):
+        points[name] = np.minimum(numbers, LARGEST_RETURN)
+    points[_STORED_RETURN] = rows["return_number"]
+    points["user_data"] = np.minimum(rows["beam"], _LARGEST_BEAM)
+    points["scan_angle"] = np.round(rows["scan_angle"] / _SCAN_STEP)
     points["classification"] = np.where(rows["flags"] & TRUE, UNCLASSIFIED, NOISE)
     decibels = 10 * np.log10(np.maximum(rows["snr"], 1e-30))
     points["intensity"] = np.clip(np.round(100 * np.nan_to_num(decibels)), 0, 65535)
     for name in extra:
         points[name] = rows[name]
     return points
+
+
+def _by_range(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return numbers by rising range, from 1, and how many there are, of true points and of false.
+
+    Rows of a shot all come together.
+    """
+    false = (rows["flags"] & TRUE) == 0
+    order = np.lexsort((rows["range"], false, rows["shot"]))
+    new = np.ones(rows.size, bool)
+    new[1:] = np.diff(rows["shot"][order].astype(np.int64)) != 0
+    new[1:] |= np.diff(false[order].astype(np.int8)) != 0
+    first = np.flatnonzero(new)
+    counts = np.diff(first, append=rows.size)
+    numbers, totals = np.empty((2, rows.size), np.int64)
+    numbers[order] = np.arange(rows.size) - np.repeat(first, counts) + 1
+    totals[order] = np.repeat(counts, counts)
+    return numbers, totals
 
 
 WRITERS: dict[str, Callable[[PointTable, Path, Remarks], int]] = {
@@ -207,9 +273,11 @@ def export(
 ) -> int:
     """Write the points of one scanner and draw to a file.
 
-    Coordinates are those of the scene's files: the scene's origin is added to what is stored.
-    Points are written in the order of shots and returns, part by part; those not computed yet are
-    left out. Nothing is at the file's place before it is whole.
+    Coordinates are those of the scene's files in metres: the scene's origin is added to what is
+    stored. Of a raster in feet they are its own times the length of a foot. Times are those of the
+    platform's table of waypoints, or begin with the flight. Radial velocities are positive when
+    closing. Points are written in the order of shots and returns, part by part; those not computed
+    yet are left out. Nothing is at the file's place before it is whole.
 
     Parameters
     ----------
@@ -248,7 +316,11 @@ def export(
         mistakes.append(Mistake("file", rule, str(file), remedy))
     recording, at = chosen(study, scanner, draw, ranges, where or {}, mistakes)
     origin = np.asarray(study.tree.attrs.get("origin", np.zeros(3)), float)
-    table = PointTable(recording, draw, ranges, origin)
+    attributes = study.tree.attrs
+    table = PointTable(
+        recording, draw, ranges, origin,
+        float(attributes.get("time_origin", 0.0)), str(attributes.get("projection", "")),
+    )  # fmt: skip
     with draft(file, replace=True) as made:
         return WRITERS[file.suffix.lower()](table, made, _remarks(study, table, at))
 
@@ -308,4 +380,9 @@ def _remarks(study: SceneStudy, table: PointTable, at: Place) -> list[str]:
     number = [f"surface {i}: {name}" for i, name in enumerate(study.surfaces)]
     bits = [f"flag {bit}: {labels.coordinate(name)}" for name, bit in FLAGS.items()]
     shown = f"scanner {table.recording.scanner}, draw {table.draw}, {table.ranges} ranges"
-    return [study.note, ", ".join(filter(None, [shown, at.words])), *number, *bits]
+    told = [
+        result.words
+        for result in consistency(study.tree)
+        if not result.is_consistent and result.scanner == table.recording.scanner
+    ]
+    return [study.note, *told, ", ".join(filter(None, [shown, at.words])), *number, *bits]

@@ -36,6 +36,7 @@ from sweep.cli.terminal import (
     shown,
     tell,
     tell_effects,
+    tell_inconsistencies,
     warn_before,
     warn_of,
 )
@@ -433,6 +434,7 @@ def export(
 
             number = write(store, file, **how)
     click.echo(f"{shown(file.absolute())}: {number:,} {form}")
+    tell_inconsistencies(store, how["scanner"])
 
 
 @main.command()

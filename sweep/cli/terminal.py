@@ -261,6 +261,7 @@ def conclude(outcome: Outcome, store: Location) -> None:
         try:
             _print_summary(outcome.store)
             tell_accuracy(outcome.store)
+            tell_inconsistencies(outcome.store)
         except Exception as error:  # the study is computed all the same
             tell(f"no table of the results: {_described(error)}", err=True)
     for scanner, rays in outcome.rays.items():
@@ -350,8 +351,44 @@ def _print_scene(store: Location) -> None:
     )
 
 
+def unchecked_beamlets(study: Spec | SceneSpec) -> str:
+    """Return what is not checked of the number of beamlets, and why; '' where it is estimated."""
+    from sweep.model.resolution import BEAMLETS, is_open
+
+    parameters = study.parameters()
+    given = study.footprint.beamlets > 0
+    varied = any(member.path == BEAMLETS for axis in study.axes for member in axis.members)
+    if study.modes()["footprint"] == "off":
+        return ""
+    if given or varied:
+        number = "several numbers" if varied else f"{study.footprint.beamlets:,}"
+        return (
+            f"whether footprint.beamlets, given as {number}, keeps accuracy.tolerance; leave it "
+            "out to have beamlets counted by the tolerance"
+        )
+    if not is_open(parameters):
+        return (
+            "whether the number of beamlets keeps accuracy.tolerance, as their amplitudes add, or "
+            "their pattern is given"
+        )
+    return ""
+
+
+def tell_inconsistencies(store: Location, scanner: str | None = None) -> None:
+    """Print which quantities of a flight are off by far more than their standard errors."""
+    from sweep.tasks import studies
+
+    if studies.read(store)[0]["kind"] != "scene":
+        return
+    from sweep.analysis.consistency import inconsistencies
+
+    for sentence in inconsistencies(store, scanner):
+        tell(f"warning: {sentence}", err=True)
+
+
 def tell_accuracy(store: Location, done: np.ndarray | None = None) -> None:
     """Print how well what is drawn is known, what beamlets leave, and what is not known at all."""
+    from sweep.tasks import studies
     from sweep.tasks.summary import accuracy_table, beyond_model, rays_table
 
     number, why = beyond_model(store, done)
@@ -377,6 +414,8 @@ def tell_accuracy(store: Location, done: np.ndarray | None = None) -> None:
             ],
             "at",
         )
+    if why := unchecked_beamlets(studies.read(store)[1].spec):
+        tell(f"Not checked: {why}.")
     if rays := rays_table(store, done):
         kind, each = ("rays", "shot") if rays[0].name else ("beamlets", "point")
         print_table(
@@ -468,6 +507,8 @@ def plan_lines(
         yield "blocks", f"{p.blocks:,}"
     yield "chunks", f"{p.chunks:,} files"
     yield "bytes", f"{decimal(p.bytes)} before compression"
+    if why := unchecked_beamlets(study):
+        yield "not checked", why
     if not p.scanners:
         yield "time a point", f"{1e6 * p.seconds_a_point:.3g} us on one core"
     bound = "at most about" if getattr(study.draws, "adaptive", False) else "about"

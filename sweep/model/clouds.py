@@ -25,6 +25,7 @@ from sweep.model.leaked_peaks import leaked_peaks
 from sweep.model.marcum import at_least_one
 from sweep.model.noisy_spectra import Methods
 from sweep.model.outputs import POINTS, STATISTICS
+from sweep.model.own_motion import own_motion
 from sweep.model.preparation import Parameters, Shots, as_arrays
 from sweep.model.ray_error import ray_error
 from sweep.model.realisations import random_effects
@@ -63,7 +64,7 @@ def cloud(
     is ``probabilities``, ``noise`` or ``spectra``. `returns` is the number of groups that are
     looked at in a segment, and of points of a shot and draw; ``surfaces_seen`` counts no more.
     `effects` and `flags` are as of :func:`sweep.model.shot.prepare_cast`. `estimates_rays` asks for
-    ``beamlets_error``, which needs powers that add and is else 0. ``surface``, ``true_range`` and
+    ``beamlets_error``, which needs powers that add and is else nan. ``surface``, ``true_range`` and
     ``true_radial_velocity`` are those of the beamlet that a true or a misread point has seen: the
     error of a misread one shows.
     """
@@ -83,11 +84,19 @@ def cloud(
                 # Probabilities are those of crossing the fixed threshold.
                 found = found._replace(pd=found.pd * np.nan, leakage=found.leakage * np.nan)
             drawn = spectra_returns(
-                shots, found, keys=keys[part], parameters=parameters, methods=methods, **numbers
+                shots,
+                found,
+                keys=keys[part],
+                parameters=parameters,
+                methods=methods,
+                motion=own_motion(seen),
+                **numbers,
             )
         else:
-            drawn = draw_returns(shots, found, keys=keys[part], method=method, **numbers)
-        left = np.zeros(shots.size)
+            drawn = draw_returns(
+                shots, found, keys=keys[part], method=method, motion=own_motion(seen), **numbers
+            )
+        left = np.full(shots.size, np.nan)
         if estimates_rays:
             left = ray_error(shots, rays, found.bin[:, :, 0], found.magnitude[:, :, 0])
         computed = _statistics(shots, found) | _points(seen, drawn, shots.offset.shape[1])

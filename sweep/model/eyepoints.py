@@ -59,6 +59,10 @@ class Eyepoints(NamedTuple):
     """(n,): speed at which its range falls [m/s]; nan where nothing is seen."""
     turn_rate: np.ndarray
     """(n,): rate at which its direction turns [rad/s], by scanner and platform."""
+    turning: np.ndarray
+    """(n, 3): rate of change of the direction, as commanded [1/s]."""
+    platform_acceleration: np.ndarray
+    """(n, 3): of the instrument [m/s^2]."""
     velocity_offset: np.ndarray
     """(n, b): radial velocity less the reference's [m/s]; nan for a miss."""
     cos_incidence: np.ndarray
@@ -139,10 +143,12 @@ def observe(
     reference = velocity[rows, np.maximum(bundle.reference, 0)]
     turning = rotate(state.attitude, shots.turning)
     acceleration, approach, turn_rate = _along_beam(state, turning, rays, bundle, moving, rotation)
+    direction = rotate(state.attitude, shots.direction)
+    commanded = np.cross(state.rate, direction) + turning
     return Eyepoints(
         time, shots.beam, shots.cycle, state.position, state.velocity,
-        rotate(state.attitude, shots.direction), bundle.range, bundle.offset, reference,
-        acceleration, approach, turn_rate,
+        direction, bundle.range, bundle.offset, reference,
+        acceleration, approach, turn_rate, commanded, state.acceleration,
         velocity - reference[:, None], bundle.cos_incidence, bundle.surface, weight,
     )  # fmt: skip
 

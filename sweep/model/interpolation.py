@@ -31,6 +31,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import Chebyshev
+from scipy.interpolate import RegularGridInterpolator
 
 from sweep.kernels import njit
 from sweep.model.window import Window, samples
@@ -218,6 +219,41 @@ def sub_bin_error(delta, ratio, tables):
     if not ratio > 0.0:
         return 0.5
     return min(_at(tables.error, abs(delta) * (tables.error.size - 1)) / ratio, 0.5)
+
+
+def drift_error(delta: np.ndarray, drift: np.ndarray, window: Window, fft_size: int) -> np.ndarray:
+    """Error [bins] of :func:`sub_bin` for a tone that moves on by some bins within the record.
+
+    The tone lies ``delta`` bins past the centre bin at the record's middle, and moves evenly.
+    """
+    shift = RegularGridInterpolator(
+        (_DRIFTS, _DRIFTING_PLACES), _drift_shifts(window, fft_size), bounds_error=False
+    )
+    delta, drift = np.broadcast_arrays(np.abs(delta), drift)
+    place = np.clip(delta, 0.0, _DRIFTING_PLACES[-1]), np.clip(drift, _DRIFTS[0], _DRIFTS[-1])
+    return np.asarray(np.minimum(shift(place[::-1]) * drift * drift, drift / 2))
+
+
+_DRIFTS = np.array([0.5, 1.0, 2.0, 4.0])
+_DRIFTING_PLACES = np.linspace(0.0, 1.0, 17)
+"""Bins by which a tone is made to move within the record, and its places past a bin."""
+
+
+@lru_cache(maxsize=32)
+def _drift_shifts(window: Window, fft_size: int) -> np.ndarray:
+    """Shift of the estimate over the square of a tone's drift [1/bins], by drift and place."""
+    w, tables = samples(window.name, window.length), interpolator(window, fft_size)
+    middle = np.arange(w.size) / w.size - 0.5
+    found = np.empty((_DRIFTS.size, _DRIFTING_PLACES.size))
+    for i, drift in enumerate(_DRIFTS):
+        moving = w * np.exp(1j * np.pi * drift * w.size / fft_size * middle**2)
+        for j, place in enumerate(_DRIFTING_PLACES):
+            magnitudes = [
+                abs((moving * phasors((k - place) / fft_size, w.size)).sum()) for k in (-1, 0, 1)
+            ]
+            estimate = sub_bin(magnitudes[0], magnitudes[1], magnitudes[2], tables)
+            found[i, j] = abs(estimate - place) / drift**2
+    return found
 
 
 @njit(cache=True, error_model="numpy")

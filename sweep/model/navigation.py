@@ -8,8 +8,14 @@ single beams, uncorrelated; covariances follow by linear propagation.
 The instrument does not know which of its points are true. Of each shot it takes the first, and
 strongest, that a Doppler peak confirms (:mod:`sweep.model.pairing`). False alarms that pass as
 confirmed, mispaired and misread points are used as if they were true; the test for one false beam
-is there to find them. A point whose standard error is not a number is left out; one under a
-millionth of a bin counts as that, to which the interpolation itself is good.
+is there to find them.
+
+The residuals of a solution may contradict the errors of its points: a chi-square that true errors
+exceed once in a thousand, over unstated relief or with a false point. Its covariance is then that
+which the residuals tell.
+
+A point whose standard error is not a number is left out; one under a millionth of a bin counts as
+that, to which the interpolation itself is good.
 
 The instrument is taken to know, from inertial sensors, how it is turned and how its place and
 velocity have changed within a cycle. So the altitude is that at the cycle's first shot, over the
@@ -49,6 +55,9 @@ _LARGEST_CONDITION = 1e6
 
 _INTERPOLATION = 1e-6
 """Least error of a place between bins, over that of a place by whole bins."""
+
+_SCALED_AT = 1e-3
+"""Probability of larger residuals from which on they tell the errors, and not what is stated."""
 
 SOLVED = 0
 """All valid beams are in the solution."""
@@ -118,7 +127,9 @@ def velocity(
                 for k in range(3)
             )
         chi = np.where(solved, sum(residual.T**2), np.nan)
-        return value, covariance, chi, np.where(solved, used.sum(axis=1) - 3, 0)
+        degrees = np.where(solved, used.sum(axis=1) - 3, 0)
+        scale = _covariance_scale(chi, degrees, degrees)
+        return value, covariance * scale[:, None, None], chi, degrees
 
     return _screened(fit, np.isfinite(closing), level, shape)
 
@@ -157,18 +168,35 @@ def altitude(
         some = np.where(mask, points[..., index], 0.0), u[..., index], error[:, index], mask
         with np.errstate(divide="ignore", invalid="ignore"):
             gradient = _plane(*some, np.zeros((2, index.size)), slope, relief)[3]
-            height, variance, chi, _ = _plane(*some, gradient, slope, relief)
+            height, variance, chi, _, slopes = _plane(*some, gradient, slope, relief)
         count = used.sum(axis=1)
-        return height, variance, np.where(count > 0, chi, np.nan), np.maximum(count - 1, 0)
+        chi, degrees = np.where(count > 0, chi, np.nan), np.maximum(count - 1, 0)
+        variance = variance * _covariance_scale(chi, degrees, count - 1 - slopes)
+        return height, variance, chi, degrees
 
     return _screened(fit, np.isfinite(distance), level, shape)
+
+
+def _covariance_scale(
+    chi_square: np.ndarray, degrees: np.ndarray, residual_degrees: np.ndarray
+) -> np.ndarray:
+    """Return the factor on the covariance of solutions whose residuals exceed the stated errors.
+
+    Residuals that true errors reach with :data:`_SCALED_AT` or less tell their size themselves: it
+    is the chi-square over the degrees of freedom that the residuals have, at least one.
+    """
+    limit = chdtri(np.maximum(degrees, 1), _SCALED_AT)
+    exceeds = (degrees > 0) & (chi_square > limit)
+    return np.where(exceeds, chi_square / np.maximum(residual_degrees, 1), 1.0)
 
 
 def _plane(
     points: np.ndarray, beams: np.ndarray, errors: np.ndarray, used: np.ndarray,
     gradient: np.ndarray, slope: float, relief: float,
-) -> Fit:  # fmt: skip
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Altitudes, variances, chi-squares and gradients of planes through n cycles' ground points.
+
+    Last come the slopes that the points tell, and not what is known beforehand: 0 to 2 of them.
 
     The plane is z = -altitude + gradient . (x, y) with the platform at the zero. An error of range
     moves a point off the plane by the error times ``gradient . (u_x, u_y) - u_z``, so the weights
@@ -185,6 +213,7 @@ def _plane(
     residual = np.zeros((n, b + 2))
     residual[:, :b] = apart[2].T
     height, variance, gradient = -centre[2], 1.0 / total, np.zeros((2, n))
+    slopes = np.zeros(n)
     if slope > 0:
         columns = np.zeros((n, b + 2, 2))
         columns[:, :b] = apart[:2].T
@@ -196,7 +225,8 @@ def _plane(
             height = height + along * coordinate[k]
             variance = variance + along**2 / square[k]
             gradient = gradient + turn[k] * coordinate[k]
-    return height, variance, sum(residual.T**2), gradient
+            slopes = slopes + 1.0 - 1.0 / (slope**2 * square[k])
+    return height, variance, sum(residual.T**2), gradient, slopes
 
 
 def _flat_cycles(

@@ -88,7 +88,8 @@ OUTPUTS: dict[str, Output] = {
     "beamlets_error": Output(
         "1",
         "largest change of a probability of detection by more beamlets",
-        "summed over the segments; 0 where their number is given, and so part of what is asked",
+        "summed over the segments; nan where it is not estimated: their number is given, or their "
+        "amplitudes add",
     ),
     "noise_variance": Output(
         "V^2", "noise variance at the ADC, sigma_x^2", "of noise that is white within the bandwidth"
@@ -219,7 +220,10 @@ def _over(dims: tuple[str, ...], outputs: dict[str, Output]) -> dict[str, Output
 _VECTOR = (XYZ,)
 
 SHOTS: dict[str, Output] = _over(("shot",), {
-    "time": Output("s", "start of the measurement"),
+    "time": Output(
+        "s", "start of the measurement, from the attribute time_origin on",
+        "which is the first time of the platform's table of waypoints, or 0",
+    ),
     "beam": Output("1", "number of the beam", dtype="int32"),
     "shot_cycle": Output("1", "number of the measurement cycle", dtype="int32"),
     "platform_position": Output("m", "position of the instrument", dims=_VECTOR),
@@ -238,6 +242,10 @@ SHOTS: dict[str, Output] = _over(("shot",), {
     "beam_turn_rate": Output(
         "rad s-1", "rate at which the direction of the reference beamlet turns"
     ),
+    "beam_turning": Output(
+        "s-1", "rate of change of beam_direction, by platform and scanner", dims=_VECTOR
+    ),
+    "platform_acceleration": Output("m s-2", "acceleration of the instrument", dims=_VECTOR),
     "beam_surface": Output("1", "surface that the reference beamlet hits", dtype="int16"),
 })  # fmt: skip
 """Geometry of each shot, the same for all draws and all radiometry: the truth of a point cloud."""
@@ -283,7 +291,7 @@ STATISTICS: dict[str, Output] = _over(("shot",), {
         "1", "largest change by more beamlets",
         "of pd in all three segments, or of a relative magnitude, whichever is more; "
         "estimated from the shot's own rays, where accuracy.tolerance says how many they are; "
-        "else 0",
+        "else nan: not checked",
     ),
 })  # fmt: skip
 """Probabilities of each shot, before any draw.

@@ -23,6 +23,7 @@ from sweep.model.detectors import main_lobe
 from sweep.model.ground import Ground
 from sweep.model.looks import NUMBER, VOTES, Looks
 from sweep.model.threshold import tnr_of
+from sweep.model.waveform import Segment
 from sweep.model.window import Window, canonical_name, window
 
 if TYPE_CHECKING:
@@ -128,7 +129,7 @@ class Shots:
     line_tolerance: np.ndarray
     """Error of a bin by taking few lines for many, over sigma."""
     beamlets_error: np.ndarray
-    """Error of pd that the number of beamlets leaves; 0 where it was given."""
+    """Error of pd that the number of beamlets leaves; nan where it was not estimated."""
     echo_scale: np.ndarray
     """Echo power [W] for a relative echo of 1/sr."""
     beat_scale: np.ndarray
@@ -163,6 +164,8 @@ class Shots:
     """(segments, n): bins by which lines move on from look to look."""
     walk: np.ndarray | float = 0.0
     """Seconds of closing by which the beats' range is below that at the shot's start, (n,)."""
+    speeding: np.ndarray | float = 0.0
+    """Seconds of acceleration by which a beat's velocity is above that at its segment's start."""
     slowing: np.ndarray | float = 0.0
     """Share of the radial velocity by which the beats tell less, (n,)."""
     alike: bool = False
@@ -411,6 +414,47 @@ class Shots:
         return here
 
     @property
+    def record_middle(self) -> np.ndarray:
+        """Time from a segment's start to its record's middle [s], (n,); 0 without range walk."""
+        return np.asarray(self.walk - (self.starts[0] + self.starts[2]) / 2) / 2
+
+    @property
+    def drifts(self) -> tuple[np.ndarray, ...]:
+        """Hz by which each segment's lines have moved on at the middle of its record, (n,) each."""
+        return tuple(
+            self._gained(each, self.record_middle, self.speeding) for each in self.waveform
+        )
+
+    @property
+    def drift_rates(self) -> tuple[np.ndarray, ...]:
+        """Hz/s at which each segment's lines move on within its record, (n,) each."""
+        walks, speeds = np.sign(self.record_middle), np.sign(self.speeding)
+        return tuple(self._gained(each, walks, speeds) for each in self.waveform)
+
+    def _gained(self, segment: Segment, walked: np.ndarray, sped: np.ndarray | float) -> np.ndarray:
+        """Hz that a segment's lines gain in a time [s] of range walk and one of acceleration."""
+        closing = self.radial_velocity + self.approach
+        closing = closing + self.acceleration * (2 * segment.start + 1.5 * self.speeding)
+        by_speed = segment.carrier * self.acceleration * sped
+        return np.asarray(2 / SPEED_OF_LIGHT * (by_speed + segment.chirp_rate * closing * walked))
+
+    @property
+    def beats_by_motion(self) -> tuple[np.ndarray, np.ndarray]:
+        """Hz of each segment's beat for a Doppler ratio, and for -2R/c, (3, n): carriers and rates.
+
+        They refer to the shot's start, of a target at a steady speed. A record tells the delay at
+        its middle, and at twice that by the phase's own curve.
+        """
+        starts, slopes, carriers, walk, rate = (
+            np.array([np.broadcast_to(v, self.size) for v in values])
+            for values in (
+                self.starts, self.slopes, self.carriers, (self.walk,), (self.chirp_rate,)
+            )
+        )  # fmt: skip
+        times = starts + walk - (starts[0] + starts[2]) / 2
+        return carriers + slopes * rate * times, slopes * rate
+
+    @property
     def moves_on(self) -> bool:
         """True where the target moves on between segments."""
         return any(np.any(start) for start in self.starts)
@@ -590,7 +634,7 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
         amplifier_bandwidth=p[RECEIVER + "amplifier_bandwidth"],
         leakage_floor=np.asarray(accuracy.leakage_floor, float),
         leakage_tolerance=accuracy.for_leakage,
-        beamlets_error=p.get(BEAMLETS_ERROR, np.asarray(0.0)),
+        beamlets_error=p.get(BEAMLETS_ERROR, np.asarray(np.nan)),
         line_tolerance=accuracy.for_lines / math.sqrt(looks.averaged),
         echo_scale=echo_scale,
         beat_scale=current_scale * p[RECEIVER + "transimpedance"],

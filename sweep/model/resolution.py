@@ -134,6 +134,7 @@ def resolved_categories(
                 number, pattern, error = beamlets_needed(p, index.size)
             else:
                 number, pattern = map(np.asarray, finest(p))
+                error = np.asarray(np.nan)  # of amplitudes that add nothing is estimated
         chosen = {BEAMLETS: number, PATTERN: pattern, BEAMLETS_ERROR: error}
         for some, q in categories(p | chosen, further):
             yield index[some], q

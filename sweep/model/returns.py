@@ -13,8 +13,10 @@ neighbours, so that another may be the largest, or to all bins of a group's echo
 
 Ranges and velocities are those at the shot's start, the instant of the truth. Range walk moves the
 interpolated range by v_r (T_w + 2 t_0), and motion between segments moves both. The velocity that
-is measured with them corrects both; nothing tells of the acceleration. Of segments with slopes
-other than 1, 0 and -1 a return is the fit of all its peaks.
+is measured with them corrects both. Nothing in the beats tells of the acceleration, or of ground
+that slides under the beam: the instrument's own motion, where it is known, corrects the points for
+them as far as it can (:mod:`sweep.model.own_motion`). Of segments with slopes other than 1, 0 and
+-1 a return is the fit of all its peaks.
 
 Echoes in developed speckle fade: in noise by factors on each group's magnitudes in the three
 segments, which share what their speckles do. Against probabilities the down segment's probability
@@ -54,7 +56,13 @@ from sweep.model.draws import (
 )
 from sweep.model.estimators import Deviation, resolved_deviation
 from sweep.model.groups import BIN, FIRST, LAST, Groups
-from sweep.model.interpolation import interpolator, spread_error, sub_bin, sub_bin_error
+from sweep.model.interpolation import (
+    drift_error,
+    interpolator,
+    spread_error,
+    sub_bin,
+    sub_bin_error,
+)
 from sweep.model.leaked_peaks import (
     LeakedPeaks,
     draw_leaked,
@@ -64,6 +72,7 @@ from sweep.model.leaked_peaks import (
     peaks_in_noise,
 )
 from sweep.model.marcum import at_least_one
+from sweep.model.own_motion import OwnMotion
 from sweep.model.pairing import (
     ABSENT,
     FALSE,
@@ -119,10 +128,12 @@ def draw_returns(
     first_draw: int = 0,
     draws: int = 1,
     method: str = "probabilities",
+    motion: OwnMotion | None = None,
 ) -> Returns:
     """Draw returns of n prepared shots by their :func:`groups` and keys (n, 2), draw by draw.
 
     ``method`` is ``probabilities`` or ``noise``; any range of draws can be computed alone.
+    ``motion`` is what the instrument knows of its own, by which it corrects range and velocity.
     """
     noisy = method == "noise"
     known, drawn = known_of(shots, found), Drawn.nothing(found, draws)
@@ -136,7 +147,7 @@ def draw_returns(
         _draw(keys[part], rule, of_part, seen, leaks, tables, own)
         for column, values in zip(drawn, own, strict=True):
             column[part] = values
-    return measured(shots, known, drawn)
+    return measured(shots, known, drawn, motion)
 
 
 def _spectra(
@@ -326,9 +337,13 @@ class Told(NamedTuple):
     """Excess of the range told over that at the shot's start [m], (n, 1, 1)."""
 
 
-def measured(shots: Shots, known: Known, drawn: Drawn) -> Returns:
-    """Compute returns from pairs of peaks; flag those that misread their common beamlet."""
+def measured(shots: Shots, known: Known, drawn: Drawn, motion: OwnMotion | None = None) -> Returns:
+    """Compute returns from pairs of peaks; flag those that misread their common beamlet.
+
+    ``motion`` is as of :func:`draw_returns`.
+    """
     fitted = shots.slopes != waveform.SIGNS
+    drawn = _with_drift(shots, drawn)
     told = _fitted(shots, drawn) if fitted else _read(shots, drawn)
     point, group = np.arange(shots.size)[:, None, None], np.maximum(drawn.group, 0)
     sizes = (known.bins[:, :, LAST] - known.bins[:, :, FIRST])[
@@ -344,9 +359,19 @@ def measured(shots: Shots, known: Known, drawn: Drawn) -> Returns:
     signal = (drawn.group[..., 0] >= 0) & (drawn.group[..., 2] >= 0)
     pd = known.pd[point, 0, group[..., 0]] * known.beside[point, 1, group[..., 2]]
     misread = (drawn.flags & TRUE > 0) & ~right
+    uncorrected = told.range[..., FINE].copy(), told.velocity[..., FINE].copy()
     if not fitted:  # what the ground came nearer by within the shot: the measured velocity tells
         told.velocity[..., FINE] *= 1 + columns(shots, shots.slowing, 2)
         told.range[..., FINE] += told.velocity[..., FINE] * columns(shots, shots.walk, 2)
+    if motion is not None:
+        _correct_motion(shots, drawn, told, motion)
+    for values, errors, before in zip(
+        (told.range, told.velocity),
+        (told.range_error, told.velocity_error),
+        uncorrected,
+        strict=True,
+    ):  # whole bins stay uncorrected: their errors say so
+        errors[..., WHOLE] = np.hypot(errors[..., WHOLE], values[..., FINE] - before)
     return Returns(
         told.range[..., WHOLE], told.range[..., FINE],
         told.velocity[..., WHOLE], told.velocity[..., FINE],
@@ -356,6 +381,71 @@ def measured(shots: Shots, known: Known, drawn: Drawn) -> Returns:
         np.where(misread, drawn.flags ^ (TRUE | MISREAD), drawn.flags), drawn.beamlet,
         np.maximum(drawn.group, FALSE),
     )  # fmt: skip
+
+
+def _with_drift(shots: Shots, drawn: Drawn) -> Drawn:
+    """Add to the peaks' errors what the drift of their lines within the record makes."""
+    bins = shots.record_duration * shots.fft_size / shots.sample_rate
+    drift = np.array([np.broadcast_to(abs(rate) * bins, shots.size) for rate in shots.drift_rates])
+    peaks = drawn.peaks.copy()
+    delta = peaks[..., FINE] - peaks[..., WHOLE]
+    wide = drift_error(delta, drift.T[:, None, None], shots.window, shots.fft_size)
+    peaks[..., ERROR] = np.hypot(peaks[..., ERROR], wide)
+    return drawn._replace(peaks=peaks)
+
+
+def _correct_motion(shots: Shots, drawn: Drawn, told: Told, motion: OwnMotion) -> None:
+    """Correct range and velocity between bins for the motion that the instrument knows, in place.
+
+    What it does not know of it goes into the standard errors (:mod:`sweep.model.own_motion`).
+    """
+    acceleration, slip = _moved_by_motion(shots, drawn)
+    known_slip = motion.slip_at(told.range[..., FINE])
+    missing_slip = shots.radial_velocity - shots.approach - motion.slip_at(shots.range)
+    missing_acceleration = shots.acceleration - motion.acceleration
+    grows = columns(shots, motion.acceleration, 2)
+    pairs = ((told.range, told.range_error), (told.velocity, told.velocity_error))
+    for (values, errors), by_slip, by_acceleration in zip(pairs, slip, acceleration, strict=True):
+        values[..., FINE] -= by_slip * known_slip + by_acceleration * grows
+        left = by_slip * columns(shots, missing_slip, 2)
+        left = left + by_acceleration * columns(shots, missing_acceleration, 2)
+        errors[:] = np.hypot(errors, left[..., None])
+
+
+def _moved_by_motion(
+    shots: Shots, drawn: Drawn
+) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    """Range [m] and velocity [m/s] that beats gain by 1 m/s^2 of acceleration, and 1 m/s of slip.
+
+    The slip is the radial velocity less the speed at which the range falls. All broadcast with the
+    returns (n, draws, most).
+    """
+    carriers, rates = shots.beats_by_motion
+    starts = np.array([np.broadcast_to(start, shots.size) for start in shots.starts])
+    within = shots.record_middle
+    light = 2 / SPEED_OF_LIGHT
+    optical = np.array([np.broadcast_to(carrier, shots.size) for carrier in shots.carriers])
+    nearer = starts**2 / 2 + 2 * starts * within + 1.5 * within * shots.speeding
+    by_acceleration = light * (optical * (starts + shots.speeding) + rates * nearer)
+    by_slip = -light * rates * (starts + within)
+    if shots.slopes == waveform.SIGNS:  # half sum and half difference of up and down beat
+        point: np.ndarray | slice = slice(None)
+        weights, shape = np.array([[1.0], [0.0], [1.0]]) + 0 * rates, (shots.size, 1, 1)
+    else:
+        shape = drawn.flags.shape
+        point = np.repeat(np.arange(shots.size), shape[1] * shape[2])
+        peaks = np.moveaxis(drawn.peaks[..., ERROR], 3, 0).reshape(3, point.size)
+        weights = np.where(np.isfinite(peaks), 1 / peaks**2, 0.0)
+    acceleration, slip = (
+        tuple(
+            moved.reshape(shape)
+            for moved in waveform.response(
+                beats[:, point], weights=weights, carriers=carriers[:, point], rates=rates[:, point]
+            )
+        )
+        for beats in (by_acceleration, by_slip)
+    )
+    return acceleration, slip  # type: ignore[return-value]  # pairs
 
 
 def _read(shots: Shots, drawn: Drawn) -> Told:
@@ -471,6 +561,10 @@ def report(at, how, known, found, pairs, out):
         centres[0], centres[2] = peaks[0, u, FINE], peaks[2, v, FINE]
         if k >= 0:
             group[1], centres[1] = which[1, k], peaks[1, k, FINE]
+        for s in range(3):  # groups of complex records may lie whole FFT lengths from their peaks
+            if how.signed != 0.0 and group[s] >= 0:
+                apart = known.bins[i, s, BIN, group[s]] - centres[s]
+                centres[s] += 2 * how.half * math.floor(apart / (2 * how.half) + 0.5)
         own = out.peaks[i, d, r]
         for f in range(4):  # slices would compile an error message of shapes
             own[0, f], own[2, f] = peaks[0, u, f], peaks[2, v, f]

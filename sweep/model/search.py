@@ -43,7 +43,8 @@ def cut(shots: Any, runs: Any) -> Any:
 def beamlet_lines(shots: Any) -> np.ndarray:
     """Places of each beamlet's line in the three spectra [bins, 0..N/2], (n, 3, beamlets).
 
-    In spectra of complex records -N/2 .. N/2.
+    In spectra of complex records -N/2 .. N/2. Lines that drift within the record, by range walk and
+    acceleration, lie where they are at its middle.
     """
     per_metre = columns(shots, shots.chirp_rate) * (2 / SPEED_OF_LIGHT)  # as a beat [Hz]
     distance = per_metre * columns(shots, shots.range), 1 + shots.offset[shots.row]
@@ -54,6 +55,7 @@ def beamlet_lines(shots: Any) -> np.ndarray:
         drifted = SPEED_OF_LIGHT / 2 * own * columns(shots, each.start)
         far = distance[0] * distance[1] - per_metre * (columns(shots, each.nearer) + drifted)
         beat = columns(shots, each.carrier) * beta - each.slope * far * (1 + beta)
+        beat += columns(shots, shots.drifts[s])
         turns = beat / columns(shots, shots.sample_rate)
         lines[:, s] = (turns - np.floor(turns + 0.5)) * shots.fft_size
     return lines if shots.complex_record else abs(lines)

@@ -191,17 +191,8 @@ def fit(
     Frequencies of peaks [Hz] by segment, (3, n), and weights, 0 where a segment is not detected;
     ``point`` says which point each is of.
     """
-    size = (shots.size,)
-    walk, rate = np.broadcast_to(shots.walk, size), np.broadcast_to(shots.sample_rate, size)
-    starts, slopes, carriers = (
-        np.array([np.broadcast_to(v, size) for v in values])
-        for values in (shots.starts, shots.slopes, shots.carriers)
-    )
-    # A record tells the delay at its middle, and at twice that by the phase's own curve.
-    times = starts + walk - (starts[0] + starts[2]) / 2
-    rates = slopes * shots.chirp_rate
-    rate = rate[point]
-    carriers = carriers + rates * times
+    carriers, rates = shots.beats_by_motion
+    rate = np.broadcast_to(shots.sample_rate, (shots.size,))[point]
     return waveform.fit(
         peaks, weights=weights, carriers=carriers[:, point], rates=rates[:, point],
         sample_rate=rate, bin_width=rate / shots.fft_size, signed=shots.complex_record,

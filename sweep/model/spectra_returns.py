@@ -35,6 +35,7 @@ from sweep.model.noisy_spectra import (
     unrolled,
     view_of,
 )
+from sweep.model.own_motion import OwnMotion
 from sweep.model.pairing import FALSE
 from sweep.model.preparation import Parameters, Shots
 from sweep.model.returns import Drawn, How, Returns, known_of, measured, put, report
@@ -50,6 +51,7 @@ def spectra_returns(
     methods: Methods,
     first_draw: int = 0,
     draws: int = 1,
+    motion: OwnMotion | None = None,
 ) -> Returns:
     """Draw returns as :func:`sweep.model.returns.draw_returns` does, by the methods of these names.
 
@@ -86,7 +88,7 @@ def spectra_returns(
                     which[s, k] = groups[k]
                 number[s] = bins.size
             report((i, d), how, known, (peaks, which, number), pairs, drawn)
-    return measured(shots, known, drawn)
+    return measured(shots, known, drawn, motion)
 
 
 def _bins_of(view: View, segment: int, signal: Signal | None) -> np.ndarray:

@@ -324,6 +324,22 @@ def _least_squares(
     return beta, x
 
 
+def response(
+    beats: np.ndarray, *, weights: np.ndarray, carriers: np.ndarray, rates: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Change of range [m] and radial velocity [m/s] that :func:`fit` makes of a change of beats.
+
+    Changes of the signed beats [Hz] and the rest are (k, n), as of :func:`fit`; 0 where beats tell
+    nothing.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        beta, x = _least_squares(beats, weights, carriers, rates)
+    ranges, velocities = (
+        np.where(np.isfinite(value), SPEED_OF_LIGHT / 2 * value, 0.0) for value in (x, beta)
+    )
+    return ranges, velocities
+
+
 def _by_signs(  # type: ignore[no-untyped-def]  # seven arrays and a word
     peaks, weights, carriers, rates, sample_rate, bin_width, assumed
 ):

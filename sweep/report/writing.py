@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +17,7 @@ import yaml
 
 from sweep.analysis import labels, noise_only
 from sweep.analysis.charts import Chart, Room
+from sweep.analysis.consistency import consistency
 from sweep.analysis.figures import SceneStudy, Study, held
 from sweep.analysis.opening import ACCURACY, GRID, SCENE, NotAStoreError, read_attributes
 from sweep.analysis.scenes.recording import INTERPOLATED, QUANTITIES, shown
@@ -121,9 +123,12 @@ def _answer(
         pd = group["pd_shot"]
         over = [group[name] > most for name, most in limits.items() if name in group]
         missed = sum(over, xr.DataArray(0)) > 0
-        found.append((pd.count(), (pd >= level).sum(), pd.sum(), pd.min(), missed.sum()))
+        unchecked = pd.notnull() & group["beamlets_error"].isnull()
+        found.append(
+            (pd.count(), (pd >= level).sum(), pd.sum(), pd.min(), missed.sum(), unchecked.sum())
+        )
     columns = np.array(dask.compute(found)[0], float).T  # a column a group
-    count, often, total, _, missed = columns.sum(axis=1)
+    count, often, total, _, missed, unchecked = columns.sum(axis=1)
     if not count:
         return Section("answer", "Answer", ["No result is there yet."])
     told = [
@@ -137,7 +142,13 @@ def _answer(
         chance = f"{most:.3g}" + " at the most" * (len(alarms) > 1)
         told.append(f"Noise alone raises a false alarm in either chirp with probability {chance}.")
     kept = f"missed at {missed:,.0f} {unit}" if missed else f"kept at all of these {unit}"
-    return Section("answer", "Answer", [*told, f"The tolerance of {tolerance:g} is {kept}."])
+    told.append(f"The tolerance of {tolerance:g} is {kept}.")
+    if unchecked:
+        told.append(
+            f"Whether the number of beamlets keeps it is not checked at {unchecked:,.0f} of them: "
+            "their number is given, or their amplitudes add."
+        )
+    return Section("answer", "Answer", told)
 
 
 def _asked(spec: Declared, flags: Sequence[xr.DataArray], dataset: xr.Dataset) -> Section:
@@ -222,7 +233,9 @@ def _scene_page(store: Location) -> Page:
              ("scanners", ", ".join(map(labels.coordinate, study.scanners)))]  # fmt: skip
     came_back = flights.returns(seen)
     sections = [
-        _answer(spec, groups, "shots", flights.came_back(came_back.frame, groups, fewer)),
+        _answer(spec, groups, "shots", [
+            *flights.came_back(came_back.frame, groups, fewer), *consistency_words(study.tree)
+        ]),
         _section("cloud", "Point cloud", [cloud],
                  [] if cloud else ["No shot has brought back a point."]),
         _section("flight", "Along the flight", flight),
@@ -230,6 +243,16 @@ def _scene_page(store: Location) -> Page:
         _section("tables", "Tables", [came_back, _cloud_points(seen)]),
     ]  # fmt: skip
     return _page(spec, attributes, "blocks", facts, sections, store)
+
+
+def consistency_words(tree: xr.DataTree) -> list[str]:
+    """Return sentences on errors against the standard errors that are stated."""
+    results = consistency(tree)
+    if words := [result.words for result in results if not result.is_consistent]:
+        return words
+    if not any(result.number for result in results):
+        return []
+    return ["Errors of points and of navigation agree with the standard errors that are stated."]
 
 
 def _section(anchor: str, title: str, items: Sequence[Made], words: Sequence[str] = ()) -> Section:
@@ -401,6 +424,8 @@ def accuracy(dataset: xr.Dataset, spec: Declared) -> list[str]:
     left = float(dataset["beamlets_error"].max()) if "beamlets_error" in dataset else 0.0
     if left > 0:
         told.append(f"More beamlets would change one by {left:.2g} at the most.")
+    elif math.isnan(left):
+        told.append("What more beamlets would change is not checked.")
     if "n_draws" in dataset:
         missed = dataset["accuracy_missed"]
         known = int(missed.notnull().sum())

@@ -21,6 +21,8 @@ _FIELDS = {
     "beam_acceleration": "acceleration",
     "beam_approach": "approach",
     "beam_turn_rate": "turn_rate",
+    "beam_turning": "turning",
+    "platform_acceleration": "platform_acceleration",
     **dict(zip(BEAMLETS, BEAMLETS, strict=True)),
 }
 """Field of :class:`Eyepoints` that each array holds."""

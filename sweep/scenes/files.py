@@ -6,7 +6,8 @@ import csv
 import hashlib
 import json
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
+from decimal import Decimal, localcontext
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import unquote
@@ -84,6 +85,10 @@ _HEADING = re.compile(r"\s*([A-Za-z_]+)\s*(?:[\[(]([^\])]*)[\])])?\s*")
 _EXAMPLE = "time [s], x [m], y [m], z [m], heading [deg], pitch [deg], roll [deg]"
 
 
+Line = tuple[int, list[str]]
+"""Number of a line, and its cells."""
+
+
 class Table(NamedTuple):
     """Waypoints of a table."""
 
@@ -93,22 +98,37 @@ class Table(NamedTuple):
     """(n, 4): quaternions (w, x, y, z), body to world; None where the table has no attitude."""
 
 
-def read_waypoints(path: str | Path) -> Table:
+def read_waypoints(path: str | Path, time_origin: Decimal = Decimal(0)) -> Table:
     """Waypoints of a CSV table.
 
     The first row names the columns and their units: ``time [s]``, ``x [km]``, ``y [km]``, ``z
     [m]``. The attitude is either ``qw, qx, qy, qz`` (body to world) or angles. The angles are
     ``heading [deg]`` (counter-clockwise from the x axis), ``pitch [deg]`` (nose up) and
     ``roll [deg]`` (left side up); a missing one is 0. Lines that begin with # are skipped. A file
-    that is missing or no such table raises SceneError.
+    that is missing or no such table raises SceneError. Times [s] count from `time_origin`.
     """
-    table = read_columns(path, COLUMNS, _POSITION, _EXAMPLE)
+    table = read_columns(path, COLUMNS, _POSITION, _EXAMPLE, time_origin)
     position = np.column_stack([table[name] for name in "xyz"])
     return Table(table["time"], position, _attitude(Path(path), table))
 
 
+def first_time(path: str | Path) -> Decimal:
+    """First time [s] of a CSV table of waypoints, with all its digits; SceneError for no table."""
+    path = existing(path)
+    lines = _lines(path)
+    if len(lines) < 2:
+        raise _too_short(path, _EXAMPLE)
+    factors = _factors(path, lines[0][1], COLUMNS, ("time",), _EXAMPLE)
+    _row(path, lines[1], list(factors))
+    return _exact_times(lines[1:2], factors)[0]
+
+
 def read_columns(
-    path: str | Path, columns: Mapping[str, str], required: Collection[str], example: str
+    path: str | Path,
+    columns: Mapping[str, str],
+    required: Collection[str],
+    example: str,
+    time_origin: Decimal = Decimal(0),
 ) -> dict[str, np.ndarray]:
     """Columns of a CSV table in SI, by name, (n,) each; the times rise.
 
@@ -123,39 +143,128 @@ def read_columns(
         Columns that must be there.
     example : str
         A good header.
+    time_origin : Decimal
+        Subtracted from the times [s] in decimal arithmetic, before they become float64: seconds of
+        GPS (1.35e9) would lose 1e-7 s there, and the accelerations of a path with them.
 
     Raises
     ------
     SceneError
-        For a file that is missing or no such table; names the line and what to write.
+        For a file that is missing or no such table; names every line at fault, and what to write.
     """
     path = existing(path)
     lines = _lines(path)
     if len(lines) < 3:
-        remedy = f"write a header ({example}) and a line for each"
-        raise SceneError(path, "holds fewer than two lines of numbers", remedy)
-    factors: dict[str, float] = {}
-    for cell in lines[0][1]:
-        match = _HEADING.fullmatch(cell)
-        name = match[1].lower() if match else ""
-        if match is None or name not in columns:
-            raise SceneError(path, f"has an unknown column '{cell.strip()}'", f"use {example}")
-        if name in factors:
-            raise SceneError(path, f"has two columns '{name}'", "leave one out")
-        factors[name] = _factor(path, name, columns[name], (match[2] or "").strip())
-    missing = [name for name in required if name not in factors]
-    if missing:
-        raise SceneError(path, f"has no column '{missing[0]}'", f"add it: {example}")
-    rows = np.array([_row(path, number, cells, len(factors)) for number, cells in lines[1:]])
-    table = {name: rows[:, i] * factor for i, (name, factor) in enumerate(factors.items())}
-    falls = np.flatnonzero(np.diff(table["time"]) <= 0)
-    if len(falls):
-        line = lines[falls[0] + 2][0]
-        raise SceneError(path, f"line {line}: the time does not rise", "sort the lines by time")
+        raise _too_short(path, example)
+    factors = _factors(path, lines[0][1], columns, required, example)
+    rows, mistakes = [], []
+    for line in lines[1:]:
+        try:
+            rows.append(_row(path, line, list(factors)))
+        except SceneError as error:
+            mistakes.append(error)
+    if not mistakes:
+        times = _exact_times(lines[1:], factors)
+        mistakes = [
+            _falling_time(path, (lines[i][0], times[i - 1]), (lines[i + 1][0], times[i]))
+            for i in range(1, len(times))
+            if times[i] <= times[i - 1]
+        ]
+    if mistakes:
+        raise _joined(path, mistakes)
+    values = np.array(rows)
+    table = {name: values[:, i] * factor for i, (name, factor) in enumerate(factors.items())}
+    if time_origin:
+        with localcontext(prec=_TIME_DIGITS):
+            table["time"] = np.array([float(time - time_origin) for time in times])
+    same = np.flatnonzero(np.diff(table["time"]) <= 0)
+    if same.size:  # apart by less than float64 can tell
+        line = lines[same[0] + 2][0]
+        rule = f"has a time on line {line} too close to the one before for numbers of 64 bits"
+        raise SceneError(path, rule, "leave one of the two lines out")
     return table
 
 
-def _lines(path: Path) -> list[tuple[int, list[str]]]:
+_MISTAKES_SHOWN = 10
+"""Mistakes of one file that are told; of more, their number."""
+
+
+def _joined(path: Path, mistakes: Sequence[SceneError]) -> SceneError:
+    """All mistakes of a file as one; their rules are predicates of the file."""
+    shown = mistakes[:_MISTAKES_SHOWN]
+    rule = ", and ".join(mistake.rule for mistake in shown)
+    if len(mistakes) > len(shown):
+        rule += f", and {len(mistakes) - len(shown)} more mistakes of the kind"
+    return SceneError(path, rule, "; ".join(dict.fromkeys(mistake.remedy for mistake in shown)))
+
+
+def _too_short(path: Path, example: str) -> SceneError:
+    """Refusal of a table without two lines of numbers."""
+    remedy = f"write a header ({example}) and a line for each"
+    return SceneError(path, "holds fewer than two lines of numbers", remedy)
+
+
+def _exact_times(lines: Sequence[Line], factors: Mapping[str, float]) -> list[Decimal]:
+    """Return the times [s] of lines of finite numbers, with all digits that are written."""
+    column, factor = list(factors).index("time"), Decimal(repr(factors["time"]))
+    with localcontext(prec=_TIME_DIGITS):
+        return [Decimal(cells[column].strip()) * factor for _, cells in lines]
+
+
+_TIME_DIGITS = 60
+"""Significant digits of times while they are decimals."""
+
+
+def _falling_time(
+    path: Path, before: tuple[int, Decimal], after: tuple[int, Decimal]
+) -> SceneError:
+    """Refusal of a time, given with its line, that does not exceed the time before."""
+    (line, time), (next_line, next_time) = before, after
+    if next_time == time:
+        rule = f"has the time {next_time.normalize():f} s on line {line} and again on {next_line}"
+        return SceneError(path, rule, "leave one line of each time")
+    rule = (
+        f"has a time on line {next_line}, {next_time.normalize():f} s, that is earlier than the "
+        f"{time.normalize():f} s on line {line}"
+    )
+    return SceneError(path, rule, "sort the lines by time")
+
+
+def _factors(
+    path: Path,
+    header: Sequence[str],
+    columns: Mapping[str, str],
+    required: Collection[str],
+    example: str,
+) -> dict[str, float]:
+    """Factor that makes each column SI, by name in the order of the header; all its mistakes."""
+    factors: dict[str, float] = {}
+    mistakes: list[SceneError] = []
+    for cell in header:
+        match = _HEADING.fullmatch(cell)
+        name = match[1].lower() if match else ""
+        if match is None or name not in columns:
+            rule = f"has an unknown column '{cell.strip()}'"
+            mistakes.append(SceneError(path, rule, f"use {example}"))
+        elif name in factors:
+            mistakes.append(SceneError(path, f"has two columns '{name}'", "leave one out"))
+        else:
+            factors[name] = 1.0
+            try:
+                factors[name] = _factor(path, name, columns[name], (match[2] or "").strip())
+            except SceneError as error:
+                mistakes.append(error)
+    mistakes += [
+        SceneError(path, f"has no column '{name}'", f"use {example}")
+        for name in required
+        if name not in factors
+    ]
+    if mistakes:
+        raise _joined(path, mistakes)
+    return factors
+
+
+def _lines(path: Path) -> list[Line]:
     """Line numbers and cells of all lines that say something."""
     try:
         text = path.read_text(encoding="utf-8-sig")
@@ -176,27 +285,36 @@ def _factor(path: Path, name: str, si: str, unit: str) -> float:
             raise SceneError(path, f"gives '{name}' a unit", "quaternions have none")
         return 1.0
     example = f"{name} [{si}]"
+    if not unit:
+        raise SceneError(path, f"has no unit for column '{name}'", f"write e.g. {example}")
     try:
-        if not unit:
-            raise QuantityError("has none")
         return read_unit(unit, si_unit=si, example=example).to_si(1)  # type: ignore[arg-type]
     except QuantityError as error:
-        rule = f"the unit of column '{name}' {error.rule}"
+        rule = f"has a wrong unit for column '{name}': it {error.rule}"
         raise SceneError(path, rule, f"write e.g. {example}") from None
 
 
-def _row(path: Path, number: int, cells: list[str], columns: int) -> list[float]:
-    """Numbers of a line."""
-    if len(cells) != columns:
-        rule = f"line {number} has {len(cells)} cells under {columns} columns"
-        raise SceneError(path, rule, "fill or cut it")
+def _row(path: Path, line: Line, names: Sequence[str]) -> list[float]:
+    """Numbers of a line, in the order of the columns' names."""
+    number, cells = line
+    if len(cells) != len(names):
+        rule = f"has {len(cells)} cells under {len(names)} columns on line {number}"
+        raise SceneError(path, rule, "fill or cut the line")
+    values = [_finite_number(cell) for cell in cells]
+    if None in values:
+        wrong = values.index(None)
+        rule = f"has no finite number in column '{names[wrong]}' on line {number}: "
+        raise SceneError(path, f"{rule}'{cells[wrong].strip()}'", "write plain numbers")
+    return [value for value in values if value is not None]
+
+
+def _finite_number(cell: str) -> float | None:
+    """Value of a cell; None if it is no finite number."""
     try:
-        values = [float(cell) for cell in cells]
+        value = float(cell)
     except ValueError:
-        values = [np.nan]
-    if not np.isfinite(values).all():
-        raise SceneError(path, f"line {number} holds no finite numbers", "write plain numbers")
-    return values
+        return None
+    return value if np.isfinite(value) else None
 
 
 def _attitude(path: Path, table: Mapping[str, np.ndarray]) -> np.ndarray | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from decimal import Decimal
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -66,7 +67,7 @@ class WaypointPath(Part):
         """Return the path through the file's waypoints."""
         from sweep.scenes.files import read_waypoints
 
-        table = read_waypoints(files.path(self.file))
+        table = read_waypoints(files.path(self.file), files.time_origin)
         return laws.Waypoints(table.time, table.position, smooth=self.smooth)
 
 
@@ -172,7 +173,7 @@ class Tracked(Part):
 
         if self.file is None:
             raise ValueError("needs a table: name its file, or take waypoints for the path")
-        table = read_waypoints(files.path(self.file))
+        table = read_waypoints(files.path(self.file), files.time_origin)
         if table.attitude is None:
             remedy = "add heading, pitch and roll, or qw, qx, qy and qz"
             raise SceneError(self.file, "has no attitude to follow", remedy)
@@ -215,6 +216,14 @@ class Platform(Motion):
         "Standard deviation of random turns about each body axis", "20 urad", "0 rad", "10 deg",
         default=0.0,
     )  # fmt: skip
+
+    def time_origin(self, files: Files) -> Decimal:
+        """Time [s] in tables at which the flight begins: the first of the path's table, or 0."""
+        from sweep.scenes.files import first_time
+
+        if not isinstance(self.path, WaypointPath):
+            return Decimal(0)
+        return first_time(files.path(self.path.file))
 
     def flight(self, files: Files, span: Span | None = None) -> laws.Flight:
         """Movement of the instrument."""

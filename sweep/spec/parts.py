@@ -8,6 +8,7 @@ import json
 import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from decimal import Decimal
 from functools import cache
 from pathlib import Path
 from types import MappingProxyType
@@ -441,6 +442,8 @@ class Files:
     """Folder that their paths are relative to; ~ is the user's own."""
     digests: Mapping[str, str] = dataclasses.field(default_factory=dict)
     """Digest of each file by its path as written."""
+    time_origin: Decimal = Decimal(0)
+    """Time [s] in tables of waypoints that is the flight's 0: the first of the platform's table."""
 
     def path(self, written: str, digest: Callable[[Path], str] = file_digest) -> Path:
         """Path of a file; a `SceneError` if it has changed since the spec was loaded."""

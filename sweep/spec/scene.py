@@ -412,6 +412,20 @@ def surfaces_of(scene: Scene) -> tuple[Surface, ...]:
     )
 
 
+def projection_of(scene: Scene, files: Files) -> str:
+    """WKT of the map projection of a scene's coordinates [m], or ''.
+
+    It is empty where rasters state none, or several. The scene's origin has to be added to
+    coordinates in a store.
+    """
+    from sweep.scenes.map_projection import projection_in_metres
+    from sweep.scenes.rasters import raster_digest
+
+    rasters = [thing for thing in scene.objects.values() if isinstance(thing, RasterGround)]
+    found = {projection_in_metres(files.path(thing.file, raster_digest)) for thing in rasters}
+    return found.pop() if len(found) == 1 else ""
+
+
 def build(scene: Scene, files: Files, span: Span) -> World:
     """Build a scene; a `SceneError` for an unfit file or object.
 

@@ -5,7 +5,9 @@ Names and references, objects, files, the flight, and axes that would move the r
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -219,6 +221,8 @@ def _flight_findings(
     findings: list[Finding] = []
     files = Files(base or Path())
     if platform is not None and (base is not None or not _on_files(platform)):
+        with contextlib.suppress(SceneError):  # which is found where the path is made
+            files = replace(files, time_origin=platform.time_origin(files))
         findings += _motion_findings(platform, ("platform",), files, None)
         if not findings:
             path = platform.path.path(files)

@@ -490,8 +490,9 @@ class SceneSpec(Study):
 
     @property
     def files(self) -> Files:
-        """The scene's files."""
-        return Files(self._base, self._digests)
+        """The scene's files, with the time in them at which the flight begins."""
+        files = Files(self._base, self._digests)
+        return replace(files, time_origin=self.platform.time_origin(files))
 
     def parameters(self) -> dict[str, float | int | str]:
         """SI values of all parameters by dotted path; of those on axes, the value off the axis."""

@@ -23,6 +23,7 @@ from sweep.model.outputs import (
     STATISTICS,
 )
 from sweep.model.resolution import by_tolerance, effects_tolerance
+from sweep.spec.scene import projection_of
 from sweep.storage.locations import Location, eyepoints_path
 from sweep.storage.sound import open_arrays
 from sweep.tasks.eyepoint_study import (
@@ -173,7 +174,12 @@ class FlightStudy(GrowingStudy):
         return block - number + grid.number((*axes, 0, cycles))
 
     def attributes(self) -> dict[str, Any]:
-        """Title, question, spec, and what the numbers of scanners and surfaces mean."""
+        """Title, question, spec, meaning of the numbers of scanners and surfaces, and origins.
+
+        ``projection`` is the WKT of the coordinates in the scene's files, or empty. ``origin`` [m]
+        and ``time_origin`` [s], a decimal with all its digits, are where these files have the zero
+        of positions and times in the store.
+        """
         return {
             "kind": "scene",
             "title": self.spec.title,
@@ -183,6 +189,8 @@ class FlightStudy(GrowingStudy):
             "scanners": list(self.spec.scanners),
             "eyepoints": {name: self.spec.geometry_id(name) for name in self.spec.scanners},
             "origin": np.asarray(world_of(self.spec).origin, float).tolist(),
+            "projection": projection_of(self.spec.scene, self.spec.files),
+            "time_origin": f"{self.spec.files.time_origin.normalize():f}",
         }
 
     def groups(self) -> dict[str, dict[str, Any]]:

@@ -318,3 +318,11 @@ def test_a_study_of_whole_spectra_answers_with_what_it_counted(tmp_path):
     assert "range_rmse" in dataset.sweep.compare(dataset)
     with pytest.raises(ValueError, match="has no closed form"):
         dataset.sweep.roc()
+
+
+@pytest.mark.parametrize("far", ["1000 km", "1 m", "9.0001 km", float("nan")])
+def test_the_nearest_value_is_not_taken_from_outside_the_grid(surface, far):
+    """1,000 km of a grid to 9 km used to be 9 km."""
+    with pytest.raises(ValueError, match="lies outside the grid, which reaches from 10 to 9000 m"):
+        surface.sweep.sel(range=far, method="nearest")
+    assert surface.sweep.sel(range="9 km", method="nearest").range.item() == 9000

@@ -5,6 +5,7 @@ import csv
 import laspy
 import numpy as np
 import pytest
+import rasterio
 import trimesh
 import xarray as xr
 from drawn_scenes import FAR, cut_short, flown
@@ -13,6 +14,7 @@ from sweep.analysis.export import COLUMNS, PointTable, export, write_las
 from sweep.analysis.opening import NotAStoreError, opened
 from sweep.analysis.scenes.recording import Recording
 from sweep.model.pairing import TRUE
+from sweep.scenes.map_projection import projection_in_metres
 from sweep.spec import SpecError
 
 
@@ -40,7 +42,21 @@ def expected(store, *, scanner="pair", power=1, draw=1, ranges="interpolated"):
         columns[name] = arrays[name].values[there]
     for name in ("time", "beam"):
         columns[name] = arrays[name].values[shot]
+    ahead, beam = arrays.platform_velocity.values[shot], arrays.beam_direction.values[shot]
+    side = np.cross(beam, ahead)[:, 2]  # over 0 on the right
+    columns["scan_angle"] = np.degrees(np.arccos(-beam[:, 2])) * np.where(side < 0, -1, 1)
     return columns
+
+
+CLOSE = {"scan_angle"}
+"""Columns that are worked out another way here than there."""
+
+
+def same(found, wanted, name):
+    """Tell whether a column is as stored, or close to what it should be where it is worked out."""
+    if name in CLOSE:
+        return found == pytest.approx(wanted, abs=1e-6)
+    return np.array_equal(found, wanted, equal_nan=True)
 
 
 def test_the_columns_of_files_are_those_expected(scene_store):
@@ -60,9 +76,10 @@ def test_a_ply_file_holds_every_point_with_all_fields_as_stored(scene_store, tmp
     np.testing.assert_allclose(cloud.vertices, np.column_stack([wanted[a] for a in "xyz"]),
                                rtol=0, atol=1e-8)  # fmt: skip
     for name in wanted.keys() - set("xyz"):
-        assert np.array_equal(vertices[name], wanted[name], equal_nan=True), name
+        assert same(vertices[name], wanted[name], name), name
     header = file.read_bytes().split(b"end_header")[0].decode()
     for text in ("comment surface 1: block", "comment flag 2: false alarm", "power 1000 mW",
+                 "comment radial_velocity: positive when closing",
                  "radial_velocity_standard_error true_radial_velocity in m s-1"):  # fmt: skip
         assert text in header
     assert list(tmp_path.iterdir()) == [file.parent] and list(file.parent.iterdir()) == [file]
@@ -77,17 +94,24 @@ def test_a_las_file_keeps_a_tenth_of_a_millimetre_and_all_other_fields(
     wanted, las = expected(scene_store), laspy.read(file)
     assert (str(las.header.version), las.header.point_format.id) == ("1.4", 6)
     assert las.header.global_encoding.wkt
+    (projection,) = las.header.vlrs.get("WktCoordinateSystemVlr")
+    assert rasterio.crs.CRS.from_wkt(projection.string) == rasterio.crs.CRS.from_epsg(32633)
     for axis in "xyz":
         assert np.abs(np.asarray(las[axis]) - wanted[axis]).max() <= 0.5e-4 + 1e-9
     assert np.array_equal(las.gps_time, wanted["time"])
-    for name in wanted.keys() - {*"xyz", "time"}:
+    numbers = {"return_number", "number_of_returns", "scan_angle"}
+    for name in wanted.keys() - {*"xyz", "time", *numbers}:
         assert np.array_equal(np.asarray(las[name]), wanted[name], equal_nan=True), name
+    assert np.array_equal(las.stored_return, wanted["return_number"])
+    assert np.array_equal(las.user_data, wanted["beam"]) and len(set(las.user_data)) == 2
+    assert 0.006 * np.asarray(las.scan_angle) == pytest.approx(wanted["scan_angle"], abs=0.0031)
+    assert np.asarray(las.scan_angle).min() < -500 and np.asarray(las.scan_angle).max() > 500
     true = (wanted["flags"] & TRUE) > 0
     assert np.array_equal(np.asarray(las.classification) == 7, ~true) and not true.all()
     decibels = 10 * np.log10(wanted["snr"])
     assert np.asarray(las.intensity) == pytest.approx(100 * decibels, abs=0.51)
     units = {extra.name: extra.description for extra in las.point_format.extra_dimensions}
-    assert units["radial_velocity"] == "m s-1" and units["snr"] == ""
+    assert units["radial_velocity"] == "m s-1; positive when closing" and units["snr"] == ""
     assert (file.read_bytes()[104] >= 128) == (suffix == ".laz")  # the format's compression bit
 
 
@@ -100,7 +124,7 @@ def test_a_csv_file_has_units_in_its_header_and_digits_that_give_the_same_number
     with file.open(newline="") as text:
         header, *rows = csv.reader(text)
     assert header[:6] == ["x [m]", "y [m]", "z [m]", "time [s]", "range [m]",
-                          "radial_velocity [m s-1]"]  # fmt: skip
+                          "radial_velocity [m s-1; positive when closing]"]  # fmt: skip
     assert len(rows) == number == len(wanted["x"])
     columns = np.array(rows, float).T
     for title, column in zip(header, columns, strict=True):
@@ -108,7 +132,7 @@ def test_a_csv_file_has_units_in_its_header_and_digits_that_give_the_same_number
         if name in "xyz":
             assert column == pytest.approx(wanted[name], abs=1e-8)
         else:
-            assert np.array_equal(column, wanted[name], equal_nan=True), name
+            assert same(column, wanted[name], name), name
 
 
 def test_what_is_not_computed_yet_is_left_out(scene_store, tmp_path):
@@ -180,3 +204,53 @@ def test_las_steps_grow_only_where_points_lie_farther_apart_than_its_integers_re
     assert las.header.scales.tolist() == [step] * 3
     x = position[:, 0][there][:, 0] + 4e6
     assert np.abs(np.asarray(las.x) - x).max() <= 0.5 * step + 1e-8
+
+
+def test_returns_of_a_las_file_are_numbered_by_range_and_false_points_apart(scene_store, tmp_path):
+    for draw in range(3):
+        file = tmp_path / f"{draw}.las"
+        export(scene_store, file, scanner="pair", draw=draw, where={"power": "1 W"})
+        las = laspy.read(file)
+        kinds = np.column_stack([las.shot, np.asarray(las.classification) == 7])
+        for kind in np.unique(kinds, axis=0):
+            here = (kinds == kind).all(axis=1)
+            order = np.argsort(np.asarray(las.range)[here], kind="stable")
+            number = np.asarray(las.return_number)[here][order]
+            assert number.tolist() == list(range(1, here.sum() + 1))
+            assert (np.asarray(las.number_of_returns)[here] == here.sum()).all()
+        several = np.asarray(las.number_of_returns) > 1
+        assert several.any()
+        strongest_is_not_nearest = np.asarray(las.stored_return) != np.asarray(las.return_number)
+        assert strongest_is_not_nearest.any()
+
+
+def test_times_and_projections_of_a_scenes_files(tmp_path):
+    """Times of the platform's table come back, and a scene without a map states no projection."""
+    first = "1350000000.25"
+    rows = "".join(f"{first[:-4]}{i}.25, {4 * i}, 0, {300 - i}\n" for i in range(4))
+    (tmp_path / "path.csv").write_text(f"time [s], x [m], y [m], z [m]\n{rows}")
+    ground = {"kind": "plane", "size": "3 km", "reflectance": 0.1}
+    store = flown(
+        tmp_path, axes={}, draws={"number": 1},
+        scanners={"one": {"kind": "corners", "angle": "7.5 deg", "rate": "2 Hz"}},
+        scene={"origin": "ground", "objects": {"ground": ground}},
+        platform={"path": {"kind": "waypoints", "file": "path.csv"}},
+    )  # fmt: skip
+    tree = opened(store)
+    assert tree.attrs["time_origin"] == first and tree.attrs["projection"] == ""
+    assert tree["one"].time.values[0] == 0
+    export(store, tmp_path / "cloud.las")
+    las = laspy.read(tmp_path / "cloud.las")
+    assert las.gps_time.min() == float(first)
+    assert not las.header.global_encoding.wkt and not las.header.vlrs.get("WktCoordinateSystemVlr")
+
+
+@pytest.mark.parametrize(("crs", "stated"), [
+    ("EPSG:32633", True), ("EPSG:2232", False), ("EPSG:3857", False), ("EPSG:4326", False),
+])  # fmt: skip
+def test_only_projections_in_metres_are_those_of_a_scene(tmp_path, crs, stated):
+    shape = {"height": 3, "width": 3, "count": 1, "dtype": "float64"}
+    corner = rasterio.Affine(1, 0, 5, 0, -1, 5)
+    with rasterio.open(tmp_path / "a.tif", "w", driver="GTiff", crs=crs, transform=corner, **shape):
+        pass
+    assert bool(projection_in_metres(tmp_path / "a.tif")) == stated

@@ -52,7 +52,9 @@ WHOLE = {
 
 SOURCES = sorted((REPOSITORY / "sweep").rglob("*.py"))
 
-MAKES_A_FILE = ("import trimesh\n", "import numpy as np\n\ntime")
+MAKES_A_FILE = (
+    "import trimesh\n", "import numpy as np\n\ntime", "from pathlib import Path\n\n_ = Path("
+)  # fmt: skip
 """Beginnings of blocks that make what a spec reads."""
 
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.S | re.M)

@@ -1,10 +1,14 @@
 import math
+import re
+from decimal import Decimal
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from sweep.model.geometry.platform import Waypoints
 from sweep.model.geometry.quaternion import about, from_heading, multiply, rotate
-from sweep.scenes.files import SceneError, read_waypoints
+from sweep.scenes.files import SceneError, first_time, read_waypoints
 
 PLAIN = "time [s], x [m], y [m], z [m]\n0, 0, 0, 500\n2, 50, 0, 450\n4, 90, 10, 420\n"
 
@@ -66,12 +70,19 @@ def test_remarks_blank_lines_and_a_byte_order_mark_are_passed_over(table):
         (PLAIN.replace("z [m]", "height [m]"), "unknown column 'height"),
         (PLAIN.replace(", z [m]", ""), "no column 'z'"),
         (PLAIN.replace("z [m]", "y [m]"), "two columns 'y'"),
-        (PLAIN.replace("x [m]", "x"), "unit of column 'x' has none"),
-        (PLAIN.replace("x [m]", "x [s]"), "unit of column 'x' needs a unit like m"),
-        (PLAIN.replace("50, 0,", "50,"), "line 3 has 3 cells under 4"),
-        (PLAIN.replace("50, 0,", "fifty, 0,"), "line 3 holds no finite numbers"),
-        (PLAIN.replace("50, 0,", "inf, 0,"), "line 3 holds no finite numbers"),
-        (PLAIN.replace("\n4,", "\n2,"), "line 4: the time does not rise"),
+        (PLAIN.replace("x [m]", "x"), "has no unit for column 'x'"),
+        (
+            PLAIN.replace("x [m]", "x [s]"),
+            "has a wrong unit for column 'x': it needs a unit like m, and 's' is none",
+        ),
+        (PLAIN.replace("50, 0,", "50,"), "has 3 cells under 4 columns on line 3"),
+        (PLAIN.replace("50, 0,", "fifty, 0,"), "no finite number in column 'x' on line 3: 'fifty'"),
+        (PLAIN.replace("50, 0,", "inf, 0,"), "no finite number in column 'x' on line 3: 'inf'"),
+        (PLAIN.replace("\n4,", "\n2,"), "has the time 2 s on line 3 and again on 4"),
+        (
+            PLAIN.replace("\n4,", "\n1,"),
+            "time on line 4, 1 s, that is earlier than the 2 s on line 3",
+        ),
         ("time [s], x [m], y [m], z [m]\n0,0,0,1\n", "fewer than two"),
         ("", "fewer than two"),
         ("time [s],x [m],y [m],z [m],qw\n0,0,0,1,1\n1,0,0,1,1\n", "part of a quaternion"),
@@ -96,3 +107,80 @@ def test_a_file_that_is_not_there_or_no_text_is_refused(tmp_path):
     (tmp_path / "b.csv").write_bytes(b"\xff\xfe\x00\x01")
     with pytest.raises(SceneError, match="UTF-8"):
         read_waypoints(tmp_path / "b.csv")
+
+
+def test_all_mistakes_of_a_table_are_told_at_once(table):
+    rows = "0, 0, 0, 500\n0, one, 0, 450\n2, 0, 0\n1, 0, 0, 1\n"
+    with pytest.raises(SceneError) as refused:
+        read_waypoints(table(f"time, x [m], y [s], height [m]\n{rows}"))
+    for said in (
+        "no unit for column 'time'",
+        "column 'y'",
+        "unknown column 'height [m]'",
+        "no column 'z'",
+    ):
+        assert said in refused.value.rule
+    with pytest.raises(SceneError) as refused:
+        read_waypoints(table(f"time [s], x [m], y [m], z [m]\n{rows}"))
+    assert refused.value.rule == (
+        "has no finite number in column 'x' on line 3: 'one', and "
+        "has 3 cells under 4 columns on line 4"
+    )
+    with pytest.raises(SceneError) as refused:
+        read_waypoints(table(PLAIN + "4, 0, 0, 0\n3, 0, 0, 0\n"))
+    assert refused.value.rule == (
+        "has the time 4 s on line 4 and again on 5, and "
+        "has a time on line 6, 3 s, that is earlier than the 4 s on line 5"
+    )
+    assert refused.value.remedy == "leave one line of each time; sort the lines by time"
+
+
+def test_of_many_mistakes_the_first_are_told_and_the_others_counted(table):
+    with pytest.raises(SceneError, match="on line 11: 'x', and 30 more mistakes of the kind"):
+        read_waypoints(table(PLAIN.partition("\n")[0] + "\n" + "x, 0, 0, 0\n" * 40))
+
+
+GPS = Decimal("1350000000.123456")
+
+
+def accelerating(first, unit="s", factor=1):
+    """Table of a steady speed, 100 m/s, whose times begin with a first one, every 10 ms."""
+    rows = [f"{(first + Decimal(i) / 100) * factor}, {i}, 0, 500" for i in range(200)]
+    return f"time [{unit}], x [m], y [m], z [m]\n" + "\n".join(rows) + "\n"
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("s", 1), ("ms", 1000), ("us", 10**6)])
+def test_seconds_of_gps_keep_all_their_digits(table, unit, factor):
+    path = table(accelerating(GPS, unit, factor))
+    assert first_time(path) == GPS
+    found, plain = read_waypoints(path, GPS), np.arange(200) / 100
+    np.testing.assert_array_equal(found.time, plain)
+    motion = Waypoints(found.time, found.position).motion(plain)
+    assert np.abs(motion.acceleration).max() < 1e-8  # 0.07 by differences of 64-bit seconds
+    np.testing.assert_allclose(motion.velocity[:, 0], 100, atol=1e-9)
+
+
+def test_a_first_time_is_read_from_a_table_that_is_one():
+    with pytest.raises(SceneError, match="does not exist"):
+        first_time("nowhere.csv")
+
+
+def test_a_table_without_a_line_or_a_unit_has_no_first_time(table):
+    with pytest.raises(SceneError, match="fewer than two lines"):
+        first_time(table("time [s], x [m], y [m], z [m]\n"))
+    with pytest.raises(SceneError, match="no unit for column 'time'"):
+        first_time(table(PLAIN.replace("time [s]", "time")))
+
+
+def test_the_table_that_the_documentation_shows_is_read_as_it_says(table):
+    page = Path(__file__).parents[2] / "docs" / "howto" / "fly_a_recorded_path.md"
+    text = re.search(r'write_text\("""\\\n(.*?)"""\)', page.read_text("utf-8"), re.S)[1]
+    path = table(text)
+    assert first_time(path) == 1350000000
+    found = read_waypoints(path, first_time(path))
+    np.testing.assert_array_equal(found.time, [0, 0.5, 1, 1.5])
+    np.testing.assert_array_equal(found.position[2], [1, 39, 371])
+    forward, left = (rotate(found.attitude[1], axis) for axis in ([1.0, 0, 0], [0, 1.0, 0]))
+    np.testing.assert_allclose(forward, [0, math.cos(math.radians(2)), -math.sin(math.radians(2))],
+                               atol=1e-15)  # fmt: skip
+    assert left[2] == pytest.approx(math.sin(math.radians(1.5)) * math.cos(math.radians(2)))

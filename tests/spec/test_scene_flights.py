@@ -1,6 +1,7 @@
 """Platforms, paths, attitudes and scanners as specs declare them, against closed forms."""
 
 import math
+from decimal import Decimal
 
 import numpy as np
 import pytest
@@ -260,3 +261,27 @@ def test_a_scene_is_told_from_a_target_by_what_the_file_holds(tmp_path):
     for spec in (scene, target):
         again = from_stored(spec.to_json())
         assert (type(again), again.id, again) == (type(spec), spec.id, spec)
+
+
+def test_tables_of_gps_seconds_share_the_origin_of_the_platforms_first_time(tmp_path):
+    """At 1.35e9 s float64 is good to 1e-7 s, by which a spline makes 0.07 m/s^2 of rest."""
+    first, header = Decimal("1350000000.1234567"), "time [s], x [m], y [m], z [m]\n"
+    rows = [f"{first + Decimal(i) / 100}, {i}, 0, 500\n" for i in range(101)]
+    (tmp_path / "path.csv").write_text(header + "".join(rows))
+    late = [f"{first + second}, {10 * second}, 0, 5\n" for second in (-1, 0, 1, 2)]
+    (tmp_path / "target.csv").write_text(header + "".join(late))
+    mapping = written(
+        platform={"path": {"kind": "waypoints", "file": "path.csv"}},
+        scene={"origin": "world", "objects": {
+            "ball": {"kind": "sphere", "radius": "20 m", "reflectance": 0.1,
+                     "motion": {"path": {"kind": "waypoints", "file": "target.csv"}}},
+        }},
+    )  # fmt: skip
+    spec = SceneSpec.from_mapping(mapping, base=tmp_path)
+    assert spec.files.time_origin == first
+    flight, (ball,) = spec.flight(), spec.world().bodies
+    assert (flight.start, flight.stop) == (0, 1)
+    state = flight.state(np.linspace(0, 1, 333))
+    assert np.abs(state.acceleration).max() < 1e-8
+    np.testing.assert_allclose(state.velocity[:, 0], 100, atol=1e-9)
+    assert ball.state(np.array([0.5])).position[0, 0] == pytest.approx(5, abs=1e-12)

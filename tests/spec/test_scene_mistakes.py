@@ -142,8 +142,14 @@ def test_a_unit_of_a_mesh_is_one_of_length(tmp_path):
 
 TABLES = [
     ("time [s], x [m], y [m], z [m]\n1, 0, 0, 0\n", "holds fewer than two lines"),
-    ("time [s], x [m], y [m], z [m]\n1, 0, 0, 0\n0, 0, 0, 0\n", "line 3: the time does not rise"),
-    ("time [s], x, y [m], z [m]\n1, 0, 0, 0\n2, 0, 0, 0\n", "the unit of column 'x'"),
+    (
+        "time [s], x [m], y [m], z [m]\n1, 0, 0, 0\n0, 0, 0, 0\n",
+        "names a file that has a time on line 3, 0 s, that is earlier than the 1 s on line 2",
+    ),
+    (
+        "time [s], x, y [m], z [m]\n1, 0, 0, 0\n2, 0, 0, 0\n",
+        "names a file that has no unit for column 'x'",
+    ),
 ]
 
 

@@ -106,7 +106,8 @@ def select(
         a coordinate with a dimension of its own removes that dimension. A coordinate along a zipped
         axis keeps the points of the axis that have it.
     method
-        ``nearest`` takes the nearest value; by default it must be there, to 1e-9 of it.
+        ``nearest`` takes the nearest value, of one between the ends of the coordinate; by default
+        it must be there, to 1e-9 of it.
 
     Raises
     ------
@@ -154,6 +155,12 @@ def _matching(
             raise ValueError(f"{array.name} '{value}' is not on the grid: there is {there}")
         return same
     distance = np.abs(values - float(value))
+    low, high = float(values.min()), float(values.max())
+    if not low - CLOSE * abs(low) <= float(value) <= high + CLOSE * abs(high):
+        raise ValueError(
+            f"{array.name} {value:g} {units} lies outside the grid, which reaches from {low:g} to "
+            f"{high:g} {units}"
+        )
     nearest = values[np.argmin(distance)]
     if method == "nearest":
         return np.flatnonzero(values == nearest)

@@ -309,6 +309,7 @@ def accelerate(shots: Shots, scene: Scene) -> Shots:
             period=shots.look_period,
         )  # fmt: skip
         shots = replace(shots, beat_scale=shots.beat_scale * left)
+    shots = replace(shots, speeding=shots.acquisition_delay + shots.record_duration / 2)
     return _with_phase(
         shots,
         acceleration_phase,

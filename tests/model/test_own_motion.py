@@ -1,0 +1,135 @@
+"""Points of shots in which the instrument turns and brakes: errors corrected, or stated."""
+
+import math
+
+import numpy as np
+import pytest
+from small_scenes import flight, instrument, observed, plate
+
+from sweep.model import philox
+from sweep.model.clouds import cloud
+from sweep.model.effects.catalogue import CORE
+from sweep.model.geometry.mesh import Surface
+from sweep.model.geometry.platform import Spin
+from sweep.model.geometry.scanner import cone, fixed
+from sweep.model.own_motion import own_motion
+from sweep.model.pairing import TRUE
+from sweep.scenes.meshes import clean
+
+MOVING = {*CORE, "range_walk", "acceleration", "segment_motion"}
+BEAMS = cone(4, half_angle=math.radians(15))
+FALL = {"position": (0.0, 0.0, 2800.0), "velocity": (30.0, 0.0, -100.0)}
+WOBBLE = Spin((0.0, math.radians(20), 0.0))
+TURN = Spin((math.radians(3), 0.0, math.radians(60)))
+
+MOTIONS = {
+    "wobbling": {"attitude": WOBBLE},
+    "braking": {"acceleration": (-20.0, 5.0, 15.0)},
+    "turning": {"attitude": TURN, "acceleration": (0.0, 0.0, 10.0)},
+    "falling": {},
+    "on an arm": {"attitude": WOBBLE, "lever_arm": (2.0, 0.0, 0.0)},
+}
+
+
+def tilted(slope):
+    """A plane that rises along x, and half as much along y."""
+    x, y = np.array([-1e5, 1e5, 1e5, -1e5]), np.array([-1e5, -1e5, 1e5, 1e5])
+    corners = np.column_stack([x, y, slope * x + slope / 2 * y])
+    return clean(corners, np.array([[0, 1, 2], [0, 2, 3]]), 0)[0]
+
+
+def errors_of_points(seen, parameters, effects=MOVING, **how):
+    """Errors of range and velocity over their standard errors, of true points, and the errors."""
+    keys = philox.point_keys(np.arange(len(seen.time), dtype=float)[:, None], domain="o", seed=1)
+    got = cloud(
+        seen, parameters=parameters, surfaces=[Surface("ground", 0.2)], keys=keys, draws=30,
+        effects=effects, **how,
+    )  # fmt: skip
+    true = got["flags"] & TRUE > 0
+    assert true.any(axis=(1, 2)).all()
+    found = {}
+    for name in ("range", "radial_velocity"):
+        error = got[f"{name}_interpolated"][true] - got[f"true_{name}"][true]
+        found[name] = error, error / got[f"{name}_interpolated_standard_error"][true]
+    return found
+
+
+def shots(motion, slope=0.0, **keywords):
+    """Shots of four beams at three times of a flight, 109 beamlets each."""
+    scanner = fixed(BEAMS, rate=2.0)
+    path = flight(**(FALL | motion))
+    bodies = [tilted(slope)]
+    return observed(path, bodies=bodies, scanner=scanner, index=range(12), number=109, **keywords)
+
+
+def is_near_one(scores, most=1.5):
+    """Scores of 68 % of the points, and their mean, are those of true standard errors."""
+    inner = np.quantile(np.abs(scores), 0.683)
+    assert 0.3 < inner < most
+    assert np.abs(scores).max() < 6
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.15])
+@pytest.mark.parametrize("name", MOTIONS)
+@pytest.mark.parametrize("method", ["probabilities", "noise"])
+def test_points_of_a_moving_instrument_are_as_good_as_they_say(table_4_1, name, slope, method):
+    parameters = instrument(table_4_1, beamlets=109)
+    found = errors_of_points(shots(MOTIONS[name], slope), parameters, method=method)
+    for _, scores in found.values():
+        is_near_one(scores)
+
+
+def test_a_wobble_of_20_deg_a_second_moves_level_ground_by_no_more_than_millimetres(table_4_1):
+    """Uncorrected it is metres: 2.2 m of 3,127.5 m, stated as 6.4 mm."""
+    seen = shots(MOTIONS["wobbling"])
+    assert np.abs(seen.acceleration).max() > 25
+    (error, _), (speed, _) = errors_of_points(seen, instrument(table_4_1, beamlets=109)).values()
+    assert np.abs(error).max() < 0.08 and np.median(np.abs(error)) < 0.02
+    assert np.abs(speed).max() < 2e-3
+
+
+@pytest.mark.parametrize("down_slope", [-1.0, 0.5])
+@pytest.mark.parametrize("record", ["real", "complex"])
+def test_segments_of_any_slopes_are_corrected_alike(table_4_1, down_slope, record):
+    parameters = instrument(table_4_1, beamlets=109) | {
+        "instrument.chirp.down_slope": down_slope, "instrument.receiver.record": record,
+    }  # fmt: skip
+    for motion in ({}, {"acceleration": (0.0, 0.0, 6.0)}):
+        for _, scores in errors_of_points(shots(motion, 0.1), parameters).values():
+            is_near_one(scores)
+
+
+@pytest.mark.parametrize("left_out", [{"acceleration"}, {"range_walk"}, {"segment_motion"}])
+def test_only_what_is_simulated_is_corrected(table_4_1, left_out):
+    parameters = instrument(table_4_1, beamlets=109)
+    seen = shots(MOTIONS["turning"], 0.1)
+    for _, scores in errors_of_points(seen, parameters, MOVING - left_out).values():
+        is_near_one(scores)
+
+
+def test_a_body_that_moves_is_not_known_and_its_errors_are_stated(table_4_1):
+    """A plate rises faster and faster: 30 m/s^2 that no sensor of the instrument tells."""
+    lift = flight(position=(0.0, 0.0, 0.0), acceleration=(0.0, 0.0, 30.0))
+    seen = observed(
+        flight(**FALL), bodies=[plate()], motion=[lift], scanner=fixed(BEAMS, rate=2.0),
+        index=range(4), number=109,
+    )  # fmt: skip
+    np.testing.assert_allclose(own_motion(seen).acceleration, 0, atol=1e-9)
+    (error, scores), _ = errors_of_points(seen, instrument(table_4_1, beamlets=109)).values()
+    assert np.abs(error).min() > 0.5
+    is_near_one(scores)
+
+
+def test_known_motion_is_the_true_one_over_level_ground():
+    for motion in MOTIONS.values():
+        seen = shots(motion)
+        known = own_motion(seen)
+        np.testing.assert_allclose(known.acceleration, seen.acceleration, rtol=1e-9, atol=1e-9)
+        slip = known.slip_at(seen.range)
+        np.testing.assert_allclose(slip, seen.radial_velocity - seen.approach, atol=1e-6)
+
+
+def test_a_beam_that_looks_ahead_is_taken_to_meet_a_wall_that_faces_it():
+    seen = observed(flight(attitude=WOBBLE), beams=np.array([[1.0, 0.0, -0.01]]))
+    known = own_motion(seen)
+    assert known.slip_at(np.array([1e3])).tolist() == [0.0]
