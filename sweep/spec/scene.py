@@ -70,7 +70,7 @@ class MeshObject(Solid):
     """A mesh from a file."""
 
     kind: Literal["mesh"]
-    file: str = of.file("The mesh: STL, OBJ, PLY, glTF and whatever trimesh loads")
+    file: str = of.file("The mesh: STL, OBJ, PLY, OFF or glTF; polygons are cut into triangles")
     unit: str | None = of.text("Unit of its lengths; the file's own, or m", None)
     up: str | None = of.choice("Its vertical axis; y for glTF, else z", ("y", "z"), None)
     scale: float = of.number("Factor on all lengths", "2", "1e-9", "1e9", default=1.0)
