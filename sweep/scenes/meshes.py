@@ -55,7 +55,8 @@ class Facets:
     Vertices (n, 3) relative to an origin (3,) [m]: terrain lies millions of metres from the
     zero of its map, and a vertex kept apart from that loses no digits to it. Faces (m, 3) are
     counter-clockwise as seen from outside; surface (m,) int16 is the index of each face's in
-    the scene's list. Notes say what was done as they were read.
+    the scene's list. Notes say what was done as they were read. Those of a grid need no mending:
+    their vertices are distinct and used, their faces too, and each has an area.
     """
 
     vertices: np.ndarray
@@ -63,6 +64,7 @@ class Facets:
     surface: np.ndarray
     origin: np.ndarray
     notes: tuple[str, ...] = ()
+    is_grid: bool = False
 
     @classmethod
     def of(
@@ -97,6 +99,11 @@ class Facets:
             raise ValueError(
                 f"a vertex lies at {place:.3g} m, farther than {COORDINATE_MAX:.0e} m from zero"
             )
+        if self.is_grid:
+            _require_faces(len(self.faces), len(self.faces))
+            centre = round_centre(self.vertices)
+            mesh = Mesh(self.vertices - centre, self.faces, self.surface, centre + self.origin)
+            return mesh, Report(len(self.vertices), len(self.faces), notes=self.notes)
         mesh, report = clean(self.vertices, self.faces, self.surface)
         report = replace(report, notes=self.notes)
         return replace(mesh, origin=mesh.origin + self.origin), report

@@ -399,6 +399,8 @@ class World(NamedTuple):
     """Report of what loading found and mended, a line an object."""
     origin: np.ndarray
     """(3,): what was subtracted from the objects' own coordinates [m]."""
+    warnings: tuple[str, ...] = ()
+    """What is doubtful about the scene's files."""
 
 
 def surfaces_of(scene: Scene) -> tuple[Surface, ...]:
@@ -420,7 +422,7 @@ def build(scene: Scene, files: Files, span: Span) -> World:
     from sweep.model.geometry.mesh import merge
     from sweep.model.geometry.rays import Caster
 
-    origin, grounds = _grounds(scene, files)
+    origin, grounds, warnings = _grounds(scene, files)
     resting: list[Mesh] = []
     moving: list[tuple[Mesh, Flight]] = []
     reports = []
@@ -446,6 +448,7 @@ def build(scene: Scene, files: Files, span: Span) -> World:
         (*(None for _ in meshes), *(flight for _, flight in moving)),
         tuple(reports),
         origin,
+        warnings,
     )
 
 
@@ -454,15 +457,27 @@ def _unfit(name: str, error: Exception) -> SceneError:
     return SceneError(f"scene.objects.{name}", f"can not be made: {error}", "change it")
 
 
-def _grounds(scene: Scene, files: Files) -> tuple[np.ndarray, dict[str, Terrain]]:
-    """Return the scene's origin, and its grounds in the scene's frame."""
+def _grounds(scene: Scene, files: Files) -> tuple[np.ndarray, dict[str, Terrain], tuple[str, ...]]:
+    """Return the scene's origin, its grounds in the scene's frame, and what is doubtful of them."""
+    from sweep.scenes.maps import require_one_map
+    from sweep.scenes.tiles import join_tiles
+
+    things = {name: thing for name, thing in scene.objects.items() if isinstance(thing, Ground)}
     own: dict[str, Terrain] = {}
-    for name, thing in scene.objects.items():
-        if isinstance(thing, Ground):
-            try:
-                own[name] = thing.terrain(files)
-            except (ValueError, ArithmeticError) as error:
-                raise _unfit(name, error) from None
+    for name, thing in things.items():
+        try:
+            own[name] = thing.survey(files)
+        except (ValueError, ArithmeticError) as error:
+            raise _unfit(name, error) from None
+    charts = [(name, terrain.chart) for name, terrain in own.items() if terrain.chart is not None]
+    require_one_map(charts)
+    joined, warnings = join_tiles({name: own[name] for name, _ in charts})
+    for name, terrain in (own | joined).items():
+        warnings += [f"scene.objects.{name}: {warning}" for warning in terrain.warnings]
+        try:
+            own[name] = things[name].shaped(terrain)
+        except (ValueError, ArithmeticError) as error:
+            raise _unfit(name, error) from None
     origin = np.zeros(3)
     if scene.origin in own:
         origin = own[scene.origin].centre
@@ -478,7 +493,7 @@ def _grounds(scene: Scene, files: Files) -> tuple[np.ndarray, dict[str, Terrain]
         beside = isinstance(scene.objects[name], PlacedGround) and name != scene.origin
         shift = 0.0 if beside else origin
         grounds[name] = replace(terrain, origin=terrain.origin - shift)
-    return origin, grounds
+    return origin, grounds, tuple(warnings)
 
 
 def _facets(

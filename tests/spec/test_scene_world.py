@@ -13,7 +13,7 @@ from sweep.model.geometry.rays import Pose
 from sweep.scenes.files import SceneError
 from sweep.spec import SceneSpec
 
-FAR = np.array([4_000_123.375, 777_000.25])
+FAR = np.array([500_123.375, 4_777_000.25])
 """Map coordinates of a raster's middle [m]."""
 
 

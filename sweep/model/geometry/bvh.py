@@ -32,6 +32,9 @@ sideways (some 1e-15 of the range, for ranges to 1e5 times the mesh's size), and
 _FAR = np.float32(3e38)
 """Begin of the empty box; it ends at minus this."""
 
+_AT_ONCE = 1 << 20
+"""Triangles whose boxes are made together."""
+
 _STACK = 8 * 16
 """Entries that the deepest tree can leave behind: seven a level."""
 
@@ -68,13 +71,18 @@ def build(vertices: np.ndarray, faces: np.ndarray) -> Tree:
 
     Vertices (n, 3) float64 [m] are finite and best centred; faces (m, 3) int, m >= 1.
     """
-    corners = [vertices[faces[:, k]] for k in range(3)]
-    low, high = np.minimum.reduce(corners), np.maximum.reduce(corners)
-    slack = _SLACK * float(np.abs(vertices).max())
+    slack = _SLACK * float(max(vertices.max(), -vertices.min()))
     boxes = np.full((len(faces) + 1, 6), _FAR)  # the last for no triangle
-    boxes[:-1, :3] = np.nextafter((low - slack).astype(np.float32), -_FAR)
-    boxes[:-1, 3:] = -np.nextafter((high + slack).astype(np.float32), _FAR)
-    leaves = _in_leaves(low + high)
+    centres = np.empty((len(faces), 3))
+    for first in range(0, len(faces), _AT_ONCE):  # the corners of all at once take much memory
+        part = slice(first, min(first + _AT_ONCE, len(faces)))
+        corners = vertices[faces[part]]
+        low, high = corners.min(axis=1), corners.max(axis=1)
+        boxes[part, :3] = np.nextafter((low - slack).astype(np.float32), -_FAR)
+        boxes[part, 3:] = -np.nextafter((high + slack).astype(np.float32), _FAR)
+        centres[part] = low + high
+    leaves = _in_leaves(centres)
+    del centres
     boxes = boxes[leaves].reshape(-1, LEAF, 6).min(axis=1)
     is_triangle = leaves < len(faces)
     count = is_triangle.reshape(-1, LEAF).sum(axis=1)
