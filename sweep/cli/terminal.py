@@ -339,7 +339,7 @@ def _print_scene(store: Location) -> None:
             [
                 row.part,
                 f"{row.shots:,}",
-                f"{row.pd:.4g}",
+                f"{row.pd:.4g}" if row.pd == row.pd else "no hit",
                 f"{100 * row.true / max(row.shots, 1):.1f} %",
                 f"{row.false:,}",
                 f"{100 * row.solved / row.cycles:.1f} %" if row.cycles else "-",
@@ -482,6 +482,7 @@ def plan_lines(
 def _scene_lines(study: SceneSpec, plan: Plan) -> Iterator[tuple[str, str]]:
     from sweep.model.accuracy import Accuracy
     from sweep.model.resolution import BEAMLETS
+    from sweep.tasks.coverage import coverage
 
     for report in plan.reports:
         yield "scene", report
@@ -495,6 +496,10 @@ def _scene_lines(study: SceneSpec, plan: Plan) -> Iterator[tuple[str, str]]:
             else f"{s.rays:,} rays at {1e6 * s.seconds_a_ray:.3g} us on one core"
         )  # fmt: skip
         yield "", f"{1e6 * s.seconds_a_draw:,.0f} us a shot and draw on one core"
+    seen = coverage(study)
+    for scanner in seen.scanners:
+        yield "hits", f"{scanner.name}: {scanner.text()}"
+    yield "extents", seen.extents()
     places = math.prod(int(axis.size) for axis in study.axes)
     yield "draws", f"{study.draws.number:,}, at {places:,} place(s) along the axes"
 
@@ -562,16 +567,26 @@ def alarms_told(study: Spec | SceneSpec) -> str:
 
 
 def warn_of(study: Spec | SceneSpec) -> None:
-    """Warn of a beam too narrow for its aperture, a path beneath the ground, many false alarms."""
+    """Warn of a beam too narrow for its aperture, of a scene and a path, of many false alarms.
+
+    SceneError for a flight that sees nothing.
+    """
     from sweep.analysis.noise_only import alarms_of_study
     from sweep.spec import SceneSpec
     from sweep.spec.grid_rules import too_narrow
-    from sweep.tasks.eyepoint_study import beneath
+    from sweep.tasks.coverage import coverage, refuse_blind
+    from sweep.tasks.eyepoint_study import beneath, world_of
 
     if narrow := too_narrow(study.parameters_off_axes(), study.axes):
         tell(f"warning: {narrow}", err=True)
-    if isinstance(study, SceneSpec) and (path := beneath(study)):
-        click.echo(f"warning: {path}", err=True)
+    if isinstance(study, SceneSpec):
+        for warning in world_of(study).warnings:
+            tell(f"warning: {warning}", err=True)
+        if path := beneath(study):
+            click.echo(f"warning: {path}", err=True)
+        refuse_blind(study)
+        for warning in coverage(study).warnings():
+            tell(f"warning: {warning}", err=True)
     most = max((any_ for any_, _ in alarms_of_study(study)), default=0.0)
     if most > MANY_ALARMS:
         tell(

@@ -87,14 +87,14 @@ class Terrain:
         vertices[..., 1] = (np.arange(rows) * dy)[:, None]
         vertices[..., 2] = z
         vertices += 0.0  # never -0.0
-        vertices = vertices.reshape(-1, 3)
+        nodes = vertices.reshape(-1, 3)
         if not present.all():
             used = np.zeros(z.size, bool)
             used[faces] = True
             number = np.cumsum(used, dtype=np.int32) - 1
-            faces, vertices = number[faces], vertices[used]
+            faces, nodes = number[faces], nodes[used]
         surface = np.zeros(len(faces), np.int16)
-        return Facets(vertices, faces, surface, self.origin, is_grid=True)
+        return Facets(nodes, faces, surface, self.origin, is_grid=True)
 
 
 def _triangles(present: np.ndarray) -> np.ndarray:
