@@ -452,11 +452,14 @@ def plan_lines(
     study: Spec | SceneSpec, store: Location, workers: int | None
 ) -> Iterator[tuple[str, str]]:
     """Lines, with their headings, of what a study will take."""
-    from sweep.spec import Spec
+    from sweep.spec import SceneSpec, Spec
+    from sweep.tasks.coverage import refuse_blind
     from sweep.tasks.plan import plan
     from sweep.tasks.progress import duration
     from sweep.tasks.session import RunOptions
 
+    if isinstance(study, SceneSpec):
+        refuse_blind(study)
     p = plan(study, store=store, workers=workers)
     if isinstance(study, Spec):
         shape = " x ".join(f"{count} {name}" for name, count in p.block_shape.items())

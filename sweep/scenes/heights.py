@@ -66,21 +66,22 @@ def _doubts(path: Path, values: np.ndarray) -> list[str]:
             break
         least = float(np.min(values, where=inside, initial=np.inf))
         most = float(np.max(values, where=inside, initial=-np.inf))
-        rest = inside & (values > least) & (values < most)
-        if not rest.any():
+        if least == most:
             break
-        below = float(np.min(values, where=rest, initial=np.inf))
-        above = float(np.max(values, where=rest, initial=-np.inf))
+        below = float(np.min(values, where=inside & (values > least), initial=np.inf))
+        above = float(np.max(values, where=inside & (values < most), initial=-np.inf))
         # Each end is held against the span of everything but itself.
         candidates = (
             (least, below - least, most - below),
             (most, most - above, above - least),
         )
         for value, gap, span in candidates:
-            limit = _CUSTOMARY_GAP if value in _CUSTOMARY else _GAP
             count = int(np.count_nonzero(values == value))
-            enough = 1 if value in _CUSTOMARY else _SHARED_CELLS
-            if count >= enough and gap > limit * span and gap > 0:
+            if value in _CUSTOMARY:
+                is_doubtful = gap > _CUSTOMARY_GAP * span
+            else:  # of two heights alone neither is more doubtful than the other
+                is_doubtful = count >= _SHARED_CELLS and gap > _GAP * span > 0
+            if is_doubtful:
                 warnings.append(
                     f"{path}: the value {value:g} stands in {count:,} cells, {gap:.4g} from the "
                     f"next: if it means that there is no data, state 'no_data: {value!r}'"

@@ -48,7 +48,7 @@ class Factors(NamedTuple):
 
 
 class Stated(NamedTuple):
-    """What a user states of a raster's coordinates and heights; None for what is left out."""
+    """A user's statements on a raster's coordinates and heights; None if left out."""
 
     metres_per_degree: tuple[float, float] | None = None
     metres_per_unit: tuple[float, float] | None = None
@@ -90,7 +90,7 @@ def height_factor(path: Path, wkt: str, band_unit: str, stated: str | None, scal
     """Metres to a unit of a raster's heights.
 
     The unit is that of the band, or of the vertical axis of the reference system, or what is
-    stated. Where nothing tells it, it is the metre, unless the map is in another unit: then it is
+    stated. If nothing tells it, it is the metre, unless the map is in another unit: then it is
     asked for. `scaled`: the spec has a factor for the heights, which tells their unit too.
     """
     told = _told_unit(path, wkt, band_unit)
@@ -220,7 +220,7 @@ def _measured(
     told = (
         f"takes a {unit} for {used.east:.6g} m eastwards and {used.north:.6g} m northwards, and on "
         f"the ground it is {middle.east:.6g} m and {middle.north:.6g} m in the middle of what is "
-        f"read: off by up to {100 * error:.2g} %"
+        f"read: off by up to {100 * error:.3g} %"
     )
     if stated is None or error > STATED_SCALE_ERROR:
         raise SceneError(path, told, f"state {suggestion}, or {_reprojected(crs, bounds)}")

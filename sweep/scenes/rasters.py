@@ -74,13 +74,13 @@ def read_raster(
 
     Nodes lie at the centres of the pixels; those without data are holes, and so are those that
     hold the value `no_data`. The raster's own scale and offset are applied, and feet are turned
-    into metres. One in degrees needs metres per degree, east and north, and one on a map whose
-    unit is another length on the ground needs metres per unit (:mod:`sweep.scenes.maps`); one
-    without a scale needs the size of a pixel [m], its lower left corner being the world's origin.
+    into metres. One in degrees needs metres per degree, east and north. One on a map whose
+    unit is another length on the ground needs metres per unit (:mod:`sweep.scenes.maps`). One
+    without a scale needs the size of a pixel [m]; its lower left corner is the world's origin.
     `scaled`: a factor is to be applied to the heights, so that their unit is known.
 
-    SceneError for a file that is missing, no raster, without scale, rotated, in a unit whose size
-    is not known, too large, or without any height; or a band or window that it does not have.
+    SceneError for a file that is missing, no raster, without scale, rotated, too large, without any
+    height, or in a unit whose size is not known; or a band or window that it does not have.
     """
     path = existing(path)
     with _opened(path) as data:

@@ -1,4 +1,4 @@
-"""What a flight sees of its scene: shares of its shots that hit something, and both extents."""
+"""Share of a flight's shots that hit something, and the extents of its path and its scene."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class ScannerCoverage(NamedTuple):
 
 
 class Coverage(NamedTuple):
-    """What a flight sees."""
+    """Shots of a flight that hit something, by scanner, and the extents of path and scene."""
 
     scanners: tuple[ScannerCoverage, ...]
     path: np.ndarray

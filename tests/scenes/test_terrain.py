@@ -171,7 +171,7 @@ def test_a_grid_without_cells_is_refused(z, spacing):
 @pytest.mark.skipif(not GALE.exists(), reason="the shared terrain is not here")
 def test_real_martian_ground_has_the_heights_and_size_its_description_gives():
     ground = read_raster(GALE, metres_per_unit=(1.0, 1.0))  # a third of a per cent too wide
-    assert "off by up to 0.33 %" in ground.warnings[0] and len(ground.warnings) == 1
+    assert "off by up to 0.333 %" in ground.warnings[0] and len(ground.warnings) == 1
     assert ground.heights.shape == (337, 348) and ground.spacing == (1.0, -1.0)
     assert ground.heights.min() == pytest.approx(-4472.67, abs=0.005)
     assert ground.heights.max() == pytest.approx(-4437.88, abs=0.005)

@@ -71,8 +71,8 @@ class Caster:
         """First hits of bundles of beamlets, each bundle from one origin (n, 3) [m].
 
         Directions (n, b, 3) are unit vectors in the world's frame, the beam's centre first. A pose
-        of None is that of a body that rests in the world's frame. What is nearer than
-        `least_range` [m] is passed through. If that is 0, a facet on which a ray starts, within
+        of None is that of a body that rests in the world's frame. Rays pass through all that is
+        nearer than `least_range` [m]. If that is 0, a facet on which a ray starts, within
         rounding, may count as hit or not.
         """
         start, along = (np.ascontiguousarray(a, np.float64) for a in (origins, directions))
