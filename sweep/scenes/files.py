@@ -57,8 +57,8 @@ def file_digest(path: str | Path) -> str:
     return digest.hexdigest()
 
 
-def require_memory(path: Path, needed: float, remedy: str) -> None:
-    """Refuse a file whose reading would take more memory [bytes] than the machine has free."""
+def require_memory(path: str | Path, needed: float, remedy: str) -> None:
+    """Refuse a file or an object that would take more memory [bytes] than the machine has free."""
     import psutil
 
     free = psutil.virtual_memory().available

@@ -26,6 +26,9 @@ _SHARED_CELLS = 4
 _VALUES_MAX = 3
 """Doubtful values that are looked for, one behind the other."""
 
+_ROWS = 256
+"""Rows that are looked at for cliffs at a time."""
+
 CLIFF_SLOPE = 20.0
 """Tangent of the steepest slope between neighbouring cells that is not told."""
 
@@ -46,7 +49,7 @@ def without_data(path: Path, values: np.ndarray, no_data: float | None) -> tuple
         with np.errstate(over="ignore"):
             missing |= values == np.float64(np.float32(no_data))
     values[missing] = np.nan
-    far = np.abs(values) > HEIGHT_MAX
+    far = (values > HEIGHT_MAX) | (values < -HEIGHT_MAX)
     if far.any():
         place = float(values[far][0])
         rule = (
@@ -100,14 +103,15 @@ def cliff_warnings(path: Path, heights: np.ndarray, spacing: tuple[float, float]
     with heights as the grid was resampled.
     """
     number, highest, width = 0, 0.0, 0.0
-    for axis, step in ((1, abs(spacing[0])), (0, abs(spacing[1]))):
-        rise = np.abs(np.diff(heights, axis=axis))
-        with np.errstate(invalid="ignore"):
+    for begin in range(0, len(heights), _ROWS):
+        part = heights[begin : begin + _ROWS + 1]
+        for axis, step in ((1, abs(spacing[0])), (0, abs(spacing[1]))):
+            rise = np.abs(np.diff(part[:_ROWS] if axis else part, axis=axis))
             steep = rise > max(CLIFF_SLOPE * step, CLIFF_HEIGHT)
-        number += int(np.count_nonzero(steep))
-        most = float(np.max(rise, where=steep, initial=0.0))
-        if most > highest:
-            highest, width = most, step
+            number += int(np.count_nonzero(steep))
+            most = float(np.max(rise, where=steep, initial=0.0))
+            if most > highest:
+                highest, width = most, step
     if not number:
         return []
     return [

@@ -79,8 +79,8 @@ def read_raster(
     without a scale needs the size of a pixel [m]; its lower left corner is the world's origin.
     `scaled`: a factor is to be applied to the heights, so that their unit is known.
 
-    SceneError for a file that is missing, no raster, without scale, rotated, too large, without any
-    height, or in a unit whose size is not known; or a band or window that it does not have.
+    SceneError for a file that is missing, no raster, without scale, rotated, too large, or without
+    any height. Likewise for a unit whose size is not known, and a missing band or window.
     """
     path = existing(path)
     with _opened(path) as data:

@@ -11,7 +11,8 @@ import numpy as np
 
 import sweep.spec.parts as of
 from sweep.model.ground import LAWS
-from sweep.scenes.rasters import MOST_CELLS, raster_digest, read_raster
+from sweep.scenes.files import require_memory
+from sweep.scenes.rasters import BYTES_A_CELL, MOST_CELLS, raster_digest, read_raster
 from sweep.spec.parts import Files, Part
 from sweep.spec.sections import SHARE_SCATTERED
 
@@ -94,6 +95,12 @@ class Craters(Part):
         return carve(terrain, craters)
 
 
+def _require_memory(nodes: int) -> None:
+    """Refuse a grid whose triangles would take more memory than there is."""
+    remedy = "take a coarser grid, or a smaller part of it"
+    require_memory(f"a ground of {nodes:,} heights", BYTES_A_CELL * nodes, remedy)
+
+
 class Ground(Material, ABC):
     """A grid of heights and what is done to it, in this order: smooth, refine, relief, craters."""
 
@@ -120,6 +127,7 @@ class Ground(Material, ABC):
 
         if terrain.heights.size * self.factor**2 > MOST_CELLS:
             raise ValueError(f"refined {self.factor} times it has more than {MOST_CELLS:.0e} nodes")
+        _require_memory(terrain.heights.size * self.factor**2)
         if self.smoothing:
             terrain = smooth(terrain, width=self.smoothing)
         if self.factor > 1:
@@ -306,6 +314,7 @@ class SquareGround(PlacedGround):
 
         self.check()
         step, number = self.own_step(), _nodes(self.size, self.own_step())
+        _require_memory(number * number)
         return Terrain(np.zeros((number, number)), (step, step), np.zeros(3))
 
     def check(self) -> None:

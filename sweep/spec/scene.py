@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from sweep.model.geometry.mesh import Mesh, Surface
     from sweep.model.geometry.platform import Flight
     from sweep.model.geometry.rays import Caster
-    from sweep.scenes.meshes import Facets
+    from sweep.scenes.meshes import Facets, Report
     from sweep.scenes.scattered import Law
     from sweep.scenes.terrain import Terrain
 
@@ -429,9 +429,7 @@ def build(scene: Scene, files: Files, span: Span) -> World:
     first = 0
     for name, thing in scene.objects.items():
         try:
-            facets = _facets(name, thing, grounds, origin, files)
-            surface = (facets.surface + first).astype(np.int16)
-            mesh, report = replace(facets, surface=surface).mesh()
+            mesh, report = _mesh(_facets(name, thing, grounds, origin, files), first)
             motion = thing.motion if isinstance(thing, Solid) else None
             if motion is None:
                 resting.append(mesh)
@@ -439,9 +437,12 @@ def build(scene: Scene, files: Files, span: Span) -> World:
                 moving.append((mesh, motion.flight(files, span)))
         except (ValueError, ArithmeticError) as error:
             raise _unfit(name, error) from None
+        del mesh
         reports.append(f"{name}: {report.text()}")
         first += len(materials(name, thing))
+    del grounds  # before the trees are built, which take the most memory
     meshes = [merge(resting)] if resting else []
+    resting.clear()
     return World(
         Caster([*meshes, *(mesh for mesh, _ in moving)]),
         surfaces_of(scene),
@@ -450,6 +451,12 @@ def build(scene: Scene, files: Files, span: Span) -> World:
         origin,
         warnings,
     )
+
+
+def _mesh(facets: Facets, first: int) -> tuple[Mesh, Report]:
+    """Mesh of facets whose surfaces are numbered from `first`, and its report."""
+    surface = (facets.surface + first).astype(np.int16)
+    return replace(facets, surface=surface).mesh()
 
 
 def _unfit(name: str, error: Exception) -> SceneError:
@@ -471,7 +478,14 @@ def _grounds(scene: Scene, files: Files) -> tuple[np.ndarray, dict[str, Terrain]
             raise _unfit(name, error) from None
     charts = [(name, terrain.chart) for name, terrain in own.items() if terrain.chart is not None]
     require_one_map(charts)
+    unnamed = [name for name, chart in charts if not chart.wkt]
     joined, warnings = join_tiles({name: own[name] for name, _ in charts})
+    if 0 < len(unnamed) < len(charts):
+        warnings += [
+            f"scene.objects.{name}: names no coordinate reference system, and is taken to lie on "
+            "the map of the other rasters"
+            for name in unnamed
+        ]
     for name, terrain in (own | joined).items():
         warnings += [f"scene.objects.{name}: {warning}" for warning in terrain.warnings]
         try:
