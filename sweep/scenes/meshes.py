@@ -44,7 +44,7 @@ _PACKAGES = {"mapbox_earcut", "plyfile", "trimesh"}
 FACES_MAX = 100_000_000
 """Most triangles of one mesh file."""
 
-_MEMORY_FACTOR = 20
+_MEMORY_FACTOR = {".obj": 40, ".off": 40, ".ply": 20, ".stl": 8, ".gltf": 20, ".glb": 20}
 """Memory that reading and preparing a mesh takes at most, over the size of its file."""
 
 
@@ -237,9 +237,8 @@ def read_mesh(
     if suffix not in MESH_FORMATS:
         formats = ", ".join(MESH_FORMATS)
         raise SceneError(path, f"is no mesh of a format that is read ({formats})", "export to one")
-    require_memory(
-        path, _MEMORY_FACTOR * path.stat().st_size, "reduce the mesh, or cut a part out of it"
-    )
+    needed = _MEMORY_FACTOR[suffix] * path.stat().st_size
+    require_memory(path, needed, "reduce the mesh, or cut a part out of it")
     try:
         reader = _read_polygon_file if suffix in POLYGON_FORMATS else _read_triangle_file
         parts, stated = reader(path)

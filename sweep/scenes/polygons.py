@@ -211,26 +211,30 @@ def _with_corners_in_line(triangles: np.ndarray, corners: np.ndarray) -> np.ndar
     if used.all():
         return triangles
     result = [tuple(triangle) for triangle in triangles.tolist()]
-    places = np.flatnonzero(used)
-    for start, stop in zip(places, np.roll(places, -1), strict=True):
+    owner: dict[tuple[int, int], int] = {}
+    for k, triangle in enumerate(result):
+        owner |= _edges(triangle, k)
+    places = np.flatnonzero(used).tolist()
+    for start, stop in zip(places, places[1:] + places[:1], strict=True):
         between = [
             k % len(corners) for k in range(start + 1, stop + len(corners) * (stop <= start))
         ]
         along = corners[stop] - corners[start]
         share = [float((corners[k] - corners[start]) @ along / (along @ along)) for k in between]
         rising = [0.0, *share, 1.0]
-        if not between or not all(np.diff(rising) > 0):
+        k = owner.get((start, stop), -1)
+        if not between or k < 0 or not all(np.diff(rising) > 0):
             continue  # none, or a spike without area
-        for place, triangle in enumerate(result):
-            for turn in range(3):
-                a, b, opposite = np.roll(triangle, -turn).tolist()
-                if (a, b) == (start, stop):
-                    chain = [a, *between, b]
-                    result[place : place + 1] = [
-                        (one, other, opposite) for one, other in pairwise(chain)
-                    ]
-                    break
-            else:
-                continue
-            break
+        (opposite,) = set(result[k]) - {start, stop}
+        for one, other in pairwise([start, *between, stop]):
+            result.append((one, other, opposite))
+            owner |= _edges(result[-1], len(result) - 1)
+        result[k] = result.pop()  # the last part stands in the place of the whole
+        owner |= _edges(result[k], k)
     return np.array(result)
+
+
+def _edges(triangle: tuple[int, ...], number: int) -> dict[tuple[int, int], int]:
+    """Directed edges of a triangle, each with the triangle's number."""
+    a, b, c = triangle
+    return {(a, b): number, (b, c): number, (c, a): number}

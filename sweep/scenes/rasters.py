@@ -25,7 +25,7 @@ from sweep.scenes.terrain import Bounds, Terrain
 MOST_CELLS = 50_000_000
 """Heights read at once at most: 100 million triangles."""
 
-FILE_CELLS_MAX = 4_000_000_000
+FILE_CELLS_MAX = 1_000_000_000
 """Heights of a raster's file at most: all of them are read for its digest."""
 
 BYTES_A_CELL = 400
@@ -159,11 +159,19 @@ def _opened(path: Path) -> Iterator[Any]:
         with _offline():
             _check_sources(path, ())
             with _dataset(path) as data:
+                _require_blocks(path, data)
                 yield data
     except rasterio.errors.RasterioError as error:
         rule = f"is no raster that can be read ({error.__cause__ or error})"
         remedy = "convert it to a GeoTIFF; nothing is fetched over the network"
         raise SceneError(path, rule, remedy) from None
+
+
+def _require_blocks(path: Path, data: Any) -> None:
+    """Refuse a raster whose blocks, each of which is unpacked whole, do not fit into memory."""
+    for (rows, columns), kind in zip(data.block_shapes, data.dtypes, strict=True):
+        needed = 2 * rows * columns * np.dtype(kind).itemsize
+        require_memory(path, needed, "write it anew with gdal_translate -co TILED=YES")
 
 
 def _dataset(path: Path) -> Any:
@@ -351,7 +359,9 @@ def read_array(
     try:
         with path.open("rb") as file:
             values = _array_of(path, file, path.stat().st_size, name)
-    except (ValueError, OSError, EOFError, SyntaxError, zipfile.BadZipFile) as error:
+    except SceneError:
+        raise
+    except Exception as error:  # archives and headers fail in as many ways
         raise SceneError(path, f"is no NumPy file ({error})", "write it with numpy.save") from None
     return _grid(path, values, spacing, no_data)
 
@@ -438,7 +448,7 @@ def read_image(path: str | Path, *, pixel: float, black: float = 0.0, white: flo
 
 def _grey(path: Path) -> np.ndarray:
     """Grey levels of an image, as stored."""
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image
 
     try:
         with warnings.catch_warnings():  # what is too large is told below
@@ -446,9 +456,9 @@ def _grey(path: Path) -> np.ndarray:
             with Image.open(path, formats=_PICTURES) as image:
                 require_cells(path, image.height, image.width, "cut a part out of it")
                 mode, levels = image.mode, np.asarray(image)
-    except (
-        UnidentifiedImageError, OSError, SyntaxError, Image.DecompressionBombError
-    ) as error:  # fmt: skip
+    except SceneError:
+        raise
+    except Exception as error:  # readers of pictures fail in as many ways
         raise SceneError(path, f"is no image that can be read ({error})", "use PNG") from None
     if mode == "RGB" and (levels[..., :1] == levels).all():
         return np.asarray(levels[..., 0])

@@ -161,6 +161,18 @@ def test_corners_in_line_stay_corners_so_that_neighbours_share_their_edges():
     assert {(k, (k + 1) % 8) for k in range(8)} <= edges
 
 
+def test_thousands_of_corners_in_line_are_cut_in_no_time():
+    angle = np.linspace(0, 2 * np.pi, 10_000, endpoint=False)
+    star = np.column_stack([np.cos(angle), np.sin(angle)]) * np.resize([1.0, 0.9], 10_000)[:, None]
+    halved = np.empty((20_000, 2))
+    halved[::2], halved[1::2] = star, (star + np.roll(star, -1, axis=0)) / 2
+    result = cut(flat(halved))
+    x, y = halved.T
+    area = 0.5 * (x * np.roll(y, -1) - y * np.roll(x, -1)).sum()
+    assert areas(flat(halved), result.faces).sum() == pytest.approx(area)
+    assert len(result.faces) > 15_000
+
+
 def test_corners_given_twice_spikes_and_bridged_holes_are_cut_as_they_should():
     twice = flat([[0, 0], [0, 0], [2, 0], [2, 0], [2, 2], [0, 2]])
     assert areas(twice, cut(twice).faces).sum() == pytest.approx(4.0)

@@ -503,7 +503,7 @@ def test_a_sparse_raster_is_refused_by_its_size(tmp_path):
     with rasterio.open(
         path, "w", driver="GTiff", width=400_000, height=400_000, count=1, dtype="float32",
         crs=UTM, transform=SOUTHWARDS, sparse_ok=True, tiled=True, bigtiff=True,
-        blockxsize=65536, blockysize=65536,
+        blockxsize=4096, blockysize=4096,
     ):  # fmt: skip
         pass
     with pytest.raises(SceneError, match=r"declares 400,000 x 400,000 heights.*gdal_translate"):
@@ -563,3 +563,23 @@ def test_pictures_are_refused_by_their_headers_and_formats(tmp_path, monkeypatch
     (tmp_path / "z.eps").write_text("%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n")
     with pytest.raises(SceneError, match="is no image"):
         read_image(tmp_path / "z.eps", pixel=1.0, white=1.0)
+
+
+def test_archives_that_can_not_be_unpacked_are_refused(tmp_path):
+    np.savez(tmp_path / "z.npz", z=GRID)
+    content = bytearray((tmp_path / "z.npz").read_bytes())
+    for offset in (6, content.rindex(b"PK\x01\x02") + 8):
+        content[offset] |= 1  # encrypted
+    (tmp_path / "z.npz").write_bytes(content)
+    with pytest.raises(SceneError, match="no NumPy file"):
+        read_array(tmp_path / "z.npz", **STEPS)
+    (tmp_path / "z.npy").write_bytes(header((3, 3))[:40])
+    with pytest.raises(SceneError, match="no NumPy file"):
+        read_array(tmp_path / "z.npy", **STEPS)
+
+
+def test_a_raster_of_one_huge_block_is_refused_before_that_is_unpacked(tiff, monkeypatch):
+    path = tiff(np.zeros((512, 512), np.float32), tiled=True, blockxsize=512, blockysize=512)
+    monkeypatch.setattr("psutil.virtual_memory", lambda: type("M", (), {"available": 1e6}))
+    with pytest.raises(SceneError, match=r"GB of memory.*TILED=YES"):
+        raster_digest(path)
