@@ -56,7 +56,7 @@ class Stated(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Chart:
+class MapFrame:
     """Map that a raster's coordinates belong to."""
 
     factors: Factors
@@ -65,8 +65,8 @@ class Chart:
     """Coordinate reference system; '' for none."""
     warnings: tuple[str, ...] = ()
 
-    def same_as(self, other: Chart) -> bool:
-        """Return true if two charts have one coordinate reference system, or one has none."""
+    def same_as(self, other: MapFrame) -> bool:
+        """Return true if two maps have one coordinate reference system, or one has none."""
         if not (self.wkt and other.wkt) or self.wkt == other.wkt:
             return True
         one, another = (_horizontal(_crs(wkt)) for wkt in (self.wkt, other.wkt))
@@ -93,38 +93,41 @@ def height_factor(path: Path, wkt: str, band_unit: str, stated: str | None, scal
     stated. If nothing tells it, it is the metre, unless the map is in another unit: then it is
     asked for. `scaled`: the spec has a factor for the heights, which tells their unit too.
     """
-    told = _told_unit(path, wkt, band_unit)
+    declared = _declared_unit(path, wkt, band_unit)
     if stated is not None:
         factor = height_metres(stated)
-        if told is not None and not math.isclose(told[1], factor, rel_tol=1e-9):
-            rule = f"states heights in {told[0]}, and the spec says {stated}"
+        if declared is not None and not math.isclose(declared[1], factor, rel_tol=1e-9):
+            rule = f"states heights in {declared[0]}, and the spec says {stated}"
             raise SceneError(path, rule, "leave height_unit out, or correct the file")
-        told = (stated, factor)
-    if told is None:
+        declared = (stated, factor)
+    if declared is None:
         unit = _linear_unit(_horizontal(_crs(wkt))) if wkt else ("metre", 1.0)
         if unit[1] != 1.0 and not scaled:
             rule = f"is in units of a {unit[0]}, and does not tell the unit of its heights"
             raise SceneError(path, rule, f"state height_unit, 'm' or '{_short(unit[0])}'")
         return 1.0
-    if scaled and told[1] != 1.0:
-        rule = f"has heights in {told[0]}, which are turned into metres, and a scale beside that"
+    if scaled and declared[1] != 1.0:
+        rule = (
+            f"has heights in {declared[0]}, which are turned into metres, and a scale beside that"
+        )
         raise SceneError(path, rule, "leave the scale out")
-    return told[1]
+    return declared[1]
 
 
-def _told_unit(path: Path, wkt: str, band_unit: str) -> tuple[str, float] | None:
-    """Return the unit of heights that a raster tells itself, and metres to it."""
+def _declared_unit(path: Path, wkt: str, band_unit: str) -> tuple[str, float] | None:
+    """Return the unit of heights that a raster declares itself, and metres to it."""
+    vertical = _vertical(_crs(wkt)) if wkt else None
+    axes = vertical.axis_info if vertical is not None else []
+    if vertical is not None and axes and axes[0].direction.lower() == "down":
+        rule = f"holds depths, by its vertical reference system '{vertical.name}'"
+        raise SceneError(path, rule, "turn them into heights with gdal_calc")
     if band_unit.strip():
         try:
             return band_unit, height_metres(band_unit)
         except QuantityError:
             remedy = "convert them to metres with gdal_calc"
             raise SceneError(path, f"has heights in '{band_unit}'", remedy) from None
-    vertical = _vertical(_crs(wkt)) if wkt else None
-    if vertical is None or not vertical.axis_info:
-        return None
-    axis = vertical.axis_info[0]
-    return str(axis.unit_name), float(axis.unit_conversion_factor)
+    return (str(axes[0].unit_name), float(axes[0].unit_conversion_factor)) if axes else None
 
 
 def _short(unit: str) -> str:
@@ -132,8 +135,8 @@ def _short(unit: str) -> str:
     return {"us survey foot": "sft", "foot": "ft"}.get(unit.lower(), unit)
 
 
-def chart_of(path: Path, wkt: str, bounds: Box, cell: float, stated: Stated) -> Chart:
-    """Chart of a raster of a reference system (WKT, '' for none), over the bounds that are read.
+def map_frame_of(path: Path, wkt: str, bounds: Box, cell: float, stated: Stated) -> MapFrame:
+    """MapFrame of a raster of a reference system (WKT, '' for none), over the bounds that are read.
 
     `cell` is the smaller side of a cell, in the raster's coordinates. SceneError where the size of
     a unit on the ground is not known, or differs over the bounds by more than `SCALE_ERROR`.
@@ -146,7 +149,7 @@ def chart_of(path: Path, wkt: str, bounds: Box, cell: float, stated: Stated) -> 
         rule = "has both metres_per_degree and metres_per_unit"
         raise SceneError(path, rule, "leave one of them out")
     if not wkt:
-        return _chart_of_none(path, bounds, cell, per_degree or per_unit)
+        return _map_frame_of_none(path, bounds, cell, per_degree or per_unit)
     crs = _horizontal(_crs_of_file(path, wkt))
     if crs.is_geographic:
         if per_unit is not None:
@@ -160,12 +163,12 @@ def chart_of(path: Path, wkt: str, bounds: Box, cell: float, stated: Stated) -> 
     return _measured(path, wkt, crs, bounds, per_unit, "metres_per_unit")
 
 
-def _chart_of_none(
+def _map_frame_of_none(
     path: Path, bounds: Box, cell: float, stated: tuple[float, float] | None
-) -> Chart:
-    """Chart of a raster without a reference system: metres, unless that can not be."""
+) -> MapFrame:
+    """MapFrame of a raster without a reference system: metres, unless that can not be."""
     if stated is not None:
-        return Chart(Factors(*stated))
+        return MapFrame(Factors(*stated))
     west, south, east, north = bounds
     on_globe = -360 <= west < east <= 360 and -90 <= south < north <= 90
     if on_globe and cell < DEGREES_CELL_MAX:
@@ -180,7 +183,7 @@ def _chart_of_none(
             "coordinates in metres metres_per_unit: [1, 1]; or add its .prj file"
         )
         raise SceneError(path, rule, remedy)
-    return Chart(Factors(1.0, 1.0))
+    return MapFrame(Factors(1.0, 1.0))
 
 
 def _measured(
@@ -190,41 +193,41 @@ def _measured(
     bounds: Box,
     stated: tuple[float, float] | None,
     field: str,
-) -> Chart:
-    """Chart whose scale is held against that on the ground."""
+) -> MapFrame:
+    """MapFrame whose scale is held against that on the ground."""
     unit = "degree" if crs.is_geographic else "unit of its coordinates"
     if stated is None and not crs.is_geographic:
         factor = _linear_unit(crs)[1]
-        used = Factors(factor, factor)
+        factors = Factors(factor, factor)
     elif stated is not None:
-        used = Factors(*stated)
+        factors = Factors(*stated)
     else:
-        used = None
+        factors = None
     scales, skew = _scales_on_ground(path, crs, bounds)
     if scales is None:  # a map of a site, of which no place on a planet is known
-        assert used is not None
-        return Chart(used, wkt)
+        assert factors is not None
+        return MapFrame(factors, wkt)
     middle = Factors(*scales[len(scales) // 2])
     suggestion = f"{field}: [{middle.east:.6g}, {middle.north:.6g}]"
-    if used is None:
+    if factors is None:
         rule = "is in degrees, which have no fixed size in metres"
         sizes = f"[{middle.east:.1f}, {middle.north:.1f}]"
         remedy = f"state metres_per_degree, here {sizes}, or reproject it with gdalwarp"
         raise SceneError(path, rule, remedy)
-    error = _largest_error(used, scales)
+    error = _largest_error(factors, scales)
     if skew > SCALE_ERROR:
         rule = f"has axes that are {math.degrees(skew):.3g} deg off a right angle on the ground"
         raise SceneError(path, rule, _reprojected(crs, bounds))
     if error <= SCALE_ERROR:
-        return Chart(used, wkt)
-    told = (
-        f"takes a {unit} for {used.east:.6g} m eastwards and {used.north:.6g} m northwards, and on "
-        f"the ground it is {middle.east:.6g} m and {middle.north:.6g} m in the middle of what is "
-        f"read: off by up to {100 * error:.3g} %"
+        return MapFrame(factors, wkt)
+    message = (
+        f"takes a {unit} for {factors.east:.6g} m eastwards and {factors.north:.6g} m northwards, "
+        f"and on the ground it is {middle.east:.6g} m and {middle.north:.6g} m in its middle: "
+        f"off by up to {100 * error:.3g} %"
     )
     if stated is None or error > STATED_SCALE_ERROR:
-        raise SceneError(path, told, f"state {suggestion}, or {_reprojected(crs, bounds)}")
-    return Chart(used, wkt, (f"{path}: {told}; read a smaller window, or reproject it",))
+        raise SceneError(path, message, f"state {suggestion}, or {_reprojected(crs, bounds)}")
+    return MapFrame(factors, wkt, (f"{path}: {message}; read a smaller window, or reproject it",))
 
 
 def _largest_error(used: Factors, scales: np.ndarray) -> float:
@@ -352,17 +355,17 @@ def degree_at(
     return math.radians(across * math.cos(phi)), math.radians(along)
 
 
-def require_one_map(charts: Sequence[tuple[str, Chart]]) -> None:
+def require_one_map(map_frames: Sequence[tuple[str, MapFrame]]) -> None:
     """Refuse rasters, by name, whose coordinates do not belong to one map; SceneError names two."""
-    for k, (name, chart) in enumerate(charts):
-        for other_name, other in charts[:k]:
+    for k, (name, map_frame) in enumerate(map_frames):
+        for other_name, other in map_frames[:k]:
             place = f"scene.objects.{name}"
-            if not chart.same_as(other):
-                rule = f"lies on the map '{chart.name}', and {other_name} on '{other.name}'"
+            if not map_frame.same_as(other):
+                rule = f"lies on the map '{map_frame.name}', and {other_name} on '{other.name}'"
                 raise SceneError(place, rule, "reproject one of them with gdalwarp")
-            if chart.factors != other.factors:
+            if map_frame.factors != other.factors:
+                sizes, other_sizes = tuple(map_frame.factors), tuple(other.factors)
                 rule = (
-                    f"takes a unit of its map for {tuple(chart.factors)} m, and {other_name} for "
-                    f"{tuple(other.factors)} m"
+                    f"takes a unit of its map for {sizes} m, and {other_name} for {other_sizes} m"
                 )
                 raise SceneError(place, rule, "state one size for both")

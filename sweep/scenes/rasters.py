@@ -19,7 +19,7 @@ import numpy as np
 
 from sweep.scenes.files import SceneError, existing, require_memory
 from sweep.scenes.heights import cliff_warnings, without_data
-from sweep.scenes.maps import Stated, chart_of, degree_at, height_factor
+from sweep.scenes.maps import Stated, degree_at, height_factor, map_frame_of
 from sweep.scenes.terrain import Bounds, Terrain
 
 MOST_CELLS = 50_000_000
@@ -98,7 +98,7 @@ def read_raster(
         wkt = "" if data.crs is None else _wkt(path, data)
         cell = math.inf if pixel is not None else min(abs(transform.a), abs(transform.e))
         stated = Stated(metres_per_degree, metres_per_unit, height_unit)
-        chart = chart_of(path, wkt, (x[0], y[0], x[1], y[1]), cell, stated)
+        map_frame = map_frame_of(path, wkt, (x[0], y[0], x[1], y[1]), cell, stated)
         unit = height_factor(path, wkt, data.units[band - 1] or "", height_unit, scaled)
         raw = _values(data, band, view)
         doubts = without_data(path, raw, no_data)
@@ -107,9 +107,9 @@ def read_raster(
         raw *= unit
     left = transform.c + (view.col_off + 0.5) * transform.a
     top = transform.f + (view.row_off + 0.5) * transform.e
-    east, north = chart.factors
+    east, north = map_frame.factors
     spacing = transform.a * east, transform.e * north
-    terrain = Terrain(raw, spacing, np.array([left * east, top * north, 0.0]), chart=chart)
+    terrain = Terrain(raw, spacing, np.array([left * east, top * north, 0.0]), map_frame=map_frame)
     return _checked(path, terrain, doubts)
 
 
@@ -127,9 +127,9 @@ def _wkt(path: Path, data: Any) -> str:
 def _checked(path: Path, terrain: Terrain, doubts: tuple[str, ...]) -> Terrain:
     """Terrain with warnings: of its map, the doubts given, and its cliffs."""
     _require_heights(path, terrain.heights)
-    charted = () if terrain.chart is None else terrain.chart.warnings
+    of_map = () if terrain.map_frame is None else terrain.map_frame.warnings
     cliffs = cliff_warnings(path, terrain.heights, terrain.spacing)
-    return replace(terrain, warnings=(*charted, *doubts, *cliffs))
+    return replace(terrain, warnings=(*of_map, *doubts, *cliffs))
 
 
 def raster_digest(path: str | Path) -> str:

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import fft
 
-from sweep.scenes.maps import Chart
+from sweep.scenes.maps import MapFrame
 from sweep.scenes.meshes import Facets
 
 _NEGLIGIBLE = 1e-6
@@ -36,13 +36,13 @@ class Terrain:
     """Heights (rows, columns) of nodes on a grid above its origin [m]; NaN where there is none.
 
     Steps (dx, dy) [m] may be negative; the origin (3,) is that of node (0, 0) at height 0 [m].
-    One that was read from a map has its chart; warnings say what is doubtful about it.
+    One that was read from a map has the frame of that map; warnings say what is doubtful about it.
     """
 
     heights: np.ndarray
     spacing: tuple[float, float]
     origin: np.ndarray
-    chart: Chart | None = None
+    map_frame: MapFrame | None = None
     warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

@@ -476,11 +476,13 @@ def _grounds(scene: Scene, files: Files) -> tuple[np.ndarray, dict[str, Terrain]
             own[name] = thing.survey(files)
         except (ValueError, ArithmeticError) as error:
             raise _unfit(name, error) from None
-    charts = [(name, terrain.chart) for name, terrain in own.items() if terrain.chart is not None]
-    require_one_map(charts)
-    unnamed = [name for name, chart in charts if not chart.wkt]
-    joined, warnings = join_tiles({name: own[name] for name, _ in charts})
-    if 0 < len(unnamed) < len(charts):
+    map_frames = [
+        (name, terrain.map_frame) for name, terrain in own.items() if terrain.map_frame is not None
+    ]
+    require_one_map(map_frames)
+    unnamed = [name for name, map_frame in map_frames if not map_frame.wkt]
+    joined, warnings = join_tiles({name: own[name] for name, _ in map_frames})
+    if 0 < len(unnamed) < len(map_frames):
         warnings += [
             f"scene.objects.{name}: names no coordinate reference system, and is taken to lie on "
             "the map of the other rasters"

@@ -40,13 +40,13 @@ class ScannerCoverage(NamedTuple):
 
     def text(self) -> str:
         """Sentence for people."""
-        told = f"{_percent(self.seen)} of the shots hit something"
+        sentence = f"{_percent(self.seen)} of the shots hit something"
         if self.partly:
-            told += f", {_percent(self.partly)} with a part of their light"
+            sentence += f", {_percent(self.partly)} with a part of their light"
         if self.blind and self.seen:
             beams = ", ".join(map(str, self.blind[:8])) + ", ..." * (len(self.blind) > 8)
-            told += f"; beam{'s' * (len(self.blind) > 1)} {beams} never"
-        return told
+            sentence += f"; beam{'s' * (len(self.blind) > 1)} {beams} never"
+        return sentence
 
 
 class Coverage(NamedTuple):

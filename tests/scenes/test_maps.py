@@ -10,7 +10,7 @@ import rasterio
 from rasterio import Affine
 
 from sweep.scenes.files import SceneError
-from sweep.scenes.maps import Chart, Factors, degree_at, require_one_map
+from sweep.scenes.maps import Factors, MapFrame, degree_at, require_one_map
 from sweep.scenes.rasters import raster_digest, read_raster
 from sweep.scenes.terrain import Terrain
 from sweep.scenes.tiles import join_tiles
@@ -139,6 +139,12 @@ def test_a_vertical_reference_system_tells_the_unit_of_heights(survey):
         read_raster(path, height_unit="ft")
 
 
+def test_depths_are_no_heights(survey):
+    depth = pyproj.CRS("EPSG:32633+5715").to_wkt("WKT1_GDAL")  # mean sea level depth
+    with pytest.raises(SceneError, match=r"holds depths.*'MSL depth'"):
+        read_raster(survey(depth, (500_000.0, 5e6), 10.0, 1.0))
+
+
 def test_a_unit_and_a_factor_of_heights_are_too_much(survey):
     path = survey("EPSG:32633", (500_000.0, 5e6), 10.0, 1.0, unit="ft")
     with pytest.raises(SceneError, match=r"heights in ft.*leave the scale out"):
@@ -184,17 +190,21 @@ def test_metres_without_a_reference_system_are_metres(tmp_path):
 
 
 def test_rasters_of_two_maps_are_refused(survey):
-    def chart(zone, name, **stated):
+    def map_frame(zone, name, **stated):
         path = survey(f"EPSG:{zone}", (500_000.0, 5e6), 10.0, 1.0, name=name)
-        return name, read_raster(path, **stated).chart
+        return name, read_raster(path, **stated).map_frame
 
-    one, same, other = chart(32632, "a.tif"), chart(32632, "b.tif"), chart(32633, "c.tif")
+    one, same, other = (
+        map_frame(32632, "a.tif"),
+        map_frame(32632, "b.tif"),
+        map_frame(32633, "c.tif"),
+    )
     require_one_map([one, same])
     with pytest.raises(SceneError, match=r"c\.tif: lies on the map 'WGS 84 / UTM zone 33N', and a"):
         require_one_map([one, same, other])
     with pytest.raises(SceneError, match="state one size for both"):
-        require_one_map([one, chart(32632, "d.tif", metres_per_unit=(1.0005, 1.0))])
-    require_one_map([one, ("none", Chart(Factors(1.0, 1.0)))])
+        require_one_map([one, map_frame(32632, "d.tif", metres_per_unit=(1.0005, 1.0))])
+    require_one_map([one, ("none", MapFrame(Factors(1.0, 1.0)))])
 
 
 WHOLE = np.random.default_rng(3).normal(size=(9, 12))
