@@ -1,7 +1,8 @@
 """Packages that only some studies need: `pip install 'sweep[scenes]'` and the like bring them."""
 
 EXTRAS = {
-    "laspy": "scenes", "rasterio": "scenes", "trimesh": "scenes",
+    "laspy": "scenes", "mapbox_earcut": "scenes", "plyfile": "scenes", "pyproj": "scenes",
+    "rasterio": "scenes", "trimesh": "scenes",
     "itables": "report", "jinja2": "report", "plotly": "report",
     "obstore": "cloud",
     "asyncssh": "clusters", "dask_jobqueue": "clusters",

@@ -74,6 +74,50 @@ def test_a_flight_beneath_its_ground_is_warned_of(here, command):
     assert "beneath" not in sweep(command[0], "landing.yaml", *command[1:]).stderr
 
 
+@pytest.mark.parametrize("command", [("plan",), ("run", "--scheduler", "none")])
+def test_a_flight_that_sees_nothing_is_refused_with_both_extents(here, command):
+    """A path in coordinates of a map, over a scene whose zero is its own middle."""
+    (here / "away.yaml").write_text(SCENE.replace("[0 m, 0 m,", "[500 km, 4000 km,"))
+    told = sweep(command[0], "away.yaml", *command[1:])
+    refused(
+        told, "platform.path", "no", "the path spans x 500000, y 4e+06, z 100 to 500 m",
+        "the scene x -1500 to 1500, y -1500 to 1500, z 0 m", "origin: world",
+    )  # fmt: skip
+    assert not (here / "results" / "away.zarr").exists()
+
+
+@pytest.mark.parametrize("command", [("plan",), ("run", "--scheduler", "none")])
+def test_a_flight_that_sees_only_a_part_is_warned_of(here, command):
+    (here / "small.yaml").write_text(SCENE.replace("size: 3 km", "size: 250 m"))
+    told = sweep(command[0], "small.yaml", *command[1:])
+    assert told.exit_code == 0
+    (warning,) = [line for line in told.stderr.splitlines() if "of the shots hit" in line]
+    assert warning.startswith("warning: scanners.three: only ") and "x -125 to 125" in warning
+    whole = sweep(command[0], "descent.yaml", *command[1:])
+    assert "of the shots hit" not in whole.stderr
+    if command[0] == "plan":
+        assert "three: 100 % of the shots hit something" in whole.stdout
+        assert "the path spans x 0, y 0, z 100 to 500 m, and the scene x -1500" in whole.stdout
+
+
+def test_what_is_doubtful_of_a_file_is_told_by_plan_and_run(here):
+    import numpy as np
+
+    heights = np.zeros((40, 40))
+    heights[:3] = -9999
+    np.save("ground.npy", heights)
+    ground = "kind: array, file: ground.npy, spacing: [100 m, 100 m]"
+    (here / "array.yaml").write_text(SCENE.replace("kind: plane, size: 3 km", ground))
+    for command in (("plan",), ("run", "--scheduler", "none")):
+        told = sweep(command[0], "array.yaml", *command[1:])
+        assert told.exit_code == 0
+        assert "warning: scene.objects.ground: ground.npy: the value -9999" in told.stderr
+    (here / "array.yaml").write_text(
+        SCENE.replace("kind: plane, size: 3 km", ground + ", no_data: -9999")
+    )
+    assert "9999" not in sweep("plan", "array.yaml").stderr
+
+
 def test_a_second_study_of_the_same_geometry_says_that_no_ray_was_cast(here):
     sweep("run", "descent.yaml", "--scheduler", "none")
     (here / "weak.yaml").write_text(SCENE.replace("power: 1 W", "power: 10 mW"))

@@ -341,7 +341,7 @@ def _print_scene(store: Location) -> None:
             [
                 row.part,
                 f"{row.shots:,}",
-                number_text(row.pd),
+                number_text(row.pd) if row.pd == row.pd else "no hit",
                 percent(row.true / row.shots, ".1f") if row.shots else "-",
                 f"{row.false:,}",
                 f"{100 * row.solved / row.cycles:.1f} %" if row.cycles else "-",
@@ -492,11 +492,14 @@ def plan_lines(
     study: Spec | SceneSpec, store: Location, workers: int | None
 ) -> Iterator[tuple[str, str]]:
     """Lines, with their headings, of what a study will take."""
-    from sweep.spec import Spec
+    from sweep.spec import SceneSpec, Spec
+    from sweep.tasks.coverage import refuse_blind
     from sweep.tasks.plan import plan
     from sweep.tasks.progress import duration
     from sweep.tasks.session import RunOptions
 
+    if isinstance(study, SceneSpec):
+        refuse_blind(study)
     p = plan(study, store=store, workers=workers)
     if isinstance(study, Spec):
         shape = " x ".join(f"{count} {name}" for name, count in p.block_shape.items())
@@ -524,6 +527,7 @@ def plan_lines(
 def _scene_lines(study: SceneSpec, plan: Plan) -> Iterator[tuple[str, str]]:
     from sweep.model.accuracy import Accuracy
     from sweep.model.resolution import BEAMLETS
+    from sweep.tasks.coverage import coverage
 
     for report in plan.reports:
         yield "scene", report
@@ -537,6 +541,10 @@ def _scene_lines(study: SceneSpec, plan: Plan) -> Iterator[tuple[str, str]]:
             else f"{s.rays:,} rays at {1e6 * s.seconds_a_ray:.3g} us on one core"
         )  # fmt: skip
         yield "", f"{1e6 * s.seconds_a_draw:,.0f} us a shot and draw on one core"
+    seen = coverage(study)
+    for scanner in seen.scanners:
+        yield "hits", f"{scanner.name}: {scanner.text()}"
+    yield "extents", seen.extents()
     places = math.prod(int(axis.size) for axis in study.axes)
     yield "draws", f"{study.draws.number:,}, at {places:,} place(s) along the axes"
 
@@ -604,16 +612,26 @@ def alarms_told(study: Spec | SceneSpec) -> str:
 
 
 def warn_of(study: Spec | SceneSpec) -> None:
-    """Warn of a beam too narrow for its aperture, a path beneath the ground, many false alarms."""
+    """Warn of a beam too narrow for its aperture, of a scene and a path, of many false alarms.
+
+    SceneError for a flight that sees nothing.
+    """
     from sweep.analysis.noise_only import alarms_of_study
     from sweep.spec import SceneSpec
     from sweep.spec.grid_rules import too_narrow
-    from sweep.tasks.eyepoint_study import beneath
+    from sweep.tasks.coverage import coverage, refuse_blind
+    from sweep.tasks.eyepoint_study import beneath, world_of
 
     if narrow := too_narrow(study.parameters_off_axes(), study.axes):
         tell(f"warning: {narrow}", err=True)
-    if isinstance(study, SceneSpec) and (path := beneath(study)):
-        click.echo(f"warning: {path}", err=True)
+    if isinstance(study, SceneSpec):
+        for warning in world_of(study).warnings:
+            tell(f"warning: {warning}", err=True)
+        if path := beneath(study):
+            click.echo(f"warning: {path}", err=True)
+        refuse_blind(study)
+        for warning in coverage(study).warnings():
+            tell(f"warning: {warning}", err=True)
     most = max((any_ for any_, _ in alarms_of_study(study)), default=0.0)
     if most > MANY_ALARMS:
         tell(

@@ -33,6 +33,7 @@ from sweep.model.returns import Returns, draw_returns
 from sweep.model.sampling import SPECTRA
 from sweep.model.shot import prepare_cast
 from sweep.model.spectra_returns import spectra_returns
+from sweep.model.unsupported import UnsupportedShot
 from sweep.model.waveform import STRONGEST
 
 STRETCH = 1 << 20
@@ -77,7 +78,14 @@ def cloud(
         seen = eyepoints.some(part)
         own = None if flags is None else flags[part]
         called = effects, own, keys[part]
-        shots, rays, found = _groups(seen, parameters, surfaces, returns, called)
+        try:
+            shots, rays, found = _groups(seen, parameters, surfaces, returns, called)
+        except UnsupportedShot as error:
+            if error.point is None:
+                raise
+            time = float(seen.time[error.point])
+            at = first + error.point
+            raise UnsupportedShot(f"the shot at time {time:.6g} s: {error}", at) from None
         numbers = {"first_draw": first_draw, "draws": draws}
         if method == SPECTRA:
             if shots.peaks == STRONGEST or parameters.get(DETECTOR + "kind", FIXED) != FIXED:

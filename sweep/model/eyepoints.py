@@ -24,9 +24,17 @@ from sweep.model.geometry.scanner import PointingJitter, Scanner, beamlet_rays
 from sweep.model.ground import Cast, Footprints, backscatter
 from sweep.model.preparation import APPROACH, Parameters, Shots
 from sweep.model.shot import prepare_cast
+from sweep.model.unsupported import UnsupportedShot
 
 HEIGHT = "atmosphere.target_height"
 SUNLIGHT = "target.solar_irradiance"
+
+LEAST_RANGE = 1e-3
+"""Range [m] below which a surface is passed through: no light is focused or falls off so near.
+
+An instrument in the plane of a wall, or standing on the ground, would see it at range 0, where the
+echo is infinite.
+"""
 
 _FLATTEST = 0.01
 """Sine of the grazing angle under which a surface is not taken to go on as a plane."""
@@ -116,9 +124,10 @@ def observe(
     (n,) of the beam's axis, infinite where that hits nothing (:func:`sweep.model.beam.angles`);
     without it the beam is `beam_divergence` wide everywhere [rad, between 1/e^2 points].
 
-    `jitter` turns the light of each shot, of which the instrument knows nothing: position, velocity
-    and `direction` stay those commanded. Without `rotation` the surfaces of turning bodies stand
-    still.
+    Surfaces nearer than `LEAST_RANGE` are passed through. `jitter` turns the light of each shot, of
+    which the instrument knows nothing: position, velocity and `direction` stay those commanded.
+    Without `rotation` the surfaces of turning bodies stand still. An UnsupportedShot names the
+    first shot whose geometry is not finite.
     """
     index = np.asarray(index)
     shots = scanner.shots(index)
@@ -133,15 +142,21 @@ def observe(
         seen = rays = fan(across, along, beam_divergence / 4)
     else:  # a ray along the axis tells how wide the footprint is
         nothing = np.zeros(1)
-        axis = caster.bundle(state.position, fan(nothing, nothing, 1.0), poses=poses or None)
+        axis = caster.bundle(
+            state.position,
+            fan(nothing, nothing, 1.0),
+            poses=poses or None,
+            least_range=LEAST_RANGE,
+        )
         rays, seen = (
             fan(across, along, np.reshape(full, (-1, 1)) / 4) for full in angles(axis.range)
         )
-    bundle = caster.bundle(state.position, rays, poses=poses or None)
+    bundle = caster.bundle(state.position, rays, poses=poses or None, least_range=LEAST_RANGE)
     velocity = _radial_velocity(state, (rays, seen), bundle, moving, rotation)
     rows = np.arange(len(time))
     reference = velocity[rows, np.maximum(bundle.reference, 0)]
     turning = rotate(state.attitude, shots.turning)
+    _require_finite(index, time, state, bundle, velocity)
     acceleration, approach, turn_rate = _along_beam(state, turning, rays, bundle, moving, rotation)
     direction = rotate(state.attitude, shots.direction)
     commanded = np.cross(state.rate, direction) + turning
@@ -151,6 +166,27 @@ def observe(
         acceleration, approach, turn_rate, commanded, state.acceleration,
         velocity - reference[:, None], bundle.cos_incidence, bundle.surface, weight,
     )  # fmt: skip
+
+
+def _require_finite(
+    index: np.ndarray, time: np.ndarray, state: State, bundle: Bundle, velocity: np.ndarray
+) -> None:
+    """Refuse shots whose geometry is not finite: no loop over their spectra would end."""
+    hit = bundle.valid
+    for words, wrong in (
+        ("position", ~np.isfinite(state.position).all(axis=1)),
+        ("velocity", ~np.isfinite(state.velocity).all(axis=1)),
+        ("range", (hit & ~np.isfinite(bundle.range[:, None] + bundle.offset)).any(axis=1)),
+        ("angle of incidence", (hit & ~np.isfinite(bundle.cos_incidence)).any(axis=1)),
+        ("radial velocity", (hit & ~np.isfinite(velocity)).any(axis=1)),
+    ):
+        if wrong.any():
+            k = int(wrong.argmax())
+            raise UnsupportedShot(
+                f"shot {index[k]}, at time {time[k]:.6g} s, has a {words} that is not finite: "
+                "check the path and the scene there for numbers out of all proportion",
+                k,
+            )
 
 
 def _radial_velocity(

@@ -126,12 +126,12 @@ def _beside(magnitude, low, k, half):
 @njit(cache=True, error_model="numpy")
 def _list_groups(magnitude, peak, level, bins):
     """Strongest groups of a run into bins (3, most), as indices; returns how many there are."""
-    if magnitude[peak] < level:
+    if not magnitude[peak] >= level:
         bins[:, 0] = peak
         return 1
     most, found, k = bins.shape[1], 0, 0
     while k < magnitude.size:
-        if magnitude[k] < level:
+        if not magnitude[k] >= level:  # true of nan too, which would end no loop
             k += 1
             continue
         best = first = k

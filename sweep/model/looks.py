@@ -284,7 +284,7 @@ class Looks(NamedTuple):
             more = (weight * special.gammaincc(n + j, least[..., None]) ** 2).sum(axis=-1)
             both = np.where(goes_on, both + more, both)
             past = n + j[-1] > least + n * r / (1 - r)
-            goes_on &= ~past | (more > 1e-14 * both + 1e-300)
+            goes_on &= (~past | (more > 1e-14 * both + 1e-300)) & np.isfinite(least)
             if not goes_on.any():
                 return np.clip(1 - both / np.maximum(p, 1e-300), 0.0, 1.0)
             j = j + j.size

@@ -23,6 +23,7 @@ from sweep.model.detectors import main_lobe
 from sweep.model.ground import Ground
 from sweep.model.looks import NUMBER, VOTES, Looks
 from sweep.model.threshold import tnr_of
+from sweep.model.unsupported import UnsupportedShot
 from sweep.model.waveform import Segment
 from sweep.model.window import Window, canonical_name, window
 
@@ -702,3 +703,47 @@ def beat_current(architecture: str, p: Mapping[str, np.ndarray], power: np.ndarr
         return p[RECEIVER + "modulation_index"] * gain * responsivity * power
     light = p[RECEIVER + "local_oscillator_power"] * power
     return 2 * gain * responsivity * np.sqrt(p[RECEIVER + "mixing_efficiency"] * light)
+
+
+_OF_POINTS = {
+    "range": "range",
+    "radial_velocity": "radial velocity",
+    "acceleration": "acceleration",
+    "beta": "Doppler shift",
+    "echo_scale": "echo's power",
+    "beat_scale": "beat's amplitude",
+    "bin_deviation": "noise",
+    "threshold": "threshold",
+}
+_OF_BEAMLETS = {
+    "offset": "beamlets' ranges",
+    "doppler": "beamlets' velocities",
+    "amplitude": "beamlets' echoes",
+}
+"""Fields of shots that have to be finite, and what users call them."""
+
+
+def require_finite(shots: Shots) -> None:
+    """Refuse shots with a number that is not finite: the spectrum of one has no peak to be found.
+
+    The UnsupportedShot says what is not finite, and of which shot.
+    """
+    for name, words in (_OF_POINTS | _OF_BEAMLETS).items():
+        values = np.asarray(getattr(shots, name))
+        if math.isfinite(float(values.sum())):  # not so of any nan, nor of an inf
+            continue
+        wrong = ~np.isfinite(values)
+        if not wrong.any():
+            continue
+        if name in _OF_BEAMLETS:
+            rows = wrong.any(axis=1)
+            point = int(rows[shots.row].argmax())
+            value = values[shots.row[point]][wrong[shots.row[point]]][0]
+        else:
+            point = int(np.broadcast_to(wrong, (shots.size,)).argmax())
+            value = np.broadcast_to(values, (shots.size,))[point]
+        raise UnsupportedShot(
+            f"the {words} can not be computed ({value}), at a range of {shots.range[point]:.6g} m: "
+            "check the scene and the path there for numbers out of all proportion",
+            point,
+        )

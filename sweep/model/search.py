@@ -131,7 +131,7 @@ def _keep_echoes(run, exempt, low, level, beside, band, lines):
     """Mark the bins of groups about lines whose largest bin is searched, and those beside them."""
     at, period = 0, band[1]
     while at < run.size:
-        if run[at] < level:
+        if not run[at] >= level:  # true of nan too, which would end no loop
             at += 1
             continue
         first = best = at

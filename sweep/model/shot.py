@@ -16,7 +16,7 @@ from sweep.model.ground import Cast, Ground, Plane
 from sweep.model.looks import fading_any_two
 from sweep.model.marcum import log_any, log_at_least_one
 from sweep.model.outputs import WITHOUT_ECHO
-from sweep.model.preparation import Parameters, Shots, as_arrays, bare
+from sweep.model.preparation import Parameters, Shots, as_arrays, bare, require_finite
 from sweep.model.resolution import resolved_categories
 from sweep.model.segments import find
 from sweep.model.strongest import outcomes
@@ -75,6 +75,7 @@ def assembled(
     for effect in nodes(effects):
         if effect.act is not None:
             shots = effect.act(shots, scene)
+    require_finite(shots)
     return shots
 
 

@@ -6,3 +6,8 @@ class UnsupportedShot(ValueError):
 
     Its text is for users: it names the fields, the limit, what was found and what to do.
     """
+
+    def __init__(self, text: str, point: int | None = None) -> None:
+        super().__init__(text)
+        self.point = point
+        """Number of the shot among those computed together; None where it is not known."""

@@ -58,17 +58,41 @@ def file_digest(path: str | Path) -> str:
     return digest.hexdigest()
 
 
+def require_memory(path: str | Path, needed: float, remedy: str) -> None:
+    """Refuse a file or an object that would take more memory [bytes] than the machine has free."""
+    import psutil
+
+    free = psutil.virtual_memory().available
+    if needed > free:
+        rule = f"would take about {needed / 1e9:.1f} GB of memory, of which {free / 1e9:.1f} GB"
+        raise SceneError(path, f"{rule} are free", remedy)
+
+
+def read_companion(path: Path, name: str) -> bytes:
+    """Content of a plain file that another one names; SceneError for what is none."""
+    companion = existing(path.parent / unquote(name))
+    size = companion.stat().st_size
+    require_memory(companion, 4 * size, "reduce it")
+    with companion.open("rb") as file:
+        return file.read(size)
+
+
 def _companions(path: Path) -> list[Path]:
     """Files whose content belongs to this one's."""
     if path.suffix.lower() != ".gltf":
         return []
     try:
         document = json.loads(path.read_bytes())
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return []  # what is wrong with it is told where it is read
     buffers: Any = document.get("buffers") if isinstance(document, dict) else None
-    names = [b.get("uri", "") for b in buffers or () if isinstance(b, dict)]
-    return [path.parent / unquote(name) for name in names if name and not name.startswith("data:")]
+    buffers = buffers if isinstance(buffers, list) else []
+    names = [b.get("uri", "") for b in buffers if isinstance(b, dict)]
+    return [
+        path.parent / unquote(name)
+        for name in names
+        if isinstance(name, str) and name and not name.startswith("data:")
+    ]
 
 
 COLUMNS = {

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import itertools
+import json
 import math
+import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,7 +16,9 @@ from numpy.typing import ArrayLike
 
 from sweep.model.geometry.mesh import Mesh, normals, require_shapes, round_centre
 from sweep.model.geometry.quaternion import about, rotate
-from sweep.scenes.files import SceneError, existing
+from sweep.scenes.files import SceneError, existing, read_companion, require_memory
+from sweep.scenes.polygon_files import POLYGON_FORMATS, read_polygons
+from sweep.scenes.polygons import triangulate
 from sweep.units import QuantityError, read_unit
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
@@ -25,6 +29,24 @@ _CLEAR = 1e-12
 _Y_UP_FORMATS = {".glb", ".gltf"}
 """Formats whose specification makes y the vertical; for the others z is taken to be it."""
 
+_TRIANGLE_FORMATS = {".stl", *_Y_UP_FORMATS}
+"""Formats that hold triangles alone."""
+
+MESH_FORMATS = (".stl", ".obj", ".ply", ".off", ".gltf", ".glb")
+"""Formats that are read. No archive is among them: what it holds can be of any size."""
+
+COORDINATE_MAX = 1e9
+"""Largest distance of a vertex from zero along any axis [m]; beyond, squares overflow."""
+
+_PACKAGES = {"mapbox_earcut", "plyfile", "trimesh"}
+"""Packages of the extra `scenes` that reading a mesh takes."""
+
+FACES_MAX = 100_000_000
+"""Most triangles of one mesh file."""
+
+_MEMORY_FACTOR = {".obj": 40, ".off": 40, ".ply": 20, ".stl": 8, ".gltf": 20, ".glb": 20}
+"""Memory that reading and preparing a mesh takes at most, over the size of its file."""
+
 
 @dataclass(frozen=True, eq=False)
 class Facets:
@@ -33,13 +55,16 @@ class Facets:
     Vertices (n, 3) relative to an origin (3,) [m]: terrain lies millions of metres from the
     zero of its map, and a vertex kept apart from that loses no digits to it. Faces (m, 3) are
     counter-clockwise as seen from outside; surface (m,) int16 is the index of each face's in
-    the scene's list.
+    the scene's list. Notes say what was done as they were read. Those of a grid need no mending:
+    their vertices are distinct and used, their faces too, and each has an area.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     surface: np.ndarray
     origin: np.ndarray
+    notes: tuple[str, ...] = ()
+    is_grid: bool = False
 
     @classmethod
     def of(
@@ -67,7 +92,20 @@ class Facets:
 
     def mesh(self) -> tuple[Mesh, Report]:
         """Mesh fit to be cast at, in the world frame, and what was done to make it so."""
+        with np.errstate(invalid="ignore"):
+            far = np.abs(self.vertices) > COORDINATE_MAX
+        if far.any():
+            place = self.vertices[far][0]
+            raise ValueError(
+                f"a vertex lies at {place:.3g} m, farther than {COORDINATE_MAX:.0e} m from zero"
+            )
+        if self.is_grid:
+            _require_faces(len(self.faces), len(self.faces))
+            centre = round_centre(self.vertices)
+            mesh = Mesh(self.vertices - centre, self.faces, self.surface, centre + self.origin)
+            return mesh, Report(len(self.vertices), len(self.faces), notes=self.notes)
         mesh, report = clean(self.vertices, self.faces, self.surface)
+        report = replace(report, notes=self.notes)
         return replace(mesh, origin=mesh.origin + self.origin), report
 
 
@@ -80,6 +118,7 @@ def join(parts: Sequence[Facets]) -> Facets:
         np.concatenate([part.faces + shift for part, shift in zip(parts, shifts, strict=True)]),
         np.concatenate([part.surface for part in parts]),
         origin,
+        tuple(note for part in parts for note in part.notes),
     )
 
 
@@ -104,13 +143,14 @@ class Report:
     duplicate: int = 0  # in whatever winding
     merged: int = 0
     unreferenced: int = 0
+    notes: tuple[str, ...] = ()  # what was done as they were read
 
     def text(self) -> str:
         """One line for people: what was given, and of the rest what is not zero."""
         counts = [(words, getattr(self, name)) for name, words in _MENDED.items()]
         said = [words.format(count) for words, count in counts if count]
         given = f"{self.faces:,} faces on {self.vertices:,} vertices"
-        return "; ".join([given, *(said or ["nothing to mend"])])
+        return "; ".join([given, *self.notes, *(said or ["nothing to mend"])])
 
 
 def clean(vertices: ArrayLike, faces: ArrayLike, surface: ArrayLike) -> tuple[Mesh, Report]:
@@ -127,7 +167,7 @@ def clean(vertices: ArrayLike, faces: ArrayLike, surface: ArrayLike) -> tuple[Me
     points, corners = np.array(vertices, dtype=np.float64), np.asarray(faces)
     kinds = np.full(len(corners), surface) if np.ndim(surface) == 0 else np.asarray(surface)
     require_shapes(points, corners, kinds)
-    given = {"vertices": len(points), "faces": len(corners)}
+    n_vertices, n_faces = len(points), len(corners)
     has_data = np.isfinite(points)[corners].all(axis=(1, 2))
     corners, kinds = corners[has_data], kinds[has_data]
     _require_faces(len(corners), len(has_data))
@@ -143,14 +183,15 @@ def clean(vertices: ArrayLike, faces: ArrayLike, surface: ArrayLike) -> tuple[Me
     _require_faces(len(first), len(has_data))
     kept = np.unique(corners[first])
     mesh = Mesh(points[kept], np.searchsorted(kept, corners[first]), kinds[first], origin)
-    counts = {
-        "non_finite": int((~has_data).sum()),
-        "degenerate": len(corners) - len(has_area),
-        "duplicate": len(has_area) - len(first),
-        "merged": merged,
-        "unreferenced": given["vertices"] - merged - len(kept),
-    }
-    return mesh, Report(**given, **counts)
+    return mesh, Report(
+        vertices=n_vertices,
+        faces=n_faces,
+        non_finite=int((~has_data).sum()),
+        degenerate=len(corners) - len(has_area),
+        duplicate=len(has_area) - len(first),
+        merged=merged,
+        unreferenced=n_vertices - merged - len(kept),
+    )
 
 
 def _require_faces(left: int, given: int) -> None:
@@ -184,29 +225,125 @@ def _have_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def read_mesh(
     path: str | Path, *, unit: str | None = None, up: str | None = None, scale: float = 1.0
 ) -> Facets:
-    """Facets of a mesh file (STL, OBJ, PLY, glTF ...), all its parts; nothing is mended here.
+    """Facets of a mesh file (`MESH_FORMATS`), all its parts; nothing is mended here.
 
-    The unit of lengths is by default the one that the file states, or else metres; up is by
-    default y for glTF, z for others. SceneError for a file that is missing, can not be loaded
-    or holds no triangles, or an unknown unit.
+    Polygons are cut into triangles (:mod:`sweep.scenes.polygons`). The unit of lengths is by
+    default the one that the file states, or else metres; up is by default y for glTF, z for
+    others. SceneError for a file that is missing, can not be loaded or holds no triangles, a
+    polygon without a surface of its own, or an unknown unit.
     """
-    import trimesh
-
     path = existing(path)
+    suffix = path.suffix.lower()
+    if suffix not in MESH_FORMATS:
+        formats = ", ".join(MESH_FORMATS)
+        raise SceneError(path, f"is no mesh of a format that is read ({formats})", "export to one")
+    needed = _MEMORY_FACTOR[suffix] * path.stat().st_size
+    require_memory(path, needed, "reduce the mesh, or cut a part out of it")
     try:
-        scene: Any = trimesh.load_scene(str(path), process=False)
+        reader = _read_polygon_file if suffix in POLYGON_FORMATS else _read_triangle_file
+        parts, stated = reader(path)
+    except SceneError:
+        raise
     except ImportError as error:
-        remedy = "install what it asks for, or export to OBJ, PLY, STL or glTF"
+        if (error.name or "").partition(".")[0] in _PACKAGES:
+            raise
+        remedy = "install what it asks for, or export to OBJ, PLY, STL or plain glTF"
         raise SceneError(path, f"needs another package ({error})", remedy) from None
-    except Exception as error:  # parsers of dozens of formats fail in as many ways
-        known = ", ".join(sorted(trimesh.available_formats()))
-        raise SceneError(path, f"is no mesh that can be read ({error})", f"use {known}") from None
-    parts = [part for node in sorted(scene.graph.nodes_geometry) for part in _parts(scene, node)]
+    except Exception as error:  # parsers of several formats fail in as many ways
+        rule, remedy = f"is no mesh that can be read ({error})", "check it, or export it again"
+        raise SceneError(path, rule, remedy) from None
     if not parts:
         raise SceneError(path, "holds no triangles", "export a triangle mesh, not points or curves")
-    y_up = path.suffix.lower() in _Y_UP_FORMATS if up is None else up == "y"
+    y_up = suffix in _Y_UP_FORMATS if up is None else up == "y"
     rotation = about(0, math.pi / 2) if y_up else UPRIGHT
-    return join(parts).placed(rotation=rotation, scale=scale * _metres(path, unit or scene.units))
+    return join(parts).placed(rotation=rotation, scale=scale * _metres(path, unit or stated))
+
+
+def _read_polygon_file(path: Path) -> tuple[list[Facets], str | None]:
+    """Facets of a file of polygons, in the file's frame and unit, which it does not state."""
+    polygons = read_polygons(path)
+    cut = triangulate(polygons)
+    if not len(cut.faces):
+        return [], None
+    return [replace(Facets.of(polygons.vertices, cut.faces), notes=cut.notes())], None
+
+
+def _read_triangle_file(path: Path) -> tuple[list[Facets], str | None]:
+    """Facets of a file of triangles, part by part, in the file's frame; its unit of length."""
+    import trimesh
+
+    if path.suffix.lower() in _Y_UP_FORMATS:
+        _check_gltf(path)
+    with path.open("rb") as file:
+        scene: Any = trimesh.load_scene(
+            file,
+            file_type=path.suffix.lower()[1:],
+            resolver=_companions_of(path),
+            process=False,
+            skip_materials=True,  # nothing is seen of textures, which can be of any size
+        )
+    nodes = sorted(scene.graph.nodes_geometry)
+    faces = [len(getattr(scene.geometry[scene.graph[node][1]], "faces", ())) for node in nodes]
+    if sum(faces) > FACES_MAX:
+        rule = f"places its meshes so often that they make {sum(faces):,} triangles"
+        raise SceneError(path, rule, f"keep it below {FACES_MAX:.0e}")
+    return [part for node in nodes for part in _parts(scene, node)], scene.units
+
+
+def _companions_of(path: Path) -> Any:
+    """Trimesh's resolver of the names in a file, which serves plain files beside it alone."""
+    from trimesh.resolvers import Resolver
+
+    class PlainFiles(Resolver):  # type: ignore[misc]
+        """Files that a mesh names."""
+
+        def __init__(self) -> None:
+            pass
+
+        def get(self, key: str) -> bytes:
+            """Content of a file."""
+            return read_companion(path, key)
+
+        def write(self, name: str, data: bytes) -> None:
+            """Refuse to write."""
+            raise NotImplementedError
+
+        def namespaced(self, namespace: str) -> PlainFiles:
+            """Return the same resolver, for names below a folder are none of a glTF's."""
+            return self
+
+        def keys(self) -> list[str]:
+            """Names that are listed: none."""
+            return []
+
+    return PlainFiles()
+
+
+_GLB_HEADER = struct.Struct("<4sIIII")
+_ACCESSOR_BYTES = 64
+"""Most bytes of an element of an accessor: a matrix of 16 floats."""
+
+
+def _check_gltf(path: Path) -> None:
+    """Refuse a glTF whose arrays are larger than its buffers, or whose document is none."""
+    content = path.read_bytes()
+    if path.suffix.lower() == ".glb":
+        if len(content) < _GLB_HEADER.size:
+            raise ValueError("it is cut off")
+        magic, version, _, length, _ = _GLB_HEADER.unpack_from(content)
+        if magic != b"glTF" or version != 2:
+            raise ValueError("it is no binary glTF of version 2")
+        content = content[_GLB_HEADER.size : _GLB_HEADER.size + length]
+    document = json.loads(content)
+    accessors = document.get("accessors", []) if isinstance(document, dict) else None
+    if accessors is None:
+        raise ValueError("it is no JSON object")
+    buffers = sum(int(buffer["byteLength"]) for buffer in document.get("buffers", []))
+    elements = sum(int(accessor["count"]) for accessor in accessors)
+    if elements > max(buffers, 1) or elements < 0:
+        raise ValueError(f"its arrays have {elements:,} elements in {buffers:,} bytes")
+    remedy = "reduce the mesh, or cut a part out of it"
+    require_memory(path, elements * _ACCESSOR_BYTES + buffers, remedy)
 
 
 def _parts(scene: Any, node: str) -> Iterator[Facets]:

@@ -2,40 +2,60 @@
 
 from __future__ import annotations
 
+import glob
 import hashlib
 import math
-import re
+import os
+import warnings
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from html import unescape
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 
-from sweep.scenes.files import SceneError, existing
+from sweep.scenes.files import SceneError, existing, require_memory
+from sweep.scenes.heights import cliff_warnings, without_data
+from sweep.scenes.maps import Stated, degree_at, height_factor, map_frame_of
 from sweep.scenes.terrain import Bounds, Terrain
 
 MOST_CELLS = 50_000_000
 """Heights read at once at most: 100 million triangles."""
 
-#: Rows that a digest is taken of at a time.
-_ROWS = 256
+FILE_CELLS_MAX = 1_000_000_000
+"""Heights of a raster's file at most: all of them are read for its digest."""
 
-#: For GDAL: it opens no address as a file, and its requests go to a port where nobody answers.
+BYTES_A_CELL = 400
+"""Memory that a height takes at most while its triangles and their tree are built, measured."""
+
+_STRIP_CELLS = 1 << 22
+"""Heights that are read from a file at a time."""
+
 _NO_NETWORK = {
-    "CPL_VSIL_CURL_ALLOWED_EXTENSIONS": "none", "GDAL_HTTP_PROXY": "127.0.0.1:1",
-}  # fmt: skip
+    "CPL_VSIL_CURL_ALLOWED_EXTENSIONS": "none",
+    "GDAL_HTTP_PROXY": "127.0.0.1:1",  # a port where nobody answers
+    "GDAL_HTTPS_PROXY": "127.0.0.1:1",
+    "GDAL_HTTP_MAX_RETRY": "0",
+    "GDAL_VRT_ENABLE_PYTHON": "NO",
+    "GDAL_VRT_ENABLE_RAWRASTERBAND": "NO",
+}
+"""Settings of GDAL by which nothing that a raster names is fetched or run."""
 
-_SOURCE = re.compile(r"<Source(?:Filename|Dataset)([^>]*)>([^<]*)<")
-_SUBDATASET = re.compile(r"[A-Z0-9_]{2,}:")
-_LARGEST_VRT = 1 << 26
+_DRIVERS = (
+    "GTiff", "AAIGrid", "GRASSASCIIGrid", "EHdr", "ENVI", "HFA", "PNG", "JPEG", "BMP", "SRTMHGT",
+    "USGSDEM", "DTED", "GSAG", "GSBG", "GS7BG", "XYZ", "SAGA", "RST", "PDS", "ISIS2", "ISIS3",
+    "VICAR", "JP2OpenJPEG", "netCDF",
+)  # fmt: skip
+"""Formats of rasters that are files of this machine and name no others."""
 
-_METRES = dict.fromkeys(("", "m", "metre", "meter", "metres", "meters"), 1.0) | {
-    "ft": 0.3048, "foot": 0.3048, "feet": 0.3048, "us survey foot": 1200 / 3937,
-}  # fmt: skip
+_PICTURES = ("PNG", "TIFF", "JPEG", "BMP", "PPM", "WEBP")
+"""Formats of grey images. Others may run programs, or hold what is no picture."""
 
-WGS84_RADIUS, WGS84_FLATTENING = 6_378_137.0, 1 / 298.257223563
+_VRT_BYTES_MAX = 1 << 26
+_VRT_DEPTH_MAX = 8
 
 
 def read_raster(
@@ -44,47 +64,89 @@ def read_raster(
     band: int = 1,
     window: Bounds | None = None,
     metres_per_degree: tuple[float, float] | None = None,
+    metres_per_unit: tuple[float, float] | None = None,
+    height_unit: str | None = None,
+    no_data: float | None = None,
     pixel: float | None = None,
+    scaled: bool = False,
 ) -> Terrain:
     """Terrain of a georeferenced raster, such as a GeoTIFF, or of a window (W, S, E, N) of it.
 
-    Nodes lie at the centres of the pixels; those without data are holes. The raster's own scale
-    and offset are applied, and feet are turned into metres. One in degrees needs metres per
-    degree, east and north; one without a scale the size of a pixel [m], its lower left corner
-    being the world's origin.
+    Nodes lie at the centres of the pixels; those without data are holes, and so are those that
+    hold the value `no_data`. The raster's own scale and offset are applied, and feet are turned
+    into metres. One in degrees needs metres per degree, east and north. One on a map whose
+    unit is another length on the ground needs metres per unit (:mod:`sweep.scenes.maps`). One
+    without a scale needs the size of a pixel [m]; its lower left corner is the world's origin.
+    `scaled`: a factor is to be applied to the heights, so that their unit is known.
 
-    SceneError for a file that is missing, no raster, without scale, rotated, in degrees whose
-    size is not stated, too large, or without any height; or a band or window that it does not
-    have.
+    SceneError for a file that is missing, no raster, without scale, rotated, too large, or without
+    any height. Likewise for a unit whose size is not known, and a missing band or window.
     """
     path = existing(path)
     with _opened(path) as data:
         if not 1 <= band <= data.count:
             raise SceneError(path, f"has {data.count} band(s), not a band {band}", "choose another")
         transform = _straight(path, data, pixel)
-        east, north = _scale(path, data, metres_per_degree)
         view = _view(path, data, transform, window)
-        heights = _heights(path, data, band, view)
+        x, y = (
+            sorted((first, first + step * number))
+            for first, step, number in (
+                (transform.c + view.col_off * transform.a, transform.a, view.width),
+                (transform.f + view.row_off * transform.e, transform.e, view.height),
+            )
+        )
+        wkt = "" if data.crs is None else _wkt(path, data)
+        cell = math.inf if pixel is not None else min(abs(transform.a), abs(transform.e))
+        stated = Stated(metres_per_degree, metres_per_unit, height_unit)
+        map_frame = map_frame_of(path, wkt, (x[0], y[0], x[1], y[1]), cell, stated)
+        unit = height_factor(path, wkt, data.units[band - 1] or "", height_unit, scaled)
+        raw = _values(data, band, view)
+        doubts = without_data(path, raw, no_data)
+        raw *= data.scales[band - 1]
+        raw += data.offsets[band - 1]
+        raw *= unit
     left = transform.c + (view.col_off + 0.5) * transform.a
     top = transform.f + (view.row_off + 0.5) * transform.e
+    east, north = map_frame.factors
     spacing = transform.a * east, transform.e * north
-    return Terrain(heights, spacing, np.array([left * east, top * north, 0.0]))
+    terrain = Terrain(raw, spacing, np.array([left * east, top * north, 0.0]), map_frame=map_frame)
+    return _checked(path, terrain, doubts)
+
+
+def _wkt(path: Path, data: Any) -> str:
+    """Coordinate reference system of a raster as WKT."""
+    from rasterio.errors import CRSError
+
+    try:
+        return str(data.crs.to_wkt())
+    except CRSError as error:
+        rule = f"has a coordinate reference system that can not be written ({error})"
+        raise SceneError(path, rule, "state it anew with gdal_edit -a_srs") from None
+
+
+def _checked(path: Path, terrain: Terrain, doubts: tuple[str, ...]) -> Terrain:
+    """Terrain with warnings: of its map, the doubts given, and its cliffs."""
+    _require_heights(path, terrain.heights)
+    of_map = () if terrain.map_frame is None else terrain.map_frame.warnings
+    cliffs = cliff_warnings(path, terrain.heights, terrain.spacing)
+    return replace(terrain, warnings=(*of_map, *doubts, *cliffs))
 
 
 def raster_digest(path: str | Path) -> str:
     """Digest of a raster's heights, spacing and frame, wherever they come from; or SceneError."""
-    from rasterio.windows import Window as Pixels
-
     path = existing(path)
     with _opened(path) as data:
+        if data.width * data.height * data.count > FILE_CELLS_MAX:
+            size = f"{data.width:,} x {data.height:,} heights in {data.count} band(s)"
+            rule = f"declares {size}, more than {FILE_CELLS_MAX:.0e}"
+            raise SceneError(path, rule, "cut a part out of it with gdal_translate -projwin")
         frame = (data.shape, data.transform, data.crs and data.crs.to_wkt())
         digest = hashlib.blake2b(repr(frame).encode(), digest_size=16)
         for band in data.indexes:
             scale = data.scales[band - 1], data.offsets[band - 1], data.units[band - 1]
             digest.update(repr(scale).encode())
-            for top in range(0, data.height, _ROWS):
-                rows = Pixels(0, top, data.width, min(_ROWS, data.height - top))
-                digest.update(_values(data, band, rows).tobytes())
+            for strip in _strips(data.width, data.height):
+                digest.update(_read(data, band, strip).tobytes())
     return digest.hexdigest()
 
 
@@ -93,27 +155,109 @@ def _opened(path: Path) -> Iterator[Any]:
     """Dataset of a raster. No source on another machine that it names is asked for anything."""
     import rasterio
 
-    _look_for_sources(path, set())
     try:
-        with rasterio.Env(**_NO_NETWORK), rasterio.open(path) as data:
-            yield data
+        with _offline():
+            _check_sources(path, ())
+            with _dataset(path) as data:
+                _require_blocks(path, data)
+                yield data
     except rasterio.errors.RasterioError as error:
         rule = f"is no raster that can be read ({error.__cause__ or error})"
         remedy = "convert it to a GeoTIFF; nothing is fetched over the network"
         raise SceneError(path, rule, remedy) from None
 
 
-def _look_for_sources(path: Path, seen: set[Path]) -> None:
-    """Refuse a .vrt with sources that are no files here: GDAL may take zeros for what is lost."""
+def _require_blocks(path: Path, data: Any) -> None:
+    """Refuse a raster whose blocks, each of which is unpacked whole, do not fit into memory."""
+    for (rows, columns), kind in zip(data.block_shapes, data.dtypes, strict=True):
+        needed = 2 * rows * columns * np.dtype(kind).itemsize
+        require_memory(path, needed, "write it anew with gdal_translate -co TILED=YES")
+
+
+def _dataset(path: Path) -> Any:
+    """Open a raster of a format that is read, and of no other."""
+    from rasterio.io import DatasetReader
+
+    for sidecar in path.parent.glob(f"{glob.escape(path.stem)}.*"):
+        if not (sidecar.is_file() or sidecar.is_dir()) and sidecar.exists():
+            rule = f"stands beside {sidecar.name}, which is a pipe or a device"
+            raise SceneError(path, rule, "remove that: it would be read as a part of the raster")
+    # An absolute path is no address; rasterio.open would take one driver alone.
+    drivers = ["VRT"] if _is_vrt(path) else list(_DRIVERS)
+    return DatasetReader(str(path.absolute()), driver=drivers)
+
+
+@contextmanager
+def _offline() -> Iterator[None]:
+    """Environment in which GDAL fetches nothing, whatever hosts the user exempts from proxies."""
+    import rasterio
+
+    exempt = {name: os.environ.pop(name) for name in ("NO_PROXY", "no_proxy") if name in os.environ}
+    try:
+        with rasterio.Env(**_NO_NETWORK):
+            yield
+    finally:
+        os.environ.update(exempt)
+
+
+def _is_vrt(path: Path) -> bool:
+    """Return true if GDAL would take a file for a virtual raster, by its beginning."""
     with path.open("rb") as file:
-        content = file.read(_LARGEST_VRT) if b"<VRTDataset" in file.peek(1024)[:1024] else b""
-    for attributes, name in _SOURCE.findall(content.decode(errors="replace")):
-        if "://" in name or "/vsi" in name:
+        return b"<vrtdataset" in file.read(1 << 16).lower()
+
+
+def _check_sources(path: Path, within: tuple[Path, ...]) -> None:
+    """Refuse a virtual raster over what is no raster of this machine.
+
+    GDAL may take zeros for a source that is lost, and opens sources of any format, hosts among
+    them.
+    """
+    if not _is_vrt(path):
+        return
+    if len(within) > _VRT_DEPTH_MAX or path in within:
+        raise SceneError(path, "is a virtual raster over itself", "name the rasters below it")
+    for source in _sources(path):
+        _check_sources(source, (*within, path))
+        _require_raster(source)
+
+
+def _sources(path: Path) -> list[Path]:
+    """Files that a virtual raster names, each once and existing."""
+    if path.stat().st_size > _VRT_BYTES_MAX:
+        raise SceneError(path, "is no raster that can be read (too large)", "make it a GeoTIFF")
+    content = path.read_bytes()
+    sources: dict[Path, None] = {}
+    try:
+        if b"<!" in content.replace(b"<!--", b"").replace(b"<![CDATA[", b""):
+            raise ElementTree.ParseError("it declares entities or a document type")
+        root = ElementTree.fromstring(content)
+    except (ElementTree.ParseError, RecursionError, ValueError) as error:
+        rule = f"is no raster that can be read ({error})"
+        raise SceneError(path, rule, "make it anew with gdalbuildvrt") from None
+    for element in root.iter():
+        tag = str(element.tag).rpartition("}")[2].lower()  # GDAL passes over their case
+        if tag not in ("sourcefilename", "sourcedataset"):
+            continue
+        name = (element.text or "").strip()
+        attributes = {key.lower(): value for key, value in element.attrib.items()}
+        if "://" in name or "/vsi" in name.lower():
             rule = f"is no raster that can be read (its source is {name})"
             raise SceneError(path, rule, "fetch that: nothing is fetched over the network")
-        source = path.parent / unescape(name) if '"1"' in attributes else Path(unescape(name))
-        if source not in seen and not _SUBDATASET.match(name):
-            _look_for_sources(existing(source), seen | {source})
+        is_relative = attributes.get("relativetovrt", "0").strip() not in ("", "0")
+        sources[existing(path.parent / name if is_relative else Path(name))] = None
+    return list(sources)
+
+
+def _require_raster(path: Path) -> None:
+    """Refuse a source of a virtual raster that is of no format that is read."""
+    import rasterio
+
+    try:
+        with _dataset(path):
+            pass
+    except rasterio.errors.RasterioError as error:
+        rule = f"is no raster that can be read ({error.__cause__ or error})"
+        raise SceneError(path, rule, "convert it to a GeoTIFF") from None
 
 
 def _straight(path: Path, data: Any, pixel: float | None) -> Any:
@@ -134,38 +278,6 @@ def _straight(path: Path, data: Any, pixel: float | None) -> Any:
     return transform
 
 
-def _scale(path: Path, data: Any, stated: tuple[float, float] | None) -> tuple[float, float]:
-    """Metres of a unit of the raster's coordinates, eastwards and northwards."""
-    if data.crs is not None and data.crs.is_geographic:
-        if stated is None:
-            rule, sizes = "is in degrees, which have no fixed size in metres", _suggestion(data)
-            remedy = f"state metres_per_degree, here {sizes}, or reproject it with gdalwarp"
-            raise SceneError(path, rule, remedy)
-        if not min(stated) > 0:
-            raise SceneError(path, f"has a degree of {stated} m", "make both sizes positive")
-        return stated
-    if stated is not None:
-        raise SceneError(path, "is not in degrees", "leave metres_per_degree out")
-    factor = 1.0 if data.crs is None else float(data.crs.linear_units_factor[1])
-    return factor, factor
-
-
-def _suggestion(data: Any) -> str:
-    """Size of a degree in the middle of a raster in degrees, on its own ellipsoid."""
-    middle = (data.bounds.bottom + data.bounds.top) / 2
-    described = data.crs.to_dict(projjson=True)
-    datum = described.get("datum") or described.get("datum_ensemble") or {}
-    ellipsoid = datum.get("ellipsoid", {})
-    if "radius" in ellipsoid:
-        sizes = degree_at(middle, radius=float(ellipsoid["radius"]), flattening=0.0)
-    elif "inverse_flattening" in ellipsoid:
-        radius, inverse = ellipsoid["semi_major_axis"], ellipsoid["inverse_flattening"]
-        sizes = degree_at(middle, radius=float(radius), flattening=1 / float(inverse))
-    else:
-        sizes = degree_at(middle)
-    return f"[{sizes[0]:.1f}, {sizes[1]:.1f}]"
-
-
 def _view(path: Path, data: Any, transform: Any, window: Bounds | None) -> Any:
     """Rows and columns to read."""
     from rasterio.windows import Window as Pixels
@@ -181,32 +293,53 @@ def _view(path: Path, data: Any, transform: Any, window: Bounds | None) -> Any:
             covered = f"it covers {tuple(data.bounds)}"
             raise SceneError(path, f"has no ground within {window}", covered)
         view = Pixels(left, top, right - left, bottom - top)
-    if view.width * view.height > MOST_CELLS:
-        rule = f"has {view.width:.0f} x {view.height:.0f} heights, more than {MOST_CELLS:.0e}"
-        raise SceneError(path, rule, f"give a window within {tuple(data.bounds)}")
+    remedy = f"give a window within {tuple(data.bounds)}"
+    require_cells(path, int(view.height), int(view.width), remedy)
     return view
 
 
-def _values(data: Any, band: int, view: Any) -> np.ndarray:
-    """Values of a band as they are stored, NaN where there are none."""
-    values = data.read(band, window=view, masked=True)
+def _strips(width: int, height: int) -> Iterator[Any]:
+    """Windows of some rows each, or of parts of a row, that make up a raster."""
+    from rasterio.windows import Window as Pixels
+
+    rows, columns = max(_STRIP_CELLS // width, 1), min(width, _STRIP_CELLS)
+    for top in range(0, height, rows):
+        for left in range(0, width, columns):
+            yield Pixels(left, top, min(columns, width - left), min(rows, height - top))
+
+
+def _read(data: Any, band: int, window: Any) -> np.ndarray:
+    """Values of a band in a window as they are stored, NaN where there are none."""
+    values = data.read(band, window=window, masked=True)
     return np.asarray(np.ma.filled(values.astype(float), np.nan))
 
 
-def _heights(path: Path, data: Any, band: int, view: Any) -> np.ndarray:
-    """Heights [m], NaN where the raster has no data."""
-    heights = _values(data, band, view)
-    heights[~np.isfinite(heights)] = np.nan
-    _require_heights(path, heights)
-    unit = (data.units[band - 1] or "").strip().lower()
-    if unit not in _METRES:
-        raise SceneError(path, f"has heights in '{unit}'", "convert them to metres with gdal_calc")
-    return (heights * data.scales[band - 1] + data.offsets[band - 1]) * _METRES[unit]
+def _values(data: Any, band: int, view: Any) -> np.ndarray:
+    """Values of a view, strip by strip, as the masks of all at once would take much memory."""
+    from rasterio.windows import Window as Pixels
+
+    values = np.empty((int(view.height), int(view.width)))
+    for strip in _strips(int(view.width), int(view.height)):
+        window = Pixels(
+            view.col_off + strip.col_off, view.row_off + strip.row_off, strip.width, strip.height
+        )
+        rows = slice(strip.row_off, strip.row_off + strip.height)
+        columns = slice(strip.col_off, strip.col_off + strip.width)
+        values[rows, columns] = _read(data, band, window)
+    return values
 
 
 def _require_heights(path: Path, heights: np.ndarray) -> None:
     if min(heights.shape) < 2 or np.isfinite(heights).sum() < 3:
         raise SceneError(path, "has too few heights for a triangle", "check its no-data value")
+
+
+def require_cells(path: Path, rows: int, columns: int, remedy: str) -> None:
+    """Refuse a grid of more heights than a scene takes, or than the memory holds."""
+    if rows * columns > MOST_CELLS:
+        rule = f"has {columns:,} x {rows:,} heights, more than {MOST_CELLS:.0e}"
+        raise SceneError(path, rule, remedy)
+    require_memory(path, BYTES_A_CELL * rows * columns, f"{remedy}, or coarsen it")
 
 
 def read_array(
@@ -224,44 +357,81 @@ def read_array(
     """
     path = existing(path)
     try:
-        loaded: Any = np.load(path, allow_pickle=False)
-    except (ValueError, OSError, EOFError) as error:
+        with path.open("rb") as file:
+            values = _array_of(path, file, path.stat().st_size, name)
+    except SceneError:
+        raise
+    except Exception as error:  # archives and headers fail in as many ways
         raise SceneError(path, f"is no NumPy file ({error})", "write it with numpy.save") from None
-    if isinstance(loaded, np.ndarray):
-        return _grid(path, loaded, spacing, no_data)
-    with loaded:
-        return _grid(path, _member(path, loaded, name), spacing, no_data)
+    return _grid(path, values, spacing, no_data)
 
 
-def _member(path: Path, loaded: Any, name: str | None) -> np.ndarray:
-    """Return the array of an archive that holds the heights."""
-    choose = f"name one of: {', '.join(loaded.files)}"
-    if name is None:
-        grids = [key for key in loaded.files if loaded[key].ndim == 2]
-        if len(grids) != 1:
-            raise SceneError(path, f"holds {len(grids)} grids", choose)
-        name = grids[0]
-    if name not in loaded.files:
-        raise SceneError(path, f"holds no '{name}'", choose)
-    return np.asarray(loaded[name])
+def _array_of(path: Path, file: Any, size: int, name: str | None) -> np.ndarray:
+    """Heights of a file of one array, or of an archive of several."""
+    if not zipfile.is_zipfile(file):
+        file.seek(0)
+        return _stored_array(path, file, size)
+    file.seek(0)
+    with zipfile.ZipFile(file) as archive:
+        entries = {
+            entry.filename.removesuffix(".npy"): entry
+            for entry in archive.infolist()
+            if entry.filename.endswith(".npy")
+        }
+        choose = f"name one of: {', '.join(entries)}"
+        if name is None:
+            grids = []
+            for key, entry in entries.items():
+                with archive.open(entry) as member:
+                    if len(_header_of(member)[0]) == 2:
+                        grids.append(key)
+            if len(grids) != 1:
+                raise SceneError(path, f"holds {len(grids)} grids", choose)
+            name = grids[0]
+        if name not in entries:
+            raise SceneError(path, f"holds no '{name}'", choose)
+        with archive.open(entries[name]) as member:
+            return _stored_array(path, member, entries[name].file_size)
+
+
+def _header_of(file: Any) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Shape and type of an array in NumPy's format, by its header alone."""
+    version = np.lib.format.read_magic(file)
+    read = np.lib.format.read_array_header_1_0
+    if version != (1, 0):
+        read = np.lib.format.read_array_header_2_0
+    shape, _, dtype = read(file)
+    return shape, dtype
+
+
+def _stored_array(path: Path, file: Any, size: int) -> np.ndarray:
+    """Array in NumPy's format of a file of so many bytes, whose header is looked at first."""
+    shape, dtype = _header_of(file)
+    if len(shape) != 2 or dtype.kind not in "iuf":
+        rule = f"holds {dtype} of shape {shape}"
+        raise SceneError(path, rule, "heights are a two-dimensional array of numbers")
+    require_cells(path, *shape, "cut a part out of it")
+    if file.tell() + math.prod(shape) * dtype.itemsize > size:
+        raise ValueError(f"its header tells of shape {shape}, and {size:,} bytes are too few")
+    file.seek(0)
+    return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
 
 
 def _grid(
     path: Path, values: np.ndarray, spacing: tuple[float, float], no_data: float | None = None
 ) -> Terrain:
     """Terrain of an array of heights."""
-    if values.ndim != 2 or min(values.shape) < 2 or values.dtype.kind not in "iuf":
+    if min(values.shape) < 2:
         rule = f"holds {values.dtype} of shape {values.shape}"
         raise SceneError(path, rule, "heights are a two-dimensional array of numbers")
-    if values.size > MOST_CELLS:
-        raise SceneError(path, f"holds more than {MOST_CELLS:.0e} heights", "cut a part out of it")
     heights = values.astype(float)
-    heights[~np.isfinite(heights) | (values == no_data)] = np.nan
+    doubts = without_data(path, heights, no_data)
     _require_heights(path, heights)
     try:
-        return Terrain(heights, spacing, np.zeros(3))
+        terrain = Terrain(heights, spacing, np.zeros(3))
     except ValueError as error:
         raise SceneError(path, str(error), "state steps in metres") from None
+    return _checked(path, terrain, doubts)
 
 
 def read_image(path: str | Path, *, pixel: float, black: float = 0.0, white: float) -> Terrain:
@@ -278,12 +448,17 @@ def read_image(path: str | Path, *, pixel: float, black: float = 0.0, white: flo
 
 def _grey(path: Path) -> np.ndarray:
     """Grey levels of an image, as stored."""
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image
 
     try:
-        with Image.open(path) as image:
-            mode, levels = image.mode, np.asarray(image)
-    except (UnidentifiedImageError, OSError, Image.DecompressionBombError) as error:
+        with warnings.catch_warnings():  # what is too large is told below
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(path, formats=_PICTURES) as image:
+                require_cells(path, image.height, image.width, "cut a part out of it")
+                mode, levels = image.mode, np.asarray(image)
+    except SceneError:
+        raise
+    except Exception as error:  # readers of pictures fail in as many ways
         raise SceneError(path, f"is no image that can be read ({error})", "use PNG") from None
     if mode == "RGB" and (levels[..., :1] == levels).all():
         return np.asarray(levels[..., 0])
@@ -291,22 +466,6 @@ def _grey(path: Path) -> np.ndarray:
         remedy = "save it in grey, 8 or 16 bits a pixel"
         raise SceneError(path, f"has pixels of mode {mode}", remedy)
     return np.asarray(levels, np.uint8 if mode == "L" else np.uint16)
-
-
-def degree_at(
-    latitude: float, *, radius: float = WGS84_RADIUS, flattening: float = WGS84_FLATTENING
-) -> tuple[float, float]:
-    """Metres of a degree of longitude and of latitude at a geodetic latitude [deg].
-
-    Over a grid of h degrees the east-west scale is off by up to ``tan(latitude) h/2`` at its
-    edges.
-    """
-    square = flattening * (2 - flattening)
-    phi = math.radians(latitude)
-    shrink = 1 - square * math.sin(phi) ** 2
-    across = radius / math.sqrt(shrink)
-    along = radius * (1 - square) / shrink**1.5
-    return math.radians(across * math.cos(phi)), math.radians(along)
 
 
 def jacksboro() -> Terrain:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -214,7 +214,7 @@ def carve(terrain: Terrain, craters: Craters) -> Terrain:
         cols, col_x = _window(x - terrain.origin[0], reach, terrain.spacing[0], heights.shape[1])
         radius = np.hypot(row_y[:, None], col_x)
         heights[rows, cols] += profile(radius, diameter=diameter, freshness=freshness)
-    return Terrain(heights, terrain.spacing, terrain.origin)
+    return replace(terrain, heights=heights)
 
 
 def _window(centre: float, reach: float, step: float, number: int) -> tuple[slice, np.ndarray]:

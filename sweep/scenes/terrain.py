@@ -13,11 +13,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import fft
 
+from sweep.scenes.maps import MapFrame
 from sweep.scenes.meshes import Facets
 
 _NEGLIGIBLE = 1e-6
@@ -35,11 +36,14 @@ class Terrain:
     """Heights (rows, columns) of nodes on a grid above its origin [m]; NaN where there is none.
 
     Steps (dx, dy) [m] may be negative; the origin (3,) is that of node (0, 0) at height 0 [m].
+    One that was read from a map has the frame of that map; warnings say what is doubtful about it.
     """
 
     heights: np.ndarray
     spacing: tuple[float, float]
     origin: np.ndarray
+    map_frame: MapFrame | None = None
+    warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         z, spacing = self.heights, self.spacing
@@ -73,25 +77,42 @@ class Terrain:
     def facets(self) -> Facets:
         """Triangles of the ground, facing upwards, and the nodes that they use."""
         z, (dx, dy) = self.heights, self.spacing
-        faces = _triangles(np.isfinite(z))
+        present = np.isfinite(z)
+        faces = _triangles(present)
         if dx * dy < 0:
             faces = faces[:, ::-1]
-        used = np.zeros(z.size, bool)
-        used[faces.ravel()] = True
-        number = np.cumsum(used) - 1
-        row, column = np.divmod(np.flatnonzero(used), z.shape[1])
-        vertices = np.column_stack([column * dx, row * dy, z.ravel()[used]]) + 0.0  # never -0.0
-        return Facets.of(vertices, number[faces], origin=self.origin)
+        rows, columns = z.shape
+        vertices = np.empty((rows, columns, 3))
+        vertices[..., 0] = np.arange(columns) * dx
+        vertices[..., 1] = (np.arange(rows) * dy)[:, None]
+        vertices[..., 2] = z
+        vertices += 0.0  # never -0.0
+        nodes = vertices.reshape(-1, 3)
+        if not present.all():
+            used = np.zeros(z.size, bool)
+            used[faces] = True
+            number = np.cumsum(used, dtype=np.int32) - 1
+            faces, nodes = number[faces], nodes[used]
+        surface = np.zeros(len(faces), np.int16)
+        return Facets(nodes, faces, surface, self.origin, is_grid=True)
 
 
 def _triangles(present: np.ndarray) -> np.ndarray:
-    """Triangles of all cells, counter-clockwise where rows and columns both increase, (m, 3).
+    """Triangles of all cells, counter-clockwise where rows and columns both increase, (m, 3) int32.
 
-    Whole cells are cut along the diagonal from node (i, j) to (i+1, j+1).
+    Whole cells are cut along the diagonal from node (i, j) to (i+1, j+1). First come the lower
+    triangles of all cells, then the upper ones.
     """
-    node = np.arange(present.size).reshape(present.shape)
+    node = np.arange(present.size, dtype=np.int32).reshape(present.shape)
     # Corners of each cell, counter-clockwise from (i, j).
     a, b, c, d = node[:-1, :-1], node[:-1, 1:], node[1:, 1:], node[1:, :-1]
+    if present.all():
+        faces = np.empty((2, *a.shape, 3), np.int32)
+        for k, corner in enumerate((a, b, c)):
+            faces[0, ..., k] = corner
+        for k, corner in enumerate((a, c, d)):
+            faces[1, ..., k] = corner
+        return faces.reshape(-1, 3)
     here = present.ravel()
     missing = [~here[corner] for corner in (a, b, c, d)]
     lacks = sum(gap.astype(np.int8) for gap in missing)
@@ -151,7 +172,7 @@ def refine(terrain: Terrain, *, factor: int) -> Terrain:
     near = holes[fine_rows // factor] | holes[-(-fine_rows // factor)]
     fine[near[:, fine_columns // factor] | near[:, -(-fine_columns // factor)]] = np.nan
     spacing = terrain.spacing[0] / factor, terrain.spacing[1] / factor
-    return Terrain(fine, spacing, terrain.origin)
+    return replace(terrain, heights=fine, spacing=spacing)
 
 
 def smooth(terrain: Terrain, *, width: float) -> Terrain:
@@ -172,7 +193,7 @@ def smooth(terrain: Terrain, *, width: float) -> Terrain:
     blurred = gaussian_filter(kept, sigma, mode="nearest")
     weight = gaussian_filter(there.astype(float), sigma, mode="nearest")
     smoothed = np.divide(blurred, weight, where=there, out=np.full_like(kept, np.nan))
-    return Terrain(smoothed, terrain.spacing, terrain.origin)
+    return replace(terrain, heights=smoothed)
 
 
 def piece(terrain: Terrain, *, centre: Sequence[float], size: float) -> Terrain:
@@ -189,7 +210,7 @@ def piece(terrain: Terrain, *, centre: Sequence[float], size: float) -> Terrain:
             raise _no_ground(centre, size)
         corner[axis] += first * step
         cuts.append(slice(first, last + 1))
-    return Terrain(terrain.heights[cuts[0], cuts[1]], terrain.spacing, corner)
+    return replace(terrain, heights=terrain.heights[cuts[0], cuts[1]], origin=corner)
 
 
 def square(terrain: Terrain, *, centre: Sequence[float], size: float) -> Bounds:

@@ -11,7 +11,8 @@ import numpy as np
 
 import sweep.spec.parts as of
 from sweep.model.ground import LAWS
-from sweep.scenes.rasters import MOST_CELLS, raster_digest, read_raster
+from sweep.scenes.files import require_memory
+from sweep.scenes.rasters import BYTES_A_CELL, MOST_CELLS, raster_digest, read_raster
 from sweep.spec.parts import Files, Part
 from sweep.spec.sections import SHARE_SCATTERED
 
@@ -94,6 +95,12 @@ class Craters(Part):
         return carve(terrain, craters)
 
 
+def _require_memory(nodes: int) -> None:
+    """Refuse a grid whose triangles would take more memory than there is."""
+    remedy = "take a coarser grid, or a smaller part of it"
+    require_memory(f"a ground of {nodes:,} heights", BYTES_A_CELL * nodes, remedy)
+
+
 class Ground(Material, ABC):
     """A grid of heights and what is done to it, in this order: smooth, refine, relief, craters."""
 
@@ -112,18 +119,22 @@ class Ground(Material, ABC):
 
         A `SceneError` for an unfit file, a ValueError for a grid that can not hold what it should.
         """
-        from sweep.scenes.terrain import Terrain, refine, smooth
+        return self.shaped(self.survey(files))
 
-        terrain = self.survey(files)
+    def shaped(self, terrain: Terrain) -> Terrain:
+        """Return the survey smoothed, refined, with its relief and its craters."""
+        from sweep.scenes.terrain import refine, smooth
+
         if terrain.heights.size * self.factor**2 > MOST_CELLS:
             raise ValueError(f"refined {self.factor} times it has more than {MOST_CELLS:.0e} nodes")
+        _require_memory(terrain.heights.size * self.factor**2)
         if self.smoothing:
             terrain = smooth(terrain, width=self.smoothing)
         if self.factor > 1:
             terrain = refine(terrain, factor=self.factor)
         if self.relief is not None:
             heights = terrain.heights + self.relief.heights(terrain.heights.shape, terrain.spacing)
-            terrain = Terrain(heights, terrain.spacing, terrain.origin)
+            terrain = replace(terrain, heights=heights)
         return terrain if self.craters is None else self.craters.carved(terrain)
 
     @abstractmethod
@@ -147,12 +158,10 @@ class PlacedGround(Ground):
 
     def survey(self, files: Files) -> Terrain:
         """Return the ground before smoothing, refining, relief and craters."""
-        from sweep.scenes.terrain import Terrain
-
         grid = self.grid(files)
         (rows, columns), (dx, dy) = grid.heights.shape, grid.spacing
         corner = np.array([-(columns - 1) / 2 * dx, -(rows - 1) / 2 * dy, 0.0])
-        return Terrain(grid.heights, grid.spacing, corner + self.position)
+        return replace(grid, origin=corner + self.position)
 
     @abstractmethod
     def grid(self, files: Files) -> Terrain:
@@ -194,6 +203,10 @@ class Jacksboro(PlacedGround):
         return max(abs(step) for step in self.grid(None).spacing) / self.factor
 
 
+_NO_DATA = of.number(
+    "Value that stands for a missing height, where the file does not declare it",
+    "-9999", "-1e39", "1e39", default=None,
+)  # fmt: skip
 _SCALE = of.number("Metres to a unit of the file's heights", "0.5", "1e-9", "1e9", default=1.0)
 
 
@@ -201,7 +214,7 @@ class RasterGround(Ground):
     """Heights of a georeferenced raster, such as a GeoTIFF, in its own coordinates."""
 
     kind: Literal["raster"]
-    file: str = of.file("The raster, whatever rasterio reads", digest=raster_digest)
+    file: str = of.file("The raster: GeoTIFF or another format of GDAL", digest=raster_digest)
     band: int = of.count("Band that holds the heights", "1", default=1)
     scale: float = _SCALE
     window: Vector | None = of.several(
@@ -212,15 +225,26 @@ class RasterGround(Ground):
         of.measure("Metres", "", "110900", "1e-6"), 2, 2, None,
         about="Metres of a degree eastwards and northwards, of a raster in degrees",
     )  # fmt: skip
+    metres_per_unit: Vector | None = of.several(
+        of.measure("Metres", "", "0.5", "1e-6"), 2, 2, None,
+        about="Metres on the ground to a unit of the raster's coordinates, eastwards and "
+        "northwards, of a map whose scale differs from that of the ground",
+    )  # fmt: skip
+    height_unit: str | None = of.text(
+        "Unit of the heights, where the file does not tell it: m, ft, sft (US survey foot)", None
+    )
+    no_data: float | None = _NO_DATA
     pixel: float | None = of.size(
         "Size of a pixel, of a raster that states no scale", "1 m", default=None
     )
 
     def survey(self, files: Files) -> Terrain:
         """Heights of the raster."""
+        fields = {"band", "window", "metres_per_degree", "metres_per_unit", "height_unit"}
         terrain = read_raster(
             files.path(self.file, raster_digest),
-            **self.model_dump(include={"band", "window", "metres_per_degree", "pixel"}),
+            **self.model_dump(include={*fields, "no_data", "pixel"}),
+            scaled=self.scale != 1.0,
         )
         return replace(terrain, heights=terrain.heights * self.scale)
 
@@ -236,7 +260,7 @@ class ArrayGround(PlacedGround):
         "m", "5 m", of=2,
     )  # fmt: skip
     name: str | None = of.text("Array of an .npz that holds the heights", None)
-    no_data: float | None = of.number("Value for a missing height", "-9999", default=None)
+    no_data: float | None = _NO_DATA
     scale: float = _SCALE
 
     def grid(self, files: Files) -> Terrain:
@@ -290,6 +314,7 @@ class SquareGround(PlacedGround):
 
         self.check()
         step, number = self.own_step(), _nodes(self.size, self.own_step())
+        _require_memory(number * number)
         return Terrain(np.zeros((number, number)), (step, step), np.zeros(3))
 
     def check(self) -> None:

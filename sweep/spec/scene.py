@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from sweep.model.geometry.mesh import Mesh, Surface
     from sweep.model.geometry.platform import Flight
     from sweep.model.geometry.rays import Caster
-    from sweep.scenes.meshes import Facets
+    from sweep.scenes.meshes import Facets, Report
     from sweep.scenes.scattered import Law
     from sweep.scenes.terrain import Terrain
 
@@ -70,7 +70,7 @@ class MeshObject(Solid):
     """A mesh from a file."""
 
     kind: Literal["mesh"]
-    file: str = of.file("The mesh: STL, OBJ, PLY, glTF and whatever trimesh loads")
+    file: str = of.file("The mesh: STL, OBJ, PLY, OFF or glTF; polygons are cut into triangles")
     unit: str | None = of.text("Unit of its lengths; the file's own, or m", None)
     up: str | None = of.choice("Its vertical axis; y for glTF, else z", ("y", "z"), None)
     scale: float = of.number("Factor on all lengths", "2", "1e-9", "1e9", default=1.0)
@@ -399,6 +399,8 @@ class World(NamedTuple):
     """Report of what loading found and mended, a line an object."""
     origin: np.ndarray
     """(3,): what was subtracted from the objects' own coordinates [m]."""
+    warnings: tuple[str, ...] = ()
+    """What is doubtful about the scene's files."""
 
 
 def surfaces_of(scene: Scene) -> tuple[Surface, ...]:
@@ -434,16 +436,14 @@ def build(scene: Scene, files: Files, span: Span) -> World:
     from sweep.model.geometry.mesh import merge
     from sweep.model.geometry.rays import Caster
 
-    origin, grounds = _grounds(scene, files)
+    origin, grounds, warnings = _grounds(scene, files)
     resting: list[Mesh] = []
     moving: list[tuple[Mesh, Flight]] = []
     reports = []
     first = 0
     for name, thing in scene.objects.items():
         try:
-            facets = _facets(name, thing, grounds, origin, files)
-            surface = (facets.surface + first).astype(np.int16)
-            mesh, report = replace(facets, surface=surface).mesh()
+            mesh, report = _mesh(_facets(name, thing, grounds, origin, files), first)
             motion = thing.motion if isinstance(thing, Solid) else None
             if motion is None:
                 resting.append(mesh)
@@ -451,16 +451,26 @@ def build(scene: Scene, files: Files, span: Span) -> World:
                 moving.append((mesh, motion.flight(files, span)))
         except (ValueError, ArithmeticError) as error:
             raise _unfit(name, error) from None
+        del mesh
         reports.append(f"{name}: {report.text()}")
         first += len(materials(name, thing))
+    del grounds  # before the trees are built, which take the most memory
     meshes = [merge(resting)] if resting else []
+    resting.clear()
     return World(
         Caster([*meshes, *(mesh for mesh, _ in moving)]),
         surfaces_of(scene),
         (*(None for _ in meshes), *(flight for _, flight in moving)),
         tuple(reports),
         origin,
+        warnings,
     )
+
+
+def _mesh(facets: Facets, first: int) -> tuple[Mesh, Report]:
+    """Mesh of facets whose surfaces are numbered from `first`, and its report."""
+    surface = (facets.surface + first).astype(np.int16)
+    return replace(facets, surface=surface).mesh()
 
 
 def _unfit(name: str, error: Exception) -> SceneError:
@@ -468,15 +478,36 @@ def _unfit(name: str, error: Exception) -> SceneError:
     return SceneError(f"scene.objects.{name}", f"can not be made: {error}", "change it")
 
 
-def _grounds(scene: Scene, files: Files) -> tuple[np.ndarray, dict[str, Terrain]]:
-    """Return the scene's origin, and its grounds in the scene's frame."""
+def _grounds(scene: Scene, files: Files) -> tuple[np.ndarray, dict[str, Terrain], tuple[str, ...]]:
+    """Return the scene's origin, its grounds in the scene's frame, and what is doubtful of them."""
+    from sweep.scenes.maps import require_one_map
+    from sweep.scenes.tiles import join_tiles
+
+    things = {name: thing for name, thing in scene.objects.items() if isinstance(thing, Ground)}
     own: dict[str, Terrain] = {}
-    for name, thing in scene.objects.items():
-        if isinstance(thing, Ground):
-            try:
-                own[name] = thing.terrain(files)
-            except (ValueError, ArithmeticError) as error:
-                raise _unfit(name, error) from None
+    for name, thing in things.items():
+        try:
+            own[name] = thing.survey(files)
+        except (ValueError, ArithmeticError) as error:
+            raise _unfit(name, error) from None
+    map_frames = [
+        (name, terrain.map_frame) for name, terrain in own.items() if terrain.map_frame is not None
+    ]
+    require_one_map(map_frames)
+    unnamed = [name for name, map_frame in map_frames if not map_frame.wkt]
+    joined, warnings = join_tiles({name: own[name] for name, _ in map_frames})
+    if 0 < len(unnamed) < len(map_frames):
+        warnings += [
+            f"scene.objects.{name}: names no coordinate reference system, and is taken to lie on "
+            "the map of the other rasters"
+            for name in unnamed
+        ]
+    for name, terrain in (own | joined).items():
+        warnings += [f"scene.objects.{name}: {warning}" for warning in terrain.warnings]
+        try:
+            own[name] = things[name].shaped(terrain)
+        except (ValueError, ArithmeticError) as error:
+            raise _unfit(name, error) from None
     origin = np.zeros(3)
     if scene.origin in own:
         origin = own[scene.origin].centre
@@ -492,7 +523,7 @@ def _grounds(scene: Scene, files: Files) -> tuple[np.ndarray, dict[str, Terrain]
         beside = isinstance(scene.objects[name], PlacedGround) and name != scene.origin
         shift = 0.0 if beside else origin
         grounds[name] = replace(terrain, origin=terrain.origin - shift)
-    return origin, grounds
+    return origin, grounds, tuple(warnings)
 
 
 def _facets(

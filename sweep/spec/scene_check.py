@@ -21,10 +21,11 @@ from sweep.model.ground import pattern as pattern_of
 from sweep.model.outputs import CYCLES, NAVIGATION, POINTS, SHOTS, STATISTICS
 from sweep.model.resolution import PATTERN
 from sweep.scenes.files import SceneError
+from sweep.scenes.maps import height_metres
 from sweep.spec.axes import place_on_grid
 from sweep.spec.grid_rules import Grid
 from sweep.spec.grid_rules import at as written_at
-from sweep.spec.grounds import Craters, Ground, Jacksboro
+from sweep.spec.grounds import Craters, Ground, Jacksboro, RasterGround
 from sweep.spec.parts import Files, named_files, read_as
 from sweep.spec.rules import Finding, Location, near_miss
 from sweep.spec.sections import default_of
@@ -154,6 +155,11 @@ def _object_findings(thing: Any, location: Location) -> Iterator[Finding]:
     """Mistakes in an object at a location, its references and files apart."""
     if isinstance(thing, Ground):
         yield from _ground_findings(thing, location)
+    if isinstance(thing, RasterGround) and thing.height_unit is not None:
+        try:
+            height_metres(thing.height_unit)
+        except QuantityError as error:
+            yield Finding((*location, "height_unit"), error.rule, "write m, ft or sft")
     if isinstance(thing, scenes.Solid):
         yield from _solid_findings(thing, location)
     if isinstance(thing, scenes.Boulders):

@@ -27,6 +27,7 @@ from sweep.storage.locations import (
 )
 from sweep.storage.opening import read_attributes, study_id
 from sweep.tasks import studies
+from sweep.tasks.coverage import refuse_blind
 from sweep.tasks.eyepoint_study import EyepointStudy, world_of
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.grid_study import GridStudy
@@ -286,6 +287,8 @@ def _into(
         if isinstance(asked, SceneSpec) and (anew or not there):
             with working("building the scene", pool.told):
                 reports = world_of(asked).reports
+                if not _has_eyepoints(new, study):
+                    refuse_blind(asked)
             for line in reports:
                 pool.told.say(line)
 
@@ -319,6 +322,13 @@ def _succeed(path: Path, *, durable: bool) -> None:
             sync(new)
         take_place(new, path)
         forget_older(path)  # where it stands now it extends and replaces nothing
+
+
+def _has_eyepoints(path: Location, study: GridStudy | FlightStudy) -> bool:
+    """Tell whether all eyepoints of a study stored at a path were cast before, or are being so."""
+    return isinstance(study, FlightStudy) and all(
+        eyepoints_path(path, eyepoints.id).exists() for eyepoints in study.eyepoint_studies()
+    )
 
 
 def _facts(spec: Declared) -> dict[str, str]:

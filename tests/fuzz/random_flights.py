@@ -38,10 +38,8 @@ def write_files(folder: Path) -> None:
     np.save(folder / "ground.npy", heights)
     Image.fromarray((heights * 40).astype(np.uint8)).save(folder / "ground.png")
     profile = {"driver": "GTiff", "height": 9, "width": 12, "count": 1, "dtype": "float64"}
-    where = rasterio.transform.from_origin(-600, 450, 100, 100)
-    with rasterio.open(
-        folder / "ground.tif", "w", crs="EPSG:32633", transform=where, **profile
-    ) as file:
+    where = rasterio.transform.from_origin(-600, 450, 100, 100)  # of a map of its own
+    with rasterio.open(folder / "ground.tif", "w", transform=where, **profile) as file:
         file.write(heights, 1)
     trimesh.creation.box(extents=(20.0, 30.0, 10.0)).export(folder / "box.stl")
     times = np.linspace(0, 8, 5)

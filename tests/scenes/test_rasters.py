@@ -1,8 +1,10 @@
 import http.server
+import io
 import math
 import os
 import threading
 import warnings
+import zipfile
 
 import numpy as np
 import pytest
@@ -60,7 +62,7 @@ def test_nodes_lie_at_the_centres_of_pixels_with_the_first_row_in_the_north(tiff
 
 
 def test_a_raster_that_runs_northwards_is_read_as_it_lies(tiff):
-    ground = read_raster(tiff(transform=Affine(2, 0, 0, 0, 3, 0)))
+    ground = read_raster(tiff(crs=None, transform=Affine(2, 0, 0, 0, 3, 0)))
     assert ground.spacing == (2.0, 3.0)
     assert ground.height_at(np.array(1.0), np.array(1.5)) == HEIGHTS[0, 0]
 
@@ -86,10 +88,11 @@ def test_a_stated_scale_and_offset_of_the_heights_are_applied(tiff):
 
 
 def test_feet_become_metres_both_ways(tiff):
-    ground = read_raster(tiff(crs=TEXAN_FEET, units="ft"))
+    texan = Affine(2.0, 0.0, 2_500_000.0, 0.0, -3.0, 7_000_000.0)
+    ground = read_raster(tiff(crs=TEXAN_FEET, units="ft", transform=texan))
     survey_foot = 1200 / 3937
     np.testing.assert_allclose(ground.spacing, (2 * survey_foot, -3 * survey_foot), rtol=1e-9)
-    np.testing.assert_allclose(ground.origin[0], 500_001 * survey_foot, rtol=1e-9)
+    np.testing.assert_allclose(ground.origin[0], 2_500_001 * survey_foot, rtol=1e-9)
     np.testing.assert_allclose(ground.heights, HEIGHTS * 0.3048, rtol=1e-7)
 
 
@@ -149,7 +152,7 @@ def test_a_raster_without_scale_needs_the_size_of_a_pixel(tiff):
         ({}, {"metres_per_degree": (1.0, 1.0)}, "not in degrees"),
         ({}, {"pixel": 2.0}, "states its own scale"),
         ({"nodata": 7.0, "heights": np.full((3, 3), 7.0)}, {}, "too few heights"),
-        ({"units": "fathom"}, {}, "fathom"),
+        ({"units": "furlonk"}, {}, "furlonk"),
         ({"crs": DEGREES}, {"metres_per_degree": (0.0, 1.0)}, "positive"),
     ],
 )
@@ -341,7 +344,7 @@ def test_a_step_of_nothing_and_a_file_of_objects_are_refused(tmp_path):
     with pytest.raises(SceneError, match="steps"):
         read_array(tmp_path / "z.npy", spacing=(0.0, 1.0))
     np.save(tmp_path / "objects.npy", np.array([{}, {}], object), allow_pickle=True)
-    with pytest.raises(SceneError, match="no NumPy file"):
+    with pytest.raises(SceneError, match="holds object of shape"):
         read_array(tmp_path / "objects.npy", **STEPS)
 
 
@@ -390,3 +393,193 @@ def test_the_default_terrain_has_the_size_and_heights_of_the_survey():
     assert 1 < ratio < 1.007
     west, south, east, north = ground.bounds
     assert (west, south) == pytest.approx((-east, -north))
+
+
+class Hosts(http.server.BaseHTTPRequestHandler):
+    """A host that counts what is asked of it."""
+
+    asked: list[str] = []  # noqa: RUF012
+
+    def do_GET(self):
+        self.asked.append(self.path)
+        self.send_error(404)
+
+    do_HEAD = do_POST = do_GET
+
+    def log_message(self, *words):
+        pass
+
+
+@pytest.fixture
+def host(monkeypatch):
+    """Address of a host on this machine, which proxies are told to pass by."""
+    for name in ("NO_PROXY", "no_proxy"):
+        monkeypatch.setenv(name, "127.0.0.1,localhost,*")
+    Hosts.asked = []
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Hosts) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_address[1]}"
+        server.shutdown()
+    assert not Hosts.asked
+
+
+WMS = (
+    '<GDAL_WMS><Service name="TMS"><ServerUrl>{}/${{z}}/${{x}}/${{y}}.png</ServerUrl></Service>'
+    "<DataWindow><UpperLeftX>0</UpperLeftX><UpperLeftY>10</UpperLeftY><LowerRightX>10</LowerRightX>"
+    "<LowerRightY>0</LowerRightY><SizeX>512</SizeX><SizeY>512</SizeY><TileLevel>1</TileLevel>"
+    "</DataWindow><Projection>EPSG:32617</Projection><BandsCount>1</BandsCount></GDAL_WMS>"
+)
+STACIT = (
+    '{{"type": "FeatureCollection", "stac_version": "1.0.0", "features": [{{"type": "Feature", '
+    '"stac_version": "1.0.0", "stac_extensions": ["https://stac-extensions.github.io/projection/'
+    'v1.0.0/schema.json"], "properties": {{"proj:epsg": 32617}}, "collection": "c", "assets": '
+    '{{"B": {{"href": "{}/dem.tif", "proj:transform": [1,0,0,0,-1,0], "proj:shape": [9,9]}}}}}}]}}'
+)
+
+
+@pytest.mark.parametrize("content", [WMS, STACIT], ids=["wms", "stacit"])
+@pytest.mark.parametrize("suffix", [".tif", ".xml", ".json"])
+def test_files_that_stand_for_hosts_are_no_rasters(tmp_path, host, content, suffix):
+    path = tmp_path / f"dem{suffix}"
+    path.write_text(content.format(host))
+    for read in (read_raster, raster_digest):
+        with pytest.raises(SceneError, match="is no raster that can be read"):
+            read(path)
+    over = vrt(tmp_path / "over.vrt", path)
+    for read in (read_raster, raster_digest):
+        with pytest.raises(SceneError, match="is no raster that can be read"):
+            read(over)
+
+
+@pytest.mark.parametrize(
+    "spell",
+    [
+        lambda text: text.replace("SourceFilename", "sourcefilename"),
+        lambda text: text.replace("SourceFilename", "SOURCEFILENAME"),
+        lambda text: text.replace("/vsicurl/", "/vsi&#99;url/"),
+        lambda text: text.replace("/vsicurl/", "&#47;vsicurl&#x2f;"),
+        lambda text: text.replace("/vsicurl/", "<![CDATA[/vsicurl/]]>"),
+        lambda text: text.replace("/vsicurl/", "/vsicurl_streaming/"),
+        lambda text: text.replace("/vsicurl/", "/vsizip/vsicurl/"),
+        lambda text: text.replace("SimpleSource", "ComplexSource"),
+        lambda text: f"<!-- a comment -->\n{text}",
+        lambda text: '<!DOCTYPE x [<!ENTITY v "/vsicurl/">]>' + text.replace("/vsicurl/", "&v;"),
+    ],
+)
+def test_a_virtual_raster_is_read_as_xml_and_its_sources_are_files_here(tmp_path, host, spell):
+    over = vrt(tmp_path / "over.vrt", f"/vsicurl/{host}/dem.tif")
+    over.write_text(spell(over.read_text()))
+    for read in (read_raster, raster_digest):
+        with pytest.raises(SceneError, match=r"over\.vrt: is no raster that can be read"):
+            read(over)
+
+
+def test_proxies_that_the_user_exempts_are_as_they_were_afterwards(tiff, monkeypatch):
+    monkeypatch.setenv("NO_PROXY", "example.org")
+    read_raster(tiff())
+    assert os.environ["NO_PROXY"] == "example.org"
+
+
+def test_a_virtual_raster_over_itself_or_a_pipe_is_refused(tmp_path):
+    over = vrt(tmp_path / "over.vrt", tmp_path / "over.vrt")
+    with pytest.raises(SceneError, match="virtual raster over itself"):
+        read_raster(over)
+    os.mkfifo(tmp_path / "pipe.tif")
+    with pytest.raises(SceneError, match="pipe or a device"):
+        read_raster(vrt(tmp_path / "b.vrt", tmp_path / "pipe.tif"))
+
+
+@pytest.mark.parametrize("sidecar", ["dem.tfw", "dem.prj", "dem.tif.aux.xml", "dem.tif.ovr"])
+def test_a_pipe_beside_a_raster_is_not_opened(tiff, tmp_path, sidecar):
+    path = tiff(crs=None, transform=None)
+    os.mkfifo(tmp_path / sidecar)
+    for read in (read_raster, raster_digest):
+        with pytest.raises(SceneError, match="which is a pipe or a device"):
+            read(path)
+
+
+def test_a_sparse_raster_is_refused_by_its_size(tmp_path):
+    path = tmp_path / "sparse.tif"
+    with rasterio.open(
+        path, "w", driver="GTiff", width=400_000, height=400_000, count=1, dtype="float32",
+        crs=UTM, transform=SOUTHWARDS, sparse_ok=True, tiled=True, bigtiff=True,
+        blockxsize=4096, blockysize=4096,
+    ):  # fmt: skip
+        pass
+    with pytest.raises(SceneError, match=r"declares 400,000 x 400,000 heights.*gdal_translate"):
+        raster_digest(path)
+    with pytest.raises(SceneError, match=r"400,000 x 400,000 heights, more than.*give a window"):
+        read_raster(path)
+
+
+def test_grids_larger_than_the_memory_are_refused_before_they_are_read(tiff, tmp_path, monkeypatch):
+    monkeypatch.setattr("psutil.virtual_memory", lambda: type("M", (), {"available": 1000}))
+    np.save(tmp_path / "z.npy", GRID)
+    image = saved(tmp_path / "z.png", np.zeros((5, 5), np.uint8))
+    for read in (
+        lambda: read_raster(tiff()),
+        lambda: read_array(tmp_path / "z.npy", **STEPS),
+        lambda: read_image(image, pixel=1.0, white=1.0),
+    ):
+        with pytest.raises(SceneError, match=r"GB of memory, of which.*or coarsen it"):
+            read()
+
+
+def header(shape, kind="<f8"):
+    """Header of an array in NumPy's format, without the array."""
+    file = io.BytesIO()
+    np.lib.format.write_array_header_1_0(
+        file, {"descr": kind, "fortran_order": False, "shape": shape}
+    )
+    return file.getvalue()
+
+
+def test_arrays_are_refused_by_their_headers(tmp_path):
+    npy, npz = tmp_path / "z.npy", tmp_path / "z.npz"
+    for shape, said in (((10**6, 10**6), "more than 5e"), ((3000, 3000), "bytes are too few")):
+        npy.write_bytes(header(shape) + bytes(100))
+        with pytest.raises(SceneError, match=said):
+            read_array(npy, **STEPS)
+        with zipfile.ZipFile(npz, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("z.npy", header(shape) + bytes(100))
+        with pytest.raises(SceneError, match=said):
+            read_array(npz, **STEPS)
+
+
+def test_only_the_heights_of_an_archive_are_unpacked(tmp_path):
+    with zipfile.ZipFile(tmp_path / "z.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        with archive.open("z.npy", "w") as file:
+            np.lib.format.write_array(file, GRID)
+        archive.writestr("bomb.npy", header((10**12,), "<u1") + bytes(10**6))
+        archive.writestr("notes.txt", "of any kind")
+    np.testing.assert_array_equal(read_array(tmp_path / "z.npz", **STEPS).heights, GRID)
+
+
+def test_pictures_are_refused_by_their_headers_and_formats(tmp_path, monkeypatch):
+    image = saved(tmp_path / "z.png", np.zeros((50, 50), np.uint8))
+    monkeypatch.setattr("sweep.scenes.rasters.MOST_CELLS", 100)
+    with pytest.raises(SceneError, match="50 x 50 heights, more than"):
+        read_image(image, pixel=1.0, white=1.0)
+    (tmp_path / "z.eps").write_text("%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n")
+    with pytest.raises(SceneError, match="is no image"):
+        read_image(tmp_path / "z.eps", pixel=1.0, white=1.0)
+
+
+def test_archives_that_can_not_be_unpacked_are_refused(tmp_path):
+    np.savez(tmp_path / "z.npz", z=GRID)
+    content = bytearray((tmp_path / "z.npz").read_bytes())
+    for offset in (6, content.rindex(b"PK\x01\x02") + 8):
+        content[offset] |= 1  # encrypted
+    (tmp_path / "z.npz").write_bytes(content)
+    with pytest.raises(SceneError, match="no NumPy file"):
+        read_array(tmp_path / "z.npz", **STEPS)
+    (tmp_path / "z.npy").write_bytes(header((3, 3))[:40])
+    with pytest.raises(SceneError, match="no NumPy file"):
+        read_array(tmp_path / "z.npy", **STEPS)
+
+
+def test_a_raster_of_one_huge_block_is_refused_before_that_is_unpacked(tiff, monkeypatch):
+    path = tiff(np.zeros((512, 512), np.float32), tiled=True, blockxsize=512, blockysize=512)
+    monkeypatch.setattr("psutil.virtual_memory", lambda: type("M", (), {"available": 1e6}))
+    with pytest.raises(SceneError, match=r"GB of memory.*TILED=YES"):
+        raster_digest(path)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from sweep.model.geometry.quaternion import about
 from sweep.scenes import terrain as ground_
-from sweep.scenes.meshes import Facets, join
+from sweep.scenes.meshes import Facets, clean, join
 from sweep.scenes.rasters import read_image, read_raster
 from sweep.scenes.terrain import Terrain, fractal, hills, refine, smooth
 
@@ -170,7 +170,8 @@ def test_a_grid_without_cells_is_refused(z, spacing):
 
 @pytest.mark.skipif(not GALE.exists(), reason="the shared terrain is not here")
 def test_real_martian_ground_has_the_heights_and_size_its_description_gives():
-    ground = read_raster(GALE)
+    ground = read_raster(GALE, metres_per_unit=(1.0, 1.0))  # a third of a per cent too wide
+    assert "off by up to 0.333 %" in ground.warnings[0] and len(ground.warnings) == 1
     assert ground.heights.shape == (337, 348) and ground.spacing == (1.0, -1.0)
     assert ground.heights.min() == pytest.approx(-4472.67, abs=0.005)
     assert ground.heights.max() == pytest.approx(-4437.88, abs=0.005)
@@ -260,3 +261,20 @@ def test_hills_have_the_height_slope_and_correlation_they_were_asked_for():
     covariance = (z[:, 5, 20] * z[:, 5, 30]).mean()
     spread = rms**2 * math.sqrt((1 + math.exp(-2)) / number)
     assert covariance == pytest.approx(rms**2 * math.exp(-1), abs=FIVE_SIGMA * spread)
+
+
+@pytest.mark.parametrize("spacing", [(2.0, 3.0), (2.0, -3.0), (-0.1, 0.3)])
+@pytest.mark.parametrize("holes", [0, 1, 40])
+def test_a_grid_is_the_mesh_that_cleaning_its_triangles_would_make(spacing, holes):
+    random = np.random.default_rng(holes)
+    heights = random.standard_normal((13, 17))
+    heights.ravel()[random.choice(heights.size, holes, replace=False)] = np.nan
+    heights[0, 0] = -0.0
+    facets = terrain(heights, spacing, (5e5, 4e6, 0.0)).facets()
+    mesh, report = facets.mesh()
+    expected, mended = clean(facets.vertices, facets.faces, facets.surface)
+    assert report == mended and report.text().endswith("nothing to mend")
+    np.testing.assert_array_equal(mesh.vertices, expected.vertices)
+    np.testing.assert_array_equal(mesh.faces, expected.faces)
+    np.testing.assert_array_equal(mesh.origin, expected.origin + facets.origin)
+    assert not np.signbit(mesh.vertices[mesh.vertices == 0]).any()

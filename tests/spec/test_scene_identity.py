@@ -254,14 +254,14 @@ def test_a_raster_counts_by_what_is_read_of_it(tmp_path):
     def fill(height):
         with rasterio.open(
             tmp_path / "dem.tif", "w", driver="GTiff", width=50, height=50, count=1,
-            dtype="float32", crs="EPSG:32617", transform=rasterio.Affine(4, 0, 0, 0, -4, 200),
+            dtype="float32", crs="EPSG:32617", transform=rasterio.Affine(4, 0, 5e5, 0, -4, 200),
         ) as data:  # fmt: skip
             data.write(np.full((1, 50, 50), height, np.float32))
 
     fill(0)
     (tmp_path / "dem.vrt").write_text(
         '<VRTDataset rasterXSize="50" rasterYSize="50"><SRS>EPSG:32617</SRS>'
-        "<GeoTransform>0, 4, 0, 200, 0, -4</GeoTransform>"
+        "<GeoTransform>500000, 4, 0, 200, 0, -4</GeoTransform>"
         '<VRTRasterBand dataType="Float32" band="1"><SimpleSource>'
         '<SourceFilename relativeToVRT="1">dem.tif</SourceFilename><SourceBand>1</SourceBand>'
         "</SimpleSource></VRTRasterBand></VRTDataset>"

@@ -13,7 +13,7 @@ from sweep.model.geometry.rays import Pose
 from sweep.scenes.files import SceneError
 from sweep.spec import SceneSpec
 
-FAR = np.array([4_000_123.375, 777_000.25])
+FAR = np.array([500_123.375, 4_777_000.25])
 """Map coordinates of a raster's middle [m]."""
 
 
@@ -65,13 +65,13 @@ def test_a_plane_slopes_and_rises_where_it_says():
     np.testing.assert_allclose(height, [7, 7, 7 + 300 * math.tan(math.radians(10))], atol=1e-9)
 
 
-def write_raster(path, heights, middle=FAR, pixel=2.0):
+def write_raster(path, heights, middle=FAR, pixel=2.0, crs="EPSG:32633"):
     rows, columns = heights.shape
     west, north = middle[0] - columns * pixel / 2, middle[1] + rows * pixel / 2
     transform = rasterio.Affine(pixel, 0, west, 0, -pixel, north)
     with rasterio.open(
         path, "w", driver="GTiff", width=columns, height=rows, count=1, dtype="float32",
-        transform=transform, crs="EPSG:32633",
+        transform=transform, crs=crs,
     ) as data:  # fmt: skip
         data.write(heights.astype("float32"), 1)
 
@@ -368,3 +368,56 @@ def test_an_object_that_can_not_be_made_is_named_in_plain_words():
         built(with_object(TREES, "forest", radius="5 m", number=500))
     with pytest.raises(SceneError, match="thing: can not be made: there is no ground within"):
         built(with_object(BOULDERS, centre=["5 km", "0 m"]))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"scene.objects.ground.spacing": "1 m"},
+        {"scene.objects.ground.spacing": "30 m", "scene.objects.ground.factor": 30},
+    ],
+)
+def test_a_ground_larger_than_the_memory_is_refused_before_it_is_made(changes, monkeypatch):
+    """9e6 nodes take 400 bytes each while their tree is built."""
+    monkeypatch.setattr("psutil.virtual_memory", lambda: type("M", (), {"available": 3e9}))
+    with pytest.raises(SceneError, match=r"of 9,.* 3\.[67] GB of memory, of which 3\.0 GB"):
+        built(written(changes | {"scene.objects.ground.size": "3 km"}))
+
+
+def test_tiles_of_a_survey_make_ground_without_a_seam(tmp_path):
+    """Two halves of a ramp: 41 rows of 31 and 30 columns, at 2 m."""
+    heights = ramp()
+    write_raster(tmp_path / "ground.tif", heights[:, :31], np.subtract(FAR, [30.0, 0.0]))
+    write_raster(tmp_path / "east.tif", heights[:, 31:], np.add(FAR, [31.0, 0.0]))
+    ground = {"kind": "raster", "reflectance": 0.1}
+    _, world = built(
+        written(
+            {
+                "scene.objects.ground": ground | {"file": "ground.tif"},
+                "scene.objects.east": ground | {"file": "east.tif", "reflectance": 0.2},
+                "scene.origin": "ground",
+            }
+        ),
+        tmp_path,
+    )
+    x, y = (v.ravel() for v in np.meshgrid(np.linspace(25, 40, 61) + 0.01, [-30.3, 0.2, 29.9]))
+    height, surface = straight_down(world, x, y)
+    np.testing.assert_allclose(height, x / 8 - y / 16, atol=1e-5)
+    assert set(surface.tolist()) == {0, 1} and not world.warnings
+
+
+def test_rasters_of_two_maps_or_of_none_are_refused_or_told(tmp_path):
+    write_raster(tmp_path / "ground.tif", ramp())
+    write_raster(tmp_path / "east.tif", ramp(), np.add(FAR, [500.0, 0.0]), crs="EPSG:32632")
+    ground = {"kind": "raster", "reflectance": 0.1}
+    mapping = written(
+        {
+            "scene.objects.ground": ground | {"file": "ground.tif"},
+            "scene.objects.east": ground | {"file": "east.tif"},
+        }
+    )
+    with pytest.raises(SceneError, match="east: lies on the map 'WGS 84 / UTM zone 32N', and"):
+        built(mapping, tmp_path)
+    write_raster(tmp_path / "east.tif", ramp(), np.add(FAR, [500.0, 0.0]), crs=None)
+    _, world = built(mapping, tmp_path)
+    assert "scene.objects.east: names no coordinate reference system" in world.warnings[0]

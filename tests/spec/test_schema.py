@@ -28,7 +28,7 @@ IDS = {
     "expanded_pattern": "9ba46e5a 96bd30ac",
     "fft_size": "ededf940",
     "forest_scan": "6edaeb3c 8f641479",
-    "gale_crater_descent": "5bdd0bb0 ec9abd25",
+    "gale_crater_descent": "6cf8e0b8 48dbaca0",
     "morpheus_three_beam": "a65525b3 7422a280",
     "oblique_descent": "caffeb12 a09399cd",
     "quickstart": "980ba9fd",

@@ -270,8 +270,8 @@ def test_the_summary_of_an_incomplete_flight_counts_committed_blocks_only(undist
 
 
 def test_a_beam_that_sees_nothing_has_no_chance_and_its_study_runs(tmp_path):
-    """A plane of 200 m under beams at 22.5 deg, that leave it behind from 240 m on."""
-    objects = {"ground": {"kind": "plane", "size": "200 m", "reflectance": 0.1}}
+    """A plane of 300 m under beams at 22.5 deg, which see it from below 360 m alone."""
+    objects = {"ground": {"kind": "plane", "size": "300 m", "reflectance": 0.1}}
     spec = small_scene(
         scene={"origin": "ground", "objects": objects},
         scanners={"three": SCENE["scanners"]["three"]},
@@ -279,6 +279,6 @@ def test_a_beam_that_sees_nothing_has_no_chance_and_its_study_runs(tmp_path):
     )
     found = opened(quiet(spec, tmp_path / "scene.zarr").store)["three"]
     unseen = ~np.isfinite(found.beam_range.values)
-    assert unseen.any() and np.isfinite(found.true_altitude.values).all()
+    assert 0.5 < unseen.mean() < 1 and np.isfinite(found.true_altitude.values).all()
     assert np.isnan(found.pd_shot.values[unseen]).all()
     assert not (found.flags.values[unseen] & 1).any()

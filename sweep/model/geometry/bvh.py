@@ -32,6 +32,9 @@ sideways (some 1e-15 of the range, for ranges to 1e5 times the mesh's size), and
 _FAR = np.float32(3e38)
 """Begin of the empty box; it ends at minus this."""
 
+_AT_ONCE = 1 << 20
+"""Triangles whose boxes are made together."""
+
 _STACK = 8 * 16
 """Entries that the deepest tree can leave behind: seven a level."""
 
@@ -68,13 +71,18 @@ def build(vertices: np.ndarray, faces: np.ndarray) -> Tree:
 
     Vertices (n, 3) float64 [m] are finite and best centred; faces (m, 3) int, m >= 1.
     """
-    corners = [vertices[faces[:, k]] for k in range(3)]
-    low, high = np.minimum.reduce(corners), np.maximum.reduce(corners)
-    slack = _SLACK * float(np.abs(vertices).max())
+    slack = _SLACK * float(max(vertices.max(), -vertices.min()))
     boxes = np.full((len(faces) + 1, 6), _FAR)  # the last for no triangle
-    boxes[:-1, :3] = np.nextafter((low - slack).astype(np.float32), -_FAR)
-    boxes[:-1, 3:] = -np.nextafter((high + slack).astype(np.float32), _FAR)
-    leaves = _in_leaves(low + high)
+    centres = np.empty((len(faces), 3))
+    for begin in range(0, len(faces), _AT_ONCE):  # the corners of all at once take much memory
+        part = slice(begin, min(begin + _AT_ONCE, len(faces)))
+        corners = vertices[faces[part]]
+        low, high = corners.min(axis=1), corners.max(axis=1)
+        boxes[part, :3] = np.nextafter((low - slack).astype(np.float32), -_FAR)
+        boxes[part, 3:] = -np.nextafter((high + slack).astype(np.float32), _FAR)
+        centres[part] = low + high
+    leaves = _in_leaves(centres)
+    del centres
     boxes = boxes[leaves].reshape(-1, LEAF, 6).min(axis=1)
     is_triangle = leaves < len(faces)
     count = is_triangle.reshape(-1, LEAF).sum(axis=1)
@@ -166,7 +174,7 @@ def _smaller(a, b):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def nearest(tree, origins, directions, distance, face):
+def nearest(tree, origins, directions, distance, face, least_distance=0.0):
     """Nearest triangle of each ray of each bundle that lies nearer than what is known.
 
     A bundle, rays from one origin in neighbouring directions, walks the tree once. A box is entered
@@ -175,27 +183,32 @@ def nearest(tree, origins, directions, distance, face):
 
     Origins (n, 3) [m] are in the tree's frame, directions (n, b, 3). `distance` (n, b), in lengths
     of the direction, is the nearest known before (inf: none), and is replaced where a triangle is
-    nearer; so is `face` (n, b), by the triangle's index in the mesh. A ray lies at distances > 0.
+    nearer; so is `face` (n, b), by the triangle's index in the mesh. A ray lies at distances above
+    `least_distance`, which is 0 or more: what is nearer is passed through.
     """
     room = np.empty((3, directions.shape[1])), np.empty((6, 3)), np.empty(WIDTH)
     stack = np.empty(_STACK, np.int64), np.empty(_STACK)
     for i in range(origins.shape[0]):
         o, d = origins[i], directions[i]
-        if not _walk(tree, o, d, distance[i], face[i], room, stack, _LARGEST_FRONT):
+        limits = _LARGEST_FRONT, least_distance
+        if not _walk(tree, o, d, distance[i], face[i], room, stack, limits):
             for b in range(d.shape[0]):
                 one = slice(b, b + 1)
-                _walk(tree, o, d[one], distance[i, one], face[i, one], room, stack, _ENDLESS)
+                limits = _ENDLESS, least_distance
+                _walk(tree, o, d[one], distance[i, one], face[i, one], room, stack, limits)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _walk(tree, o, d, distance, face, room, stack, budget):
+def _walk(tree, o, d, distance, face, room, stack, limits):
     """Nearest triangles of all rays of a bundle in one walk; False where it was given up.
 
     Given up with all triangles tested so far accounted for, so that single walks may go on.
+    `limits` are the number of triangles that may be tested, and the least distance of a hit.
     """
     bounds, children, faces, order, vertices = tree
     shears, planes, entered = room
     waiting, entry = stack
+    budget, least_distance = limits
     axis = _set_up(d, shears, planes)
     if axis < 0:
         return False
@@ -232,7 +245,7 @@ def _walk(tree, o, d, distance, face, room, stack, budget):
                 (vertices[p, kx] - ox, vertices[p, ky] - oy, vertices[p, axis] - oz),
                 (vertices[q, kx] - ox, vertices[q, ky] - oy, vertices[q, axis] - oz),
                 (vertices[r, kx] - ox, vertices[r, ky] - oy, vertices[r, axis] - oz),
-                order[j], shears, distance, face,
+                order[j], shears, least_distance, distance, face,
             )  # fmt: skip
         is_known = False
         budget -= count
@@ -301,7 +314,7 @@ def _enter(bounds, node, ox, oy, oz, planes, limit, entry):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _test(a, b, c, index, shears, distance, face):
+def _test(a, b, c, index, shears, least_distance, distance, face):
     """Test one triangle against all rays of a bundle; keeps the nearer hits.
 
     A hit's distance is a weighted mean of the corners' depths: between them, however flat the
@@ -321,7 +334,7 @@ def _test(a, b, c, index, shears, distance, face):
         least = _smaller(u, _smaller(v, w))
         most = _larger(u, _larger(v, w))
         t = (u * az + v * bz + w * cz) / (u + v + w) * inverse
-        t = t if ((least >= 0.0) | (most <= 0.0)) & (t > 0.0) else np.inf
+        t = t if ((least >= 0.0) | (most <= 0.0)) & (t > least_distance) else np.inf
         closer = (t < distance[i]) | ((t == distance[i]) & (index < face[i]))
         distance[i] = t if closer else distance[i]
         face[i] = index if closer else face[i]

@@ -66,16 +66,18 @@ class Caster:
         directions: ArrayLike,
         *,
         poses: Sequence[Pose | None] | None = None,
+        least_range: float = 0.0,
     ) -> Bundle:
         """First hits of bundles of beamlets, each bundle from one origin (n, 3) [m].
 
         Directions (n, b, 3) are unit vectors in the world's frame, the beam's centre first. A pose
-        of None is that of a body that rests in the world's frame. A facet on which a ray starts,
-        within rounding, may count as hit or not.
+        of None is that of a body that rests in the world's frame. Rays pass through all that is
+        nearer than `least_range` [m]. If that is 0, a facet on which a ray starts, within
+        rounding, may count as hit or not.
         """
         start, along = (np.ascontiguousarray(a, np.float64) for a in (origins, directions))
         frames = self._frames(poses, len(start))
-        face, body = self._first_hits(frames, start, along)
+        face, body = self._first_hits(frames, start, along, least_range)
         hit = face >= 0
         reference = np.where(hit.any(axis=1), hit.argmax(axis=1), -1)
         n, rows = len(start), np.flatnonzero(reference >= 0)
@@ -108,14 +110,15 @@ class Caster:
             high, reference, normal, offset, hit, np.abs(cos_incidence), surface, face, body
         )
 
-    def _first_hits(self, frames, origins, directions):
+    def _first_hits(self, frames, origins, directions, least_range):
         """Triangle and body that each beamlet hits first, (n, b)."""
         shape = directions.shape[:2]
         distance, face = np.full(shape, np.inf), np.full(shape, -1)
         body = np.full(shape, -1, np.int16)
         for number, frame in enumerate(frames):
             found = np.full(shape, -1)
-            nearest(self._trees[number], *frame.rounded(origins, directions), distance, found)
+            rays = frame.rounded(origins, directions)
+            nearest(self._trees[number], *rays, distance, found, least_range)
             nearer = found >= 0
             face[nearer], body[nearer] = found[nearer], number
         return face, body

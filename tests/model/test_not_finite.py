@@ -1,0 +1,103 @@
+"""Numbers that are not finite: every loop ends on them, and the shot that has one is named."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_scenes import DOWN, flight, instrument, observed, plate
+
+from sweep.model.eyepoints import LEAST_RANGE, prepare_eyepoints
+from sweep.model.geometry.mesh import Surface
+from sweep.model.geometry.rays import Caster
+from sweep.model.groups import _list_groups
+from sweep.model.looks import Looks
+from sweep.model.preparation import require_finite
+from sweep.model.search import _keep_echoes
+from sweep.model.unsupported import UnsupportedShot
+from sweep.scenes.meshes import clean
+
+NOT_FINITE = [np.nan, np.inf, -np.inf]
+
+
+@pytest.mark.parametrize("value", NOT_FINITE)
+@pytest.mark.parametrize("level", [2.0, np.nan])
+def test_lists_of_groups_end_wherever_a_magnitude_is_not_finite(value, level):
+    for place in range(6):
+        magnitude = np.array([1.0, 3.0, 4.0, 1.0, 5.0, 1.0])
+        magnitude[place] = value
+        bins = np.full((3, 4), -1)
+        peak = int(np.nanargmax(magnitude))
+        assert _list_groups(magnitude, peak, level, bins) <= 4
+        exempt = np.zeros(6, np.bool_)
+        _keep_echoes(magnitude, exempt, 0, level, 0, (np.array([0, 6]), 0), np.array([2.0]))
+
+
+def test_probabilities_of_several_records_end_for_levels_that_are_not_finite():
+    several = Looks(4)
+    for level in (np.nan, np.inf):
+        with np.errstate(all="ignore"):
+            several.fresh(np.array([level, 3.0]), 0.4)
+
+
+def shots(table_4_1):
+    eyes = observed(flight(), index=range(3))
+    return prepare_eyepoints(eyes, instrument(table_4_1), [Surface("plate", 0.1)])
+
+
+@pytest.mark.parametrize("value", NOT_FINITE)
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("range", "the range"), ("amplitude", "beamlets' echoes"),
+     ("offset", "beamlets' ranges"), ("echo_scale", "echo's power")],
+)  # fmt: skip
+def test_a_shot_with_a_number_that_is_not_finite_is_named(table_4_1, name, words, value):
+    prepared = shots(table_4_1)
+    require_finite(prepared)
+    values = np.array(np.broadcast_to(getattr(prepared, name), np.shape(getattr(prepared, name))))
+    if values.ndim:
+        values[1 if values.shape[0] > 1 else 0] = value
+    else:
+        values = np.asarray(value)
+    with pytest.raises(UnsupportedShot, match=words) as refused:
+        require_finite(replace(prepared, **{name: values}))
+    assert refused.value.point in (0, 1)
+
+
+def test_a_path_that_leaves_the_numbers_is_refused_with_the_shot_and_its_time():
+    away = flight(velocity=(1e308, 0.0, 0.0), duration=1e3)
+    with (
+        np.errstate(all="ignore"),
+        pytest.raises(UnsupportedShot, match=r"shot 4, at time 4 s, has a position that is not"),
+    ):
+        observed(away, index=(0, 1, 4))
+
+
+WALL = clean(
+    np.array([[0.0, -50, -50], [0, 50, -50], [0, 50, 50], [0, -50, 50]]),
+    np.array([[0, 1, 2], [0, 2, 3]]),
+    0,
+)[0]
+FORWARD = np.array([[1.0, 0.0, 0.0]])
+
+
+@pytest.mark.parametrize("x", [0.0, -1e-12, -0.5 * LEAST_RANGE])
+def test_an_instrument_in_the_plane_of_a_wall_sees_what_is_beyond_it(table_4_1, x):
+    far = replace(WALL, origin=WALL.origin + np.array([200.0, 0.0, 0.0]))
+    eyes = observed(flight((x, 0.0, 0.0)), bodies=[WALL, far], beams=FORWARD)
+    np.testing.assert_allclose(eyes.range, 200.0, rtol=1e-4)
+    prepare_eyepoints(eyes, instrument(table_4_1), [Surface("wall", 0.1)])
+    alone = observed(flight((x, 0.0, 0.0)), bodies=[WALL], beams=FORWARD)
+    assert not alone.seen.any()
+
+
+def test_a_surface_farther_than_the_least_range_is_hit():
+    eyes = observed(flight((-2 * LEAST_RANGE, 0.0, 0.0)), bodies=[WALL], beams=FORWARD)
+    np.testing.assert_allclose(eyes.range, 2 * LEAST_RANGE)
+    low = observed(flight((0.0, 0.0, 0.1)), beams=DOWN)
+    np.testing.assert_allclose(low.range, 0.1)
+
+
+def test_the_least_range_is_the_callers():
+    caster, origin = Caster(plate()), np.array([[0.0, 0.0, 0.5]])
+    for least, range_ in ((0.0, 0.5), (0.4, 0.5), (0.6, np.inf)):
+        assert caster.bundle(origin, DOWN[:, None], least_range=least).range == range_
