@@ -24,6 +24,7 @@ from sweep.model.outputs import (
 )
 from sweep.model.resolution import by_tolerance, effects_tolerance
 from sweep.storage.locations import Location, eyepoints_path
+from sweep.storage.opening import MAP
 from sweep.storage.sound import open_arrays
 from sweep.tasks.eyepoint_study import (
     SIZES,
@@ -181,12 +182,11 @@ class FlightStudy(GrowingStudy):
             "spec": self.spec.to_json(),
             "surfaces": [surface.name for surface in self.surfaces],
             "scanners": list(self.spec.scanners),
-            "eyepoints": {name: self.spec.geometry_id(name) for name in self.spec.scanners},
             "origin": np.asarray(world_of(self.spec).origin, float).tolist(),
         }
 
     def groups(self) -> dict[str, dict[str, Any]]:
-        """Return a group for each scanner."""
+        """Return a group for each scanner, and one of the map, whose cells are none of theirs."""
         names = " ".join(member.name for axis in self.spec.axes for member in axis.members)
         return {
             name: {
@@ -195,7 +195,7 @@ class FlightStudy(GrowingStudy):
                 "coordinates": names,
             }
             for name, blocks in self.scanners.items()
-        }
+        } | {MAP: {}}
 
     def known_arrays(self) -> list[ArrayLayout]:
         """Return the map of the scene, and every scanner's coordinates."""
