@@ -198,13 +198,19 @@ def compare_flights(ours: xr.DataTree, other: xr.DataTree) -> xr.DataTree:
     """
     if not isinstance(other, xr.DataTree):
         raise ValueError(ONE_OF_EACH)
-    scanners = [name for name in ours.attrs["scanners"] if name in other.attrs["scanners"]]
+    scanners = [name for name in scanner_names(ours) if name in scanner_names(other)]
     if not scanners:
-        has = (", ".join(tree.attrs["scanners"]) for tree in (ours, other))
+        has = (", ".join(scanner_names(tree)) for tree in (ours, other))
         raise ValueError("the flights have no scanner in common: {}; and {}".format(*has))
     parts = {name: _scanner(ours, other, name) for name in scanners}
     whole = xr.Dataset(attrs={"ours": titled(ours), "other": titled(other)})
     return xr.DataTree.from_dict({"/": whole, **parts})
+
+
+def scanner_names(tree: xr.DataTree) -> list[str]:
+    """Return the names of a flight's scanners; netCDF makes a word of a list of one."""
+    names = tree.attrs["scanners"]
+    return [names] if isinstance(names, str) else [str(name) for name in names]
 
 
 def _scanner(ours: xr.DataTree, other: xr.DataTree, scanner: str) -> xr.Dataset:
