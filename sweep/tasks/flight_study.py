@@ -137,7 +137,7 @@ class ScannerBlocks(Lattice, BlockGrid):
 
 
 #: Shots of a scanner, and these times draws and places along axes, at the most.
-SHOTS_MAX, DRAWN_SHOTS_MAX = 10**9, 10**12
+SHOTS_MAX, DRAWN_SHOTS_MAX = 10**9, 10**10
 
 
 def _refuse_too_many(spec: SceneSpec, scanner: str, shots: int) -> None:
