@@ -6,7 +6,7 @@ READY := .venv/.ready
 KERNELS := .venv/.kernels
 TIMED := .ci/timed
 
-.PHONY: install-core install demo test timed-lint timed-kernels test-all lint size stability fuzz chaos side-by-side effects accuracy stopping frozen promise detectors peers scaling validation instruments docs fields scale million lock clean
+.PHONY: install-core install demo test timed-lint timed-kernels test-all lint size stability fuzz chaos side-by-side effects accuracy stopping frozen promise detectors peers scaling validation instruments docs pictures fields scale million lock clean
 SEED ?= 1
 
 # What grids and figures need; the demo needs no more.
@@ -24,9 +24,16 @@ install-core: $(CORE)
 
 install: $(READY)
 
+# The studies of README's pictures, computed and drawn.
+DEMO := quickstart descent
 demo: $(CORE)
-	$(BIN)/sweep run experiments/quickstart.yaml --store results/quickstart.zarr --overwrite
-	$(BIN)/sweep figures results/quickstart.zarr
+	for name in $(DEMO); do \
+	  $(BIN)/sweep run experiments/$$name.yaml --store results/$$name.zarr --overwrite && \
+	  $(BIN)/sweep figures results/$$name.zarr || exit 1; done
+
+# The pictures of README and docs/, from the present model: a test tells when they are out of date.
+pictures: $(CORE)
+	$(BIN)/python docs/pictures.py
 
 test: $(READY)
 	$(MAKE) --no-print-directory --jobs 3 --output-sync timed-lint timed-kernels

@@ -27,7 +27,7 @@ def spec_of(gigabytes, block_points=CHUNK, powers=100, figures=()):
     """A study of about so many GB of results."""
     ranges = max(2, round(gigabytes * 1e9 / BYTES_A_POINT / ANGLES / powers))
     return experiment(
-        "quickstart",
+        "range_angle_coarse",
         title="Made up",
         axes={
             "instrument.laser.power": {"log": ["1 W", "10 W"], "number": powers},

@@ -32,7 +32,10 @@ def spec_at(folder: Path) -> Path:
         "target.range": {"linear": ["10 m", "5 km"], "number": SIDE},
         "target.grazing_angle": {"linear": ["1 deg", "90 deg"], "number": SIDE},
     }
-    written = plain(EXPERIMENTS, "quickstart") | {"axes": axes, "storage": {"block_points": 1}}
+    written = plain(EXPERIMENTS, "range_angle_coarse") | {
+        "axes": axes,
+        "storage": {"block_points": 1},
+    }
     path = folder / "million.yaml"
     path.write_text(yaml.safe_dump(written))
     return path

@@ -105,7 +105,7 @@ def study(block_points: int = BATCH):
         "target.range": {"linear": ["10 m", "5 km"], "number": SIDE},
         "target.grazing_angle": {"linear": ["1 deg", "90 deg"], "number": SIDE},
     }
-    return experiment("quickstart", axes=axes, storage={"block_points": block_points})
+    return experiment("range_angle_coarse", axes=axes, storage={"block_points": block_points})
 
 
 @contextmanager

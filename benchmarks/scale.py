@@ -96,7 +96,7 @@ def blocks(n_blocks, store):
 
     axes = {"target.range": {"linear": ["1 m", "10 km"], "number": n_blocks // 100},
             "target.grazing_angle": {"linear": ["1 deg", "90 deg"], "number": 100}}  # fmt: skip
-    spec = experiment("quickstart", axes=axes, storage={"block_points": 1})
+    spec = experiment("range_angle_coarse", axes=axes, storage={"block_points": 1})
     grid, _, planned = timed(lambda: Grid(spec))
     assert grid.n_blocks == n_blocks
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -483,12 +483,22 @@ def three_speeds(ds):
     ]
 
 
+PICTURE = """\
+![Probability of detection over range and grazing angle at four thresholds](threshold.png)
+
+*Fig. 4.5 by `experiments/threshold.yaml`: probability of detection at threshold-to-noise ratios of
+1, 5, 10 and 15. The footprint has fixed phases, as in the thesis, which makes fringes.*
+
+"""
+
+
 def page():
     """The whole page."""
     tables = (("transmit_power", "4.3"), ("aperture", "4.4"), ("fft_size", "4.5"))
     return "".join([
         INTRODUCTION,
         table("Figures of Chapter 4", TABLE, chapter_4()),
+        PICTURE,
         thresholds(),
         *(alarms(name, number) for name, number in tables),
         REMARK,

@@ -21,7 +21,7 @@ from sweep.spec.reading import read_document
 EXPERIMENTS = sorted((Path(__file__).parents[1] / "experiments").glob("*.yaml"))
 SCENES = [path for path in EXPERIMENTS if "scene" in read_document(path).value]
 GRIDS = [path for path in EXPERIMENTS if path not in SCENES]
-OF_EACH_KIND = "quickstart", "speckled_target", "cfar", "morpheus_three_beam"
+OF_EACH_KIND = "quickstart", "range_angle_coarse", "speckled_target", "cfar", "morpheus_three_beam"
 """Run each time; `make test-all` has all."""
 
 KEPT = 4
@@ -65,7 +65,8 @@ def _thinned(spec):
 def test_experiment_runs_to_store_and_figures(path, tmp_path):
     spec = sweep.load(path)
     assert spec.question
-    assert spec.target.reflectance * spec.instrument.telescope.optical_efficiency == 0.1
+    if path.stem != "quickstart":  # an instrument of another source than the thesis
+        assert spec.target.reflectance * spec.instrument.telescope.optical_efficiency == 0.1
     store = tmp_path / "tiny.zarr"
     assert sweep.run(_thinned(spec), store=store, scheduler="none", progress=False).complete
     dataset = sweep.open(store)

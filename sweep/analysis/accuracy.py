@@ -225,7 +225,9 @@ def sentences(dataset: xr.Dataset, settings: Sequence[Setting]) -> list[str]:
     found += _fixed(against_fixed(settings), attributes)
     found += _thesis(settings, attributes["thesis_beamlets"]) + _like_for_like(settings)
     found.append(_reference(attributes))
-    found += [note[0].upper() + note[1:] + "." for note in attributes["notes"]]
+    notes = attributes["notes"]  # a list in stores of earlier versions
+    notes = notes.splitlines() if isinstance(notes, str) else notes
+    found += [note[0].upper() + note[1:] + "." for note in notes]
     if why := attributes["stopped"]:
         points = f"{attributes['points']} {attributes['unit']}"
         found.append(f"Not the whole sample ({why}): {points} of it.")

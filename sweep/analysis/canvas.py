@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from matplotlib import colormaps, rc_context, rcdefaults, rcParams
+from matplotlib import colormaps, patheffects, rc_context, rcdefaults, rcParams
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
@@ -18,7 +18,7 @@ from matplotlib.colors import Colormap, LogNorm, Normalize
 from matplotlib.figure import Figure as Sheet
 
 from sweep.analysis import labels
-from sweep.analysis.charts import LOG, WORDS, Axis, Chart, Line, Panel, Scale
+from sweep.analysis.charts import LOG, WORDS, Axis, Chart, Line, Map, Panel, Scale
 
 DPI = 150
 SCALE = "viridis"
@@ -48,7 +48,12 @@ STYLE: dict[Any, Any] = {
     "path.snap": True,
 }
 
-_NO_TRACES = {
+SOURCE = "Source"
+"""Field of a PNG's metadata that says what it was drawn from; of other formats, the subject."""
+
+_SOURCES = {"png": SOURCE, "pdf": "Subject", "svg": "Description"}
+
+_NO_TRACES: dict[str, dict[str, str | None]] = {
     "png": {"Software": None},
     "pdf": {"Creator": None, "Producer": None, "CreationDate": None},
     "svg": {"Creator": None, "Date": None},
@@ -103,13 +108,17 @@ def caption(figure: Sheet, text: str) -> None:
         )  # fmt: skip
 
 
-def save(figure: Sheet, path: Path) -> Path:
-    """Write the sheet in the format of the suffix; the same sheet gives the same bytes."""
+def save(figure: Sheet, path: Path, *, source: str = "") -> Path:
+    """Write the sheet in the format of the suffix; the same sheet gives the same bytes.
+
+    ``source`` says what it was drawn from, and goes into the file's metadata.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     kind = path.suffix.removeprefix(".")
     dpi = DPI if kind == "png" else PRINTED_DPI
     with style():
-        figure.savefig(path, format=kind, dpi=dpi, metadata=_NO_TRACES[kind])
+        metadata = _NO_TRACES[kind] | ({_SOURCES[kind]: source} if source else {})
+        figure.savefig(path, format=kind, dpi=dpi, metadata=metadata)
     return path
 
 
@@ -187,12 +196,36 @@ def _map(axes: Axes, norm: Normalize, panel: Panel) -> None:
             axes.set(**{f"{side}ticks": np.arange(values.size), f"{side}ticklabels": values})
             values = np.arange(values.size)
         sides.append(edges(values, axis.kind == LOG))
-    axes.pcolormesh(
-        *sides, np.ma.masked_invalid(layer.values), norm=norm, cmap=colours(), rasterized=True
-    )
+    values = np.ma.masked_invalid(layer.values)
+    axes.pcolormesh(*sides, values, norm=norm, cmap=colours(), rasterized=True)
+    if len(layer.levels) and min(values.shape) > 1 and values.count():
+        _contours(axes, layer, values)
     _scale(axes, "x", panel.x)
     _scale(axes, "y", panel.y)
     axes.set_facecolor(NOT_COMPUTED)
+
+
+def _contours(axes: Axes, layer: Map, values: np.ma.MaskedArray) -> None:
+    """Contours with their levels, black with a pale rim: they stand out from every colour."""
+    known = [level for level in layer.levels if values.min() < level < values.max()]
+    if not known:
+        return
+    rim: list[patheffects.AbstractPathEffect] = [
+        patheffects.withStroke(linewidth=3.2, foreground="white", alpha=0.75)
+    ]
+    contours = axes.contour(
+        layer.x, layer.y, values, levels=known, colors="black", linewidths=1.3, zorder=3
+    )
+    contours.set_path_effects(rim)
+    width, height = (np.ptp(own) for own in (layer.x, layer.y))
+    middles = []
+    for lines in contours.allsegs:
+        line = max(lines, key=len)
+        steps = np.hypot(np.diff(line[:, 0]) / width, np.diff(line[:, 1]) / height)
+        along = np.concatenate([[0.0], np.cumsum(steps)])
+        middles.append(tuple(line[np.searchsorted(along, along[-1] / 2)]))
+    for label in axes.clabel(contours, fmt="%g", fontsize=10, manual=middles):
+        label.set_path_effects(rim)
 
 
 def _scale(axes: Axes, side: Literal["x", "y"], axis: Axis) -> None:
@@ -236,12 +269,17 @@ def _sheet_of_lines(chart: Chart) -> Sheet:
 def _apart(panels: Sequence[Panel]) -> tuple[Sequence[Panel], bool]:
     """Panels with a single line each, where lines of one would lie over each other."""
     packed = any(line.together > 1 for panel in panels for line in panel.lines)
-    if max(len(panel.lines) for panel in panels) <= (1 if packed else MOST_TOGETHER):
+    split = [
+        (panel, [line for line in panel.lines if line.look != "level"],
+         [line for line in panel.lines if line.look == "level"])
+        for panel in panels
+    ]  # fmt: skip
+    if max(len(lines) for _, lines, _ in split) <= (1 if packed else MOST_TOGETHER):
         return panels, False
     return [
-        replace(panel, lines=[line], when={**panel.when, "line": line.name})
-        for panel in panels
-        for line in panel.lines
+        replace(panel, lines=[line, *levels], when={**panel.when, "line": line.name})
+        for panel, lines, levels in split
+        for line in lines
     ], True
 
 
@@ -264,6 +302,12 @@ def _line(axes: Axes, line: Line, *, solid: bool) -> None:
     """One line over its band."""
     if line.look == "level":
         axes.axhline(line.y[0], color="0.6", linewidth=0.8, zorder=1)
+        if not line.name:
+            return
+        axes.annotate(
+            line.name, (1.0, line.y[0]), xycoords=("axes fraction", "data"), xytext=(4, 0),
+            textcoords="offset points", va="center", fontsize=8, color="0.35",
+        )  # fmt: skip
         return
     look: dict[str, Any] = {"color": LINES[line.number % 8], "linewidth": 1.3}
     marked = line.x.size <= MARKED

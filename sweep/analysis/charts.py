@@ -58,11 +58,12 @@ class Line:
 
 @dataclass(frozen=True, eq=False)
 class Map:
-    """Values (rows, columns) over y and x; nan where there is none."""
+    """Values (rows, columns) over y and x; nan where there is none. Levels have contours."""
 
     x: np.ndarray
     y: np.ndarray
     values: np.ndarray
+    levels: Sequence[float] = ()
 
 
 @dataclass(frozen=True)
@@ -207,9 +208,19 @@ def not_shown(number: int) -> str:
 
 
 def surface(
-    found: Points, *, x: str, y: str, variable: str, words: str, room: Room = SHEET
+    found: Points,
+    *,
+    x: str,
+    y: str,
+    variable: str,
+    words: str,
+    room: Room = SHEET,
+    levels: Sequence[float] = (),
 ) -> Chart:
-    """Return a variable over two coordinates, a panel for each value of what else varies."""
+    """Return a variable over two coordinates, a panel for each value of what else varies.
+
+    Contours are drawn at some levels of the variable, where both coordinates are numbers.
+    """
     parts, left_out = facets_of(found, [x, y], room.parts)
     planes = [_plane(part, variable, x, y) for _, part in parts]
     kinds = [MEAN, worst(variable)] if worst(variable) else [MEAN]
@@ -230,10 +241,13 @@ def surface(
     for ((name, _), (_, across, up)), kind in product(zip(parts, planes, strict=True), kinds):
         when = {"part": name, "cell": f"{kind} of each cell" if max(by) > 1 else ""}
         columns, rows = across.middles(most[0]), up.middles(most[1])
-        layer = Map(x_ruler.shown(columns), y_ruler.shown(rows), layers[len(panels)])
+        contours = () if WORDS in (x_ruler.axis.kind, y_ruler.axis.kind) else levels
+        layer = Map(x_ruler.shown(columns), y_ruler.shown(rows), layers[len(panels)], contours)
         panels.append(Panel(when, x_ruler.axis, y_ruler.axis, map=layer))
     spans = [ruler.span(np.unique(found.values(n))) for ruler, n in ((x_ruler, x), (y_ruler, y))]
     remarks = [_reduction(math.prod(by), planes[0][1:], kinds), not_shown(left_out)]
+    if levels and panels and panels[0].map and panels[0].map.levels:
+        remarks.append(f"contours: {' and '.join(f'{level:g}' for level in levels)}")
     if any(np.isnan(layer).any() for layer in layers):
         remarks.append("grey or empty: not computed, or without a value")
     return Chart(
@@ -282,8 +296,17 @@ def _reduction(each: int, sides: Sequence[Side], kinds: Sequence[str]) -> str:
     return told
 
 
-def slices(found: Points, *, x: str, by: str, variable: str, words: str, most: int = 6) -> Chart:
-    """Return a variable along a coordinate, a line for each value of another."""
+def slices(
+    found: Points,
+    *,
+    x: str,
+    by: str,
+    variable: str,
+    words: str,
+    most: int = 6,
+    levels: Sequence[float] = (),
+) -> Chart:
+    """Return a variable along a coordinate, a line for each value of another; lines at levels."""
     lines_by = [by] if by else []
     parts, left_out = facets_of(found, [x, *lines_by], most)
     named, lacking = lines_of(parts, lines_by)
@@ -293,13 +316,23 @@ def slices(found: Points, *, x: str, by: str, variable: str, words: str, most: i
     limits = CHANCE if variable.startswith("pd_") else None
     up = Axis(words, LOG if scale.decades else LINEAR, limits)
     panels = panels_of(named, drawn, ruler, up)
+    told = alternative(words, ruler.span(np.unique(found.values(x))), panels[0])
+    panels = [
+        replace(panel, lines=[*panel.lines, *_level_lines(panel, levels)]) for panel in panels
+    ]
     return Chart(
         words,
-        alternative(words, ruler.span(np.unique(found.values(x))), panels[0]),
+        told,
         [*remarks, not_shown(left_out + lacking)],
         panels,
         {"part": "Shown for"},
     )
+
+
+def _level_lines(panel: Panel, levels: Sequence[float]) -> list[Line]:
+    """Return level lines as long as the other lines of a panel."""
+    x = panel.lines[0].x
+    return [Line(x, np.full(x.size, level), f"{level:g}", look="level") for level in levels]
 
 
 Named = tuple[str, str, Points]

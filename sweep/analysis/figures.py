@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -95,8 +97,8 @@ class Study:
         words = labels.with_units(about.get("long_name", figure.variable), about.get("units", ""))
         options: dict[str, Any] = {"x": figure.x, "variable": figure.variable, "words": words}
         if isinstance(figure, Surface):
-            return charts.surface(found, y=figure.y, room=room, **options)
-        return charts.slices(found, by=figure.by, **options)
+            return charts.surface(found, y=figure.y, room=room, levels=figure.levels, **options)
+        return charts.slices(found, by=figure.by, levels=figure.levels, **options)
 
     def page(self, figure: Table | FalseAlarmTable | ThresholdTable) -> tables.Page:
         """Tables of one that it asks for."""
@@ -157,7 +159,8 @@ def draw(
         eyepoints that a figure needs are gone.
     """
     store = located(store_path)
-    kind = read_attributes(store)["kind"]
+    attributes = read_attributes(store)
+    kind = attributes["kind"]
     if kind == ACCURACY:
         return accuracy.draw(store, None if directory is None else Path(directory), form)
     stem = store.name.removesuffix(".zarr")
@@ -175,12 +178,25 @@ def draw(
             files += made.save(directory, figure.stem)
         else:
             sheet = canvas.empty(f"{study.spec.title}: {made}") if isinstance(made, str) else made
-            files.append(canvas.save(sheet, directory / f"{figure.stem}.{form}"))
+            about = source(str(attributes["study_id"]), figure)
+            files.append(canvas.save(sheet, directory / f"{figure.stem}.{form}", source=about))
     return files
 
 
+def source(study_id: str, figure: Figure | SceneFigure) -> str:
+    """Words that tell whether a picture is of a study and a figure as these are now.
+
+    The id of a study counts all that its results depend on, the model's version included.
+    """
+    fields = json.dumps(figure.model_dump(mode="json"), sort_keys=True)
+    return f"study {study_id}, figure {hashlib.sha256(fields.encode()).hexdigest()[:16]}"
+
+
 def default_figures(spec: Spec) -> list[Figure]:
-    """Surfaces where two axes are long; slices along a zipped or the longest axis; else tables."""
+    """Surfaces where two axes are long; slices along a zipped or the longest axis.
+
+    Axes of words alone make slices, by category, and tables.
+    """
     zipped = [axis for axis in spec.axes if axis.zipped][:1]
     axes = zipped or sorted(spec.axes, key=lambda axis: -axis.size)
     numeric = [
@@ -202,8 +218,12 @@ def default_figures(spec: Spec) -> list[Figure]:
         others = [a for a in spec.axes if a is not axis and not a.zipped]
         by = next(({"by": a.name} for a in others if a.size <= charts.MOST_LINES), {})
         return [Slices(kind="slices", variable=v, x=x, **by) for v in VARIABLES]
-    return [Table(kind="table", variable=v, rows=a.members[0].name)
-            for a in axes[:1] for v in VARIABLES]  # fmt: skip
+    by = {"by": axes[1].members[0].name} if len(axes) > 1 else {}
+    columns = {"columns": by["by"]} if by else {}
+    drawn: list[Figure] = [Slices(kind="slices", variable=v, x=a.members[0].name, **by)
+                           for a in axes[:1] for v in VARIABLES]  # fmt: skip
+    return drawn + [Table(kind="table", variable=v, rows=a.members[0].name, **columns)
+                    for a in axes[:1] for v in VARIABLES]  # fmt: skip
 
 
 COLOURS = ("range", "radial_velocity")

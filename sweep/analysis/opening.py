@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from functools import wraps
@@ -12,13 +12,28 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from sweep.analysis.answers import comparison, errors, limits, physical, probability
+from sweep.analysis.answers import (
+    comparison,
+    errors,
+    limits,
+    physical,
+    probability,
+    provenance,
+)
+from sweep.analysis.answers.physical import STUDY_ID
 from sweep.messages import suggestion
 from sweep.model.outputs import RUNNING
 from sweep.spec import SceneSpec, Spec
 from sweep.storage import opening
 from sweep.storage.locations import JOURNAL, Location, located
-from sweep.storage.opening import CHECKED, NotAStoreError, read_lines, read_receipts
+from sweep.storage.opening import (
+    CHECKED,
+    MAP,
+    NotAStoreError,
+    read_lines,
+    read_receipts,
+    versions_text,
+)
 from sweep.storage.sound import readable
 
 BATCH = "batch"
@@ -42,8 +57,12 @@ _HOLDS = {
 """Contents of the kinds of stores, and the functions that open them."""
 
 
-def open(path: str | Location) -> xr.Dataset:
-    """Open the store of a study as a dataset.
+def open(
+    path: str | Location | Sequence[str | Location] | Mapping[str, str | Location],
+    *,
+    dim: str = "design",
+) -> xr.Dataset:
+    """Open the store of a study as a dataset, or those of several as one, a design each.
 
     Dimensions bear the names of the study's axes, coordinates are in the units that the study was
     written in, and every variable has its units and what it is. Arrays are read when they are
@@ -53,13 +72,19 @@ def open(path: str | Location) -> xr.Dataset:
     Parameters
     ----------
     path
-        The store, complete or not.
+        The store, complete or not. A list of stores, or a mapping from names of designs to stores,
+        is joined along a new dimension; designs of a list are named by the titles of their studies.
+        Answers of `ds.sweep` from the result are per design, from each design's own spec.
+    dim
+        Name of that dimension.
 
     Returns
     -------
     xarray.Dataset
-        Its attributes are the store's and: `started`, `finished` (UTC; empty where there is
-        nothing to tell), `points`, `points_committed`, `blocks` and `blocks_committed`.
+        Its coordinate `study_id` is the id of the study, which proves to `ds.sweep` that a part of
+        the dataset is of one study. Its attributes are the store's and: `started`, `finished` (UTC;
+        empty where there is nothing to tell), `points`, `points_committed`, `blocks` and
+        `blocks_committed`.
 
     Raises
     ------
@@ -68,7 +93,18 @@ def open(path: str | Location) -> xr.Dataset:
     ReplacedError
         Later, where values are read that are not read yet, and another study's store is in the
         place by then: the store was extended, or run anew.
+    ValueError
+        Studies that can't be joined: `dim` is taken, one comes twice, or zipped axes differ.
+
+    Examples
+    --------
+    >>> ds = sweep.open({"25 mm": "small.zarr", "50 mm": "large.zarr"})  # doctest: +SKIP
+    >>> ds.sweep.maximum_range(pd=0.9).unbroken                          # doctest: +SKIP
     """
+    if isinstance(path, Mapping) and path:
+        return provenance.joined({str(name): open(store) for name, store in path.items()}, dim)
+    if isinstance(path, Sequence | Mapping) and not isinstance(path, str):
+        return provenance.joined(_by_title([open(store) for store in path]), dim)
     path = located(path)
     study = read_attributes(path, GRID)
     refuse_lost(path)
@@ -78,8 +114,39 @@ def open(path: str | Location) -> xr.Dataset:
     dataset = in_pieces(dataset.drop_vars(RUNNING, errors="ignore"))
     if BATCH in dataset.dims:
         dataset = merged(dataset)
-    dataset = dataset.assign_coords({name: c.compute() for name, c in dataset.coords.items()})
+    dataset = _with_study_id(_with_plain_words(dataset), study["study_id"])
     return dataset.assign_attrs(progress(path, points.size, blocks))
+
+
+def _by_title(datasets: Sequence[xr.Dataset]) -> dict[str, xr.Dataset]:
+    """Return datasets by the titles of their studies, with the ids of those that share a title."""
+    titles = [str(dataset.attrs["title"]) for dataset in datasets]
+    named = {
+        comparison.titled(dataset) if titles.count(title) > 1 else title: dataset
+        for title, dataset in zip(titles, datasets, strict=True)
+    }
+    if not named:
+        raise ValueError("the list of stores to join is empty: name two or more")
+    if len(named) < len(datasets):
+        raise ValueError("the list of stores to join has one study twice: leave one out")
+    return named
+
+
+def _with_plain_words(dataset: xr.Dataset) -> xr.Dataset:
+    """Load coordinates, words as numpy's own type of text, which xarray plots and writes."""
+    loaded = {name: array.compute() for name, array in dataset.coords.items()}
+    return dataset.assign_coords({
+        name: array.copy(data=np.array(array.values.tolist(), str))
+        if array.dtype.kind in "OT" else array
+        for name, array in loaded.items()
+    })  # fmt: skip
+
+
+def _with_study_id(dataset: xr.Dataset, identity: str) -> xr.Dataset:
+    """Return a dataset with the id of its study as a coordinate, and flat attributes."""
+    about = {"long_name": "id of the study"}
+    dataset = dataset.assign_coords({STUDY_ID: xr.DataArray(identity, attrs=about)})
+    return dataset.assign_attrs({name: versions_text(v) for name, v in dataset.attrs.items()})
 
 
 def open_scene(path: str | Location) -> xr.DataTree:
@@ -113,13 +180,25 @@ def opened(path: Location, chunks: dict[str, int] | None = None) -> xr.DataTree:
     attributes = read_attributes(path, SCENE)
     refuse_lost(path)
     store = readable(path, attributes["study_id"])
-    tree = xr.open_datatree(store, engine="zarr", chunks=chunks, **CHECKED)
+    whole = xr.open_datatree(store, engine="zarr", chunks=chunks, **CHECKED)
+    groups = {name: group.to_dataset(inherit=False) for name, group in whole.children.items()}
+    root = whole.to_dataset()
+    if _OLD_MAP.keys() <= root.variables.keys():  # where earlier versions have it
+        groups[MAP] = root[list(_OLD_MAP)].rename(_OLD_MAP)
+        root = root.drop_vars(list(_OLD_MAP))
+    for name in attributes["scanners"]:
+        groups[name] = _with_study_id(_with_plain_words(groups[name]), attributes["study_id"])
+    tree = xr.DataTree.from_dict({"/": _with_study_id(root, attributes["study_id"]), **groups})
     tree.encoding["source"] = str(path)
     flags = [tree[scanner].to_dataset()["flags"] for scanner in attributes["scanners"]]
     points = sum(int(own.size) // own.sizes["return_number"] for own in flags)
     blocks = sum(_blocks(own) for own in flags)
     tree.attrs |= progress(path, points, blocks)
     return tree
+
+
+_OLD_MAP = {"map_x": "x", "map_y": "y", "map_height": "height"}
+"""Names of the scene's map in the root of stores of earlier versions, and in its group."""
 
 
 def _blocks(array: xr.DataArray) -> int:
@@ -214,12 +293,19 @@ def _utc(time: float) -> str:
     return datetime.fromtimestamp(time, UTC).isoformat(timespec="seconds")
 
 
-def _answer(answer: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function of a dataset or tree as a method, with its words and arguments."""
+def _answer(answer: Callable[..., Any], *, every_axis: bool = False) -> Callable[..., Any]:
+    """Return a function of a dataset as a method, with its words and arguments.
+
+    The dataset has to prove that it is one study's; of a join of several the method answers per
+    design. ``every_axis``: the answer needs the coordinates of all axes.
+    """
 
     @wraps(answer)
-    def method(self: SweepAccessor | FlightAccessor, *given: Any, **options: Any) -> Any:
-        return answer(self._held, *given, **options)
+    def method(self: SweepAccessor, *given: Any, **options: Any) -> Any:
+        def of_study(dataset: xr.Dataset) -> Any:
+            return answer(dataset, *given, **options)
+
+        return provenance.answer_per_study(self._held, of_study, every_axis=every_axis)
 
     return method
 
@@ -237,7 +323,7 @@ class SweepAccessor:
     @property
     def spec(self) -> Spec:
         """The study."""
-        return physical.spec_of(self._held)
+        return physical.spec_of(provenance.proven(self._held, every_axis=False))
 
     def sel(self, *, method: str | None = None, **coordinates: Any) -> xr.Dataset:
         """Points by physical value: ``ds.sweep.sel(range="2 km", grazing_angle="20 deg")``.
@@ -247,17 +333,17 @@ class SweepAccessor:
         return physical.select(self._held, coordinates, method=method)
 
     detection_probability = _answer(probability.detection_probability)
-    roc = _answer(probability.roc)
+    roc = _answer(probability.roc, every_axis=True)
     limit = _answer(limits.limit)
     maximum_range = _answer(limits.maximum_range)
     minimum_grazing_angle = _answer(limits.minimum_grazing_angle)
     contour = _answer(limits.contour)
-    false_alarms_per_second = _answer(probability.false_alarms_per_second)
-    false_alarms_per_kilometre = _answer(probability.false_alarms_per_kilometre)
-    range_error = _answer(errors.range_error)
-    velocity_error = _answer(errors.velocity_error)
+    false_alarms_per_second = _answer(probability.false_alarms_per_second, every_axis=True)
+    false_alarms_per_kilometre = _answer(probability.false_alarms_per_kilometre, every_axis=True)
+    range_error = _answer(errors.range_error, every_axis=True)
+    velocity_error = _answer(errors.velocity_error, every_axis=True)
     summary = _answer(probability.summary)
-    compare = _answer(comparison.compare)
+    compare = _answer(comparison.compare, every_axis=True)
 
 
 @xr.register_datatree_accessor("sweep")
@@ -272,4 +358,7 @@ class FlightAccessor:
         """The study."""
         return physical.study_of(self._held)
 
-    compare = _answer(comparison.compare_flights)
+    @wraps(comparison.compare_flights)
+    def compare(self, other: xr.DataTree) -> xr.DataTree:
+        """Compare two flights; as :func:`.comparison.compare_flights`."""
+        return comparison.compare_flights(self._held, other)

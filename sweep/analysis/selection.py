@@ -145,8 +145,11 @@ class Points:
         return [(value, replace(self, places={**self.places, dim: own})) for value, own in groups]
 
     def side(self, name: str) -> Side:
-        """Places along a coordinate, in rising order, each value of the coordinate once."""
+        """Places along a coordinate, once a value: numbers rising, words as they appear."""
         values, first = np.unique(self.values(name), return_index=True)
+        if labels.is_words(values):
+            order = np.argsort(first)
+            values, first = values[order], first[order]
         dim = self.dim_of(name)
         return Side(dim, np.asarray(self.places[dim].index)[first], values)
 

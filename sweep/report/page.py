@@ -150,6 +150,14 @@ def _traces(panel: Panel, scale: Scale | None) -> Iterator[Any]:
         colorscale="Viridis", colorbar=COLOUR_BAR, name=panel.when["part"],
         meta=when(None, **panel.when),
     )  # fmt: skip
+    for level in layer.levels:
+        yield go.Contour(
+            x=_short(layer.x), y=_short(layer.y), z=_short(layer.values), name=f"{level:g}",
+            contours={"start": level, "end": level, "size": 1, "coloring": "none",
+                      "showlabels": True, "labelfont": {"size": 12, "color": "white"}},
+            line={"width": 2, "color": "white"}, showscale=False, showlegend=False,
+            hoverinfo="skip", meta=when(None, **panel.when),
+        )  # fmt: skip
 
 
 def _short(values: np.ndarray) -> np.ndarray:

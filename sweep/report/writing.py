@@ -31,6 +31,7 @@ from sweep.report.page import Item, Page, Section, Table, Text, plot, rendered
 from sweep.spec import SceneSpec, Slices, Spec, Surface
 from sweep.spec.sections import parameter_rules
 from sweep.storage.locations import Location, draft, located
+from sweep.storage.opening import software_versions
 
 PAGE = Room(parts=detector.MOST_PARTS, columns=500, rows=180, cells=400_000, abreast=1)
 """Cells of all heat maps of a page together, which keep it to a few megabytes."""
@@ -166,7 +167,7 @@ def _page(
         *counted,
         ("study", attributes["study_id"][:8]),
         ("model", str(attributes["model_version"])),
-        ("sweep", attributes["software"]["sweep"]),
+        ("sweep", software_versions(attributes).get("sweep", "")),
         ("finished (UTC)", str(attributes["finished"])[:16].replace("T", " ")),
     ]
     done, number = attributes[f"{unit}_committed"], attributes[unit]
@@ -440,8 +441,8 @@ def accuracy(dataset: xr.Dataset, spec: Declared) -> list[str]:
 
 def _reproduction(attributes: Mapping[Any, Any], spec: Declared, store: str) -> Section:
     """Citation of the study, and commands that make it again."""
-    software = attributes["software"]
-    version = software["sweep"]
+    software = software_versions(attributes)
+    version = software.get("sweep", "")
     year = str(attributes.get("finished") or attributes.get("started") or "")[:4]
     identity = f"study {attributes['study_id']}, model {attributes['model_version']}"
     cite = (

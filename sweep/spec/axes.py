@@ -34,7 +34,7 @@ from sweep.spec.sections import (
 )
 from sweep.units import QuantityError, Unit
 
-RESERVED = ("batch", "draw", "point", "spec")
+RESERVED = ("batch", "draw", "point", "spec", "study_id")
 """Names of dimensions that a store may have besides its axes."""
 
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,60}")

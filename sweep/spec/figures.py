@@ -117,6 +117,9 @@ class GridDrawing(Drawing):
     """Base of figures of grids."""
 
 
+_LEVELS = of.measure("Level, in the quantity's unit", "", "0.9", "-1e30", "1e30")
+
+
 class Surface(GridDrawing):
     """A quantity over two coordinates, seen from above."""
 
@@ -126,6 +129,9 @@ class Surface(GridDrawing):
     x: str = _coordinate()
     y: str = _coordinate()
     where: dict[str, Selection] = of.field(_WHERE, {})
+    levels: tuple[float, ...] = of.several(
+        _LEVELS, 1, 10, (), about="Levels at which contours are drawn", rising=True
+    )
 
 
 class Slices(GridDrawing):
@@ -137,6 +143,9 @@ class Slices(GridDrawing):
     x: str = _coordinate()
     by: str = _coordinate("")
     where: dict[str, Selection] = of.field(_WHERE, {})
+    levels: tuple[float, ...] = of.several(
+        _LEVELS, 1, 10, (), about="Levels at which lines are drawn across", rising=True
+    )
 
 
 class Table(GridDrawing):

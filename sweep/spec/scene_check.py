@@ -31,8 +31,8 @@ from sweep.spec.rules import Finding, Location, near_miss
 from sweep.spec.sections import default_of
 from sweep.units import QuantityError, read_unit
 
-RESERVED = ("map_height", "map_x", "map_y")
-"""Names that arrays of a store have beside its scanners."""
+RESERVED = ("scene_map",)
+"""Names that a store has for other groups than its scanners."""
 _PLACED = (scenes.Sphere, scenes.Box)
 OBJECTS: Location = ("scene", "objects")
 _LOOKS = 257

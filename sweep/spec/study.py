@@ -37,6 +37,7 @@ from sweep.spec.grid_rules import (
     spectra_findings,
     without_draws,
 )
+from sweep.spec.grid_rules import at as written_at
 from sweep.spec.grounds import OPTICAL
 from sweep.spec.parts import (
     Files,
@@ -636,7 +637,36 @@ def load(path: str | Path) -> Spec | SceneSpec:
             "`sweep.spec.Spec.from_mapping(...)` makes one of plain data"
         )
     document = read_document(Path(path))
-    return _kind(document.value).from_document(document, Path(path).parent)
+    both = _written_twice(document.value)
+    spec = _kind(document.value).from_document(document, Path(path).parent)
+    if findings := list(_contradictions(spec, both)):
+        raise SpecError(document.mistakes(findings))
+    return spec
+
+
+def _written_twice(written: Any) -> dict[str, object]:
+    """Return the fields that a file has in a section although an axis sets them, as written.
+
+    An instrument's own file or the library may have them: an axis is there to change these.
+    """
+    if not isinstance(written, Mapping):
+        return {}
+    found = {path: written_at(written, path, None) for path in paths_on_axes(written.get("axes"))}
+    return {path: copy.deepcopy(value) for path, value in found.items() if value is not None}
+
+
+def _contradictions(spec: Study, both: Mapping[str, object]) -> Iterator[Finding]:
+    """Report fields of a file whose value is none of their axis."""
+    for path, value in both.items():
+        member, rule = spec.member(path), sections.parameter_rules()[path]
+        read = rule.read(value)
+        values = np.asarray(member.values)
+        is_number = values.dtype.kind in "fi" and not isinstance(read, str)
+        if np.isclose(values, read, rtol=1e-9, atol=0).any() if is_number else read in values:
+            continue
+        told = f"is on the axis {member.name} too, which does not have this value"
+        remedy = "leave it out here, or put it on the axis"
+        yield Finding(tuple(path.split(".")), told, remedy, value)
 
 
 def from_stored(text: str, base: Path | str | None = None) -> Spec | SceneSpec:

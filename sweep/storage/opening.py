@@ -66,9 +66,7 @@ _KINDS = {
 
 _REQUIRED = ("study_id", "model_version", "software")
 
-_NOT_TEXT = {
-    "software": dict, "shots_a_cycle": int, "scanners": list, "surfaces": list,
-}  # fmt: skip
+_NOT_TEXT = {"shots_a_cycle": int, "scanners": list, "surfaces": list}
 
 _ARRAY_ATTRIBUTES = {
     "units": str, "long_name": str, "comment": str, "standard_name": str, "path": str,
@@ -82,6 +80,9 @@ _FILLS: dict[str, tuple[Any, ...]] = {
     "uint32": (0,), "uint8": (0,), "bool": (False,), "string": ("",),
 }  # fmt: skip
 """Types of arrays, and what stands where nothing is written."""
+
+MAP = "scene_map"
+"""Group of the map of a flight's ground."""
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,199}")
 
@@ -145,9 +146,27 @@ def recognised(path: Location, attributes: Any) -> dict[str, Any]:
             f"{path} is laid out as version {layout!r:.20}; this sweep writes {LAYOUT}"
         )
     needed = (*_REQUIRED, *_KINDS.get(str(ours.get("kind")), ("no known kind",)))
-    if any(type(ours.get(name)) is not _NOT_TEXT.get(name, str) for name in needed):
+    text = ours | {"software": versions_text(ours.get("software"))}
+    if any(type(text.get(name)) is not _NOT_TEXT.get(name, str) for name in needed):
         raise NotAStoreError(f"{path} is a Zarr store, but not one that sweep made")
     return ours
+
+
+def versions_text(software: Any) -> Any:
+    """Return versions by name as text, ``numba 0.60, numpy 2.1``; anything but a mapping as it is.
+
+    Attributes that are text, numbers or lists of these go into any file format. Stores of earlier
+    versions have mappings.
+    """
+    if not isinstance(software, dict):
+        return software
+    return ", ".join(f"{name} {version}" for name, version in software.items())
+
+
+def software_versions(attributes: Mapping[Any, Any]) -> dict[str, str]:
+    """Return the versions of the software that a store was begun with, by name."""
+    text = str(versions_text(attributes["software"]))
+    return dict(part.rsplit(" ", 1) for part in text.split(", ") if " " in part)
 
 
 def refuse_foreign(path: Location) -> None:
@@ -245,9 +264,10 @@ def _check_node(path: str, node: dict[str, Any]) -> None:
         raise ValueError(f"{path} is of the Zarr format {node['zarr_format']!r:.20}")
     if node["node_type"] == "group":
         own = node["attributes"]
-        if not re.fullmatch("[0-9a-f]{32}", own["geometry_id"]):  # part of a path
-            raise ValueError(f"the group {path} has no eyepoints")
-        own["coordinates"].split()
+        if path != MAP:
+            if not re.fullmatch("[0-9a-f]{32}", own["geometry_id"]):  # part of a path
+                raise ValueError(f"the group {path} has no eyepoints")
+            own["coordinates"].split()
         expected = {"node_type": "group", "zarr_format": 3, "attributes": own}
     else:
         expected = _expected(path, node)

@@ -14,6 +14,7 @@ import numpy as np
 
 from sweep.messages import option, suggestion
 from sweep.spec import SceneSpec, Spec
+from sweep.spec.clusters import Local
 from sweep.storage.locations import (
     PACKED,
     Location,
@@ -43,6 +44,7 @@ from sweep.tasks.journal import (
     refuse_damaged_recipe,
     write_recipe,
 )
+from sweep.tasks.memory import refuse_too_large
 from sweep.tasks.progress import BusyError, ClusterError, StoreError, told, working
 from sweep.tasks.session import Outcome, Pool, RunOptions, Session
 from sweep.tasks.store import (
@@ -91,6 +93,8 @@ def run(
     path, how = real(located(store)), RunOptions.of(options)
     _refuse_no_study(spec)
     _check_code(spec)
+    if how.client is None and isinstance(how.place(spec), Local | None):
+        refuse_too_large(spec)
     pool = Pool(how, spec)
     if not overwrite:
         _refuse_in_the_way(path, studies.study_of(spec, path))

@@ -17,6 +17,7 @@ import numpy as np
 from sweep.model.accuracy import Accuracy
 from sweep.model.outputs import BEAMLETS, CYCLES, SHOTS, WEIGHT
 from sweep.model.resolution import more_rays
+from sweep.storage.opening import MAP
 from sweep.tasks.study import FILLS, TILE_SHOTS, ArrayLayout, BlockGrid, Results, Study, described
 
 if TYPE_CHECKING:
@@ -277,11 +278,11 @@ def scene_map(spec: SceneSpec) -> list[ArrayLayout]:
     depth = altitude(world, grid, spec.flight().start)
     height = np.where(np.isfinite(depth), top - depth, np.nan).reshape(len(y), len(x))
     return [
-        ArrayLayout.known(name, dims, values, described("m", long_name), fill=FILLS["f"])
-        for name, dims, values, long_name in (
-            ("map_x", ("map_x",), x, "x of the map's nodes"),
-            ("map_y", ("map_y",), y, "y of the map's nodes"),
-            ("map_height", ("map_y", "map_x"), height, "height seen from above"),
+        ArrayLayout.known(f"{MAP}/{name}", dims, values, described("m", text), fill=FILLS["f"])
+        for name, dims, values, text in (
+            ("x", ("x",), x, "x of the map's nodes"),
+            ("y", ("y",), y, "y of the map's nodes"),
+            ("height", ("y", "x"), height, "height seen from above"),
         )
     ]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, cached_property, partial
@@ -23,8 +24,10 @@ from sweep.model.outputs import (
     STATISTICS,
 )
 from sweep.model.resolution import by_tolerance, effects_tolerance
+from sweep.spec.rules import Mistake, SpecError
 from sweep.spec.scene import projection_of
 from sweep.storage.locations import Location, eyepoints_path
+from sweep.storage.opening import MAP
 from sweep.storage.sound import open_arrays
 from sweep.tasks.eyepoint_study import (
     SIZES,
@@ -99,6 +102,7 @@ class ScannerBlocks(Lattice, BlockGrid):
         self.scanner, self.axes = scanner, self.shape
         self.total_cycles, self.shots_a_cycle = spec.cycles(scanner), spec.shots_a_cycle(scanner)
         self.draws = int(spec.draws.number)
+        _refuse_too_many(spec, scanner, self.total_cycles * self.shots_a_cycle)
         fitting = max(1, int(spec.storage.block_shots) // self.shots_a_cycle)
         BlockGrid.__init__(
             self,
@@ -131,6 +135,30 @@ class ScannerBlocks(Lattice, BlockGrid):
     def first_part(self, axes: tuple[int, ...]) -> Part:
         """Return the first block at a place along the axes."""
         return self.part(self.number((*axes, 0, 0)))
+
+
+#: Shots of a scanner, and these times draws and places along axes, at the most.
+SHOTS_MAX, DRAWN_SHOTS_MAX = 10**9, 10**10
+
+
+def _refuse_too_many(spec: SceneSpec, scanner: str, shots: int) -> None:
+    """Refuse a flight of more shots than can be handled, before any array of them is made."""
+    flight, draws = spec.flight(), int(spec.draws.number)
+    all_shots = shots * draws * math.prod(int(axis.size) for axis in spec.axes)
+    if shots > SHOTS_MAX:
+        rule = (
+            f"makes {shots:.3g} shots in a flight of {flight.stop - flight.start:.3g} s, and a "
+            f"scanner has at most {SHOTS_MAX:.0e}"
+        )
+        value = f"{spec.scanners[scanner].rate:g} Hz"
+        remedy = "lower the rate, or shorten the flight: mind the speeds in platform.path"
+        raise SpecError([Mistake(f"scanners.{scanner}.rate", rule, value, remedy)])
+    if all_shots > DRAWN_SHOTS_MAX:
+        rule = (
+            f"makes {all_shots:.3g} shots in all draws and places along axes, and a study has at "
+            f"most {DRAWN_SHOTS_MAX:.0e}"
+        )
+        raise SpecError([Mistake("draws.number", rule, f"{draws}", "take fewer draws")])
 
 
 class KnownCloud(NamedTuple):
@@ -187,14 +215,13 @@ class FlightStudy(GrowingStudy):
             "spec": self.spec.to_json(),
             "surfaces": [surface.name for surface in self.surfaces],
             "scanners": list(self.spec.scanners),
-            "eyepoints": {name: self.spec.geometry_id(name) for name in self.spec.scanners},
             "origin": np.asarray(world_of(self.spec).origin, float).tolist(),
             "projection": projection_of(self.spec.scene, self.spec.files),
             "time_origin": f"{self.spec.files.time_origin.normalize():f}",
         }
 
     def groups(self) -> dict[str, dict[str, Any]]:
-        """Return a group for each scanner."""
+        """Return a group for each scanner, and one of the map, whose cells are none of theirs."""
         names = " ".join(member.name for axis in self.spec.axes for member in axis.members)
         return {
             name: {
@@ -203,7 +230,7 @@ class FlightStudy(GrowingStudy):
                 "coordinates": names,
             }
             for name, blocks in self.scanners.items()
-        }
+        } | {MAP: {}}
 
     def known_arrays(self) -> list[ArrayLayout]:
         """Return the map of the scene, and every scanner's coordinates."""

@@ -29,6 +29,7 @@ from sweep.tasks.grid_study import (
     select,
     with_few_draws,
 )
+from sweep.tasks.memory import point_bytes, refuse_too_large
 from sweep.tasks.studies import study_of
 from sweep.tasks.study import TILE_SHOTS, Value
 
@@ -94,6 +95,7 @@ def plan(
     spec: Spec | SceneSpec, *, store: Location | None = None, workers: int | None = None
 ) -> Plan:
     """Plan a study to be stored at a place, by its size and a second of measuring points."""
+    refuse_too_large(spec)
     study = study_of(spec, (store or Path("nowhere.zarr")).absolute())
     scanners: tuple[ScannerPlan, ...] = ()
     reports: tuple[str, ...] = ()
@@ -121,7 +123,9 @@ def plan(
         seconds_a_point=each,
         seconds=START + work / min(workers, study.n_blocks),
         # with the model loaded, and a block's results twice: its own, and those being encoded
-        worker_memory=psutil.Process().memory_info().rss + 2 * study.block_bytes,
+        worker_memory=psutil.Process().memory_info().rss
+        + 2 * study.block_bytes
+        + point_bytes(spec),
         scanners=scanners,
         reports=reports,
     )

@@ -56,6 +56,8 @@ from sweep.storage.opening import (
     read_lines,
     read_sealed,
     sealed,
+    software_versions,
+    versions_text,
 )
 from sweep.tasks.journal import LOCK, LOGS, REPLACES, Lock, Receipt, read_recipe, write_recipe
 from sweep.tasks.progress import BusyError, StoreError
@@ -178,7 +180,7 @@ def new_attributes(study: Content) -> dict[str, Any]:
         "Conventions": CONVENTIONS,
         "study_id": study.id,
         "model_version": VERSION,
-        "software": software(),
+        "software": versions_text(software()),
         "processor": processor(),
         "layout": LAYOUT,
     }
@@ -483,7 +485,7 @@ def refuse_other_study(
 
 def refuse_other_versions(path: str | Location, attributes: dict[str, Any], *, where: str) -> None:
     """Refuse a store begun with another model or other software: the bits could differ."""
-    recorded = {"model": attributes["model_version"], **attributes["software"]}
+    recorded = {"model": attributes["model_version"], **software_versions(attributes)}
     here = {"model": VERSION, **software()}
     if recorded != here:
         listed = "\n".join(

@@ -2,7 +2,6 @@
 
 import numpy as np
 import xarray as xr
-from drawn_studies import study
 from scipy.special import ndtr
 
 import sweep.analysis.opening  # noqa: F401
@@ -17,14 +16,15 @@ def made(z, half_width=None, **coordinates):
     z = np.asarray(z, float)
     variables = {"pd_shot": (dims, ndtr(z)), "miss_shot": (dims, ndtr(-z))}
     if half_width is not None:
-        variables["pd_shot_half_width"] = (dims, np.full(z.shape, half_width))
+        width, about = np.full(z.shape, half_width), {"confidence": 0.95}
+        variables["pd_shot_half_width"] = (dims, width, about)
     dataset = xr.Dataset(
         variables,
         {
             name: ([name], np.asarray(values, float), {"units": UNITS[name], "path": PATHS[name]})
             for name, values in coordinates.items()
         },
-        {"spec": study({}).to_json(), "title": "Made"},
+        {"title": "Made"},
     )
     dataset.pd_shot.attrs = {"units": "1", "long_name": "probability of detection, shot"}
     return dataset

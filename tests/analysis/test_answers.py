@@ -258,7 +258,7 @@ def test_other_draws_agree_within_their_intervals_and_another_laser_does_not(spe
 
 
 def test_a_dataset_that_is_none_of_sweeps_says_so():
-    with pytest.raises(ValueError, match="lacks the attribute 'spec'"):
+    with pytest.raises(ValueError, match="lacks the coordinate 'study_id'"):
         _ = xr.Dataset().sweep.spec
 
 

@@ -62,7 +62,7 @@ def test_neither_does_that_of_its_figures(tmp_path, monkeypatch):
     # as many cells of both, and what they are drawn in left out
     monkeypatch.setattr(charts, "SHEET", replace(charts.SHEET, columns=20))
     monkeypatch.setattr(charts, "STRETCHES", 5)
-    monkeypatch.setattr(canvas, "save", lambda sheet, path: path)
+    monkeypatch.setattr(canvas, "save", lambda sheet, path, source: path)
     sizes = stores(tmp_path, (0.006, 0.024), 2000)
     # what grows is what a handful of pieces takes; with all points in memory it was 0.37
     assert growth(lambda path: draw(path, tmp_path), sizes, monkeypatch) < 0.15

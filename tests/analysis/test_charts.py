@@ -166,7 +166,7 @@ def test_words_stand_one_after_the_other_along_an_axis():
         np.linspace(0, 1, 4).reshape(2, 2), grazing_angle=[10.0, 20.0], window=["hann", "hamming"]
     )
     panel = sheet(surface(found, x="window")).axes[0]
-    assert [label.get_text() for label in panel.get_xticklabels()] == ["hamming", "hann"]
+    assert [label.get_text() for label in panel.get_xticklabels()] == ["hann", "hamming"]
 
 
 def test_parameters_that_vary_together_make_no_panels_and_others_do():

@@ -81,12 +81,18 @@ def pictures(tmp_path_factory):
         axes = {"target.range": ["1 km", "4 km", "9 km"]} if name == "drawn" else axes
         stores[name] = stored(directory / name, axes, **more)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(canvas, "save", lambda sheet, file: sheets.setdefault(file.stem, sheet))
+        patch.setattr(
+            canvas, "save", lambda sheet, file, source="": sheets.setdefault(file.stem, sheet)
+        )
         for name in ("grid", "scene"):
             draw(stores[name])
-        patch.setattr(canvas, "save", lambda sheet, file: sheets.setdefault("drawn", sheet))
+        patch.setattr(
+            canvas, "save", lambda sheet, file, source="": sheets.setdefault("drawn", sheet)
+        )
         draw(stores["drawn"])
-        patch.setattr(canvas, "save", lambda sheet, file: sheets.setdefault("shot", sheet))
+        patch.setattr(
+            canvas, "save", lambda sheet, file, source="": sheets.setdefault("shot", sheet)
+        )
         shot_figure.report(study({}), {}, directory, noise=True, seed=3)
     with canvas.style():
         opened = sweep.open(stores["powers"])

@@ -3,9 +3,13 @@ import pytest
 from drawn_files import shows
 from drawn_studies import POWERS, SURFACE, stored, study
 from matplotlib.text import Text
+from PIL import Image
 
 from sweep.analysis import canvas
-from sweep.analysis.figures import default_figures, draw
+from sweep.analysis.charts import SHEET
+from sweep.analysis.figures import Study, default_figures, draw, source
+from sweep.report.page import plot
+from sweep.report.writing import write
 
 ASKED = [
     {"kind": "surface", "variable": "pd_shot", "x": "range", "y": "grazing_angle"},
@@ -25,6 +29,8 @@ ASKED = [
         "minimum_range": "1 km",
     },
 ]
+WINDOWS = {"instrument.processing.window": ["rectangular", "hann", "blackman"]}
+SPECKLE = {"footprint.speckle": ["none", "developed"]}
 TOGETHER = {"target.range": ["1 km", "3 km"], "instrument.laser.power": ["1 W", "3 W"]}
 
 
@@ -71,7 +77,7 @@ def test_a_figure_of_values_that_are_not_in_the_grid_says_so(tmp_path, monkeypat
     figure = ASKED[1] | {"where": {"grazing_angle": "17 deg"}}
     path = stored(tmp_path, {"target.range": ["1 km"], **SURFACE}, figures=[figure])
     sheets = []
-    monkeypatch.setattr(canvas, "save", lambda sheet, file: sheets.append(sheet) or file)
+    monkeypatch.setattr(canvas, "save", lambda sheet, file, source="": sheets.append(sheet) or file)
     draw(path)
     ((words,),) = (sheet.texts for sheet in sheets)
     assert words.get_text().endswith("no point of the study has grazing angle 17 deg")
@@ -83,7 +89,7 @@ def test_a_figure_of_values_that_are_not_in_the_grid_says_so(tmp_path, monkeypat
         (SURFACE, ["surface", "surface"]),
         ({"target.range": ["1 km", "2 km"], "instrument.laser.power": ["1 W"]}, ["slices"] * 2),
         (POWERS, ["slices"] * 2),
-        ({"instrument.processing.window": ["hann", "hamming"]}, ["table"] * 2),
+        (WINDOWS, ["slices"] * 2 + ["table"] * 2),
         ({}, []),
     ],
 )
@@ -97,6 +103,8 @@ def test_a_study_that_asks_for_nothing_has_the_figures_that_suit_its_axes(axes, 
         (SURFACE, 2),
         ({}, 2),
         ({"along": {"zip": TOGETHER}}, 2),
+        (WINDOWS, 6),
+        (WINDOWS | SPECKLE, 6),
     ],
 )
 def test_the_usual_figures_of_a_study_are_drawn(axes, number, tmp_path):
@@ -118,3 +126,74 @@ def test_a_dollar_in_a_title_is_a_dollar(tmp_path, text):
     assert len(shown) == 3 and not any(found.get_parse_math() for found in shown)
     for sheet in sheets:
         canvas.save(sheet, tmp_path / "sheet.png")
+
+
+WORDS = [
+    {"kind": "slices", "name": "by_number", "variable": "pd_shot", "x": "window", "by": "range"},
+    {"kind": "slices", "name": "by_words", "variable": "pd_shot", "x": "range", "by": "window"},
+    {"kind": "surface", "name": "across", "variable": "pd_shot", "x": "window", "y": "range"},
+    {"kind": "surface", "name": "up", "variable": "pd_shot", "x": "range", "y": "window"},
+]
+
+
+@pytest.mark.parametrize("draws", [{}, {"number": 20}])
+def test_axes_of_words_are_drawn_by_category_in_files_and_pages(draws, tmp_path):
+    axes = WINDOWS | {"target.range": ["1 km", "4 km", "9 km"]}
+    path = stored(tmp_path, axes, figures=WORDS, draws=draws)
+    for form in ("png", "svg"):
+        files = draw(path, form=form)
+        assert len(files) == len(WORDS)
+    assert all(map(shows, draw(path)))
+    figures = Study.of(path)
+    for figure in figures.figures[:1]:
+        (panel,) = figures.chart(figure, SHEET).panels
+        assert panel.x.kind == "category"
+        for line in panel.lines:  # in the order of the study, not of the alphabet
+            assert line.x.tolist() == ["rectangular", "hann", "blackman"]
+    values = figures.dataset.pd_shot
+    for figure, words in zip(figures.figures[2:], ("x", "y"), strict=True):
+        (panel,) = figures.chart(figure, SHEET).panels
+        assert getattr(panel, words).kind == "category"
+        own = (
+            values.transpose("range", "window") if words == "x" else values.transpose("window", ...)
+        )
+        np.testing.assert_allclose(panel.map.values, own)
+        assert getattr(panel.map, words).tolist() == ["rectangular", "hann", "blackman"]
+        (trace,) = plot(figures.chart(figure, SHEET)).figure.data
+        assert getattr(trace, words).tolist() == ["rectangular", "hann", "blackman"]
+    assert write(path, tmp_path / "page.html").stat().st_size > 1e6
+
+
+def test_levels_are_contours_of_maps_and_lines_across_slices(tmp_path):
+    levels = {"levels": [0.5, 0.9]}
+    figures = [ASKED[0] | levels, ASKED[1] | levels | {"variable": "pd_shot"}]
+    path = stored(tmp_path, SURFACE, figures=figures)
+    assert all(map(shows, draw(path)))
+    surface, slices = (Study.of(path).chart(f, SHEET) for f in Study.of(path).figures)
+    assert surface.panels[0].map.levels == (0.5, 0.9) and "0.5 and 0.9" in " ".join(surface.caption)
+    levels = [line for line in slices.panels[0].lines if line.look == "level"]
+    assert [line.y[0] for line in levels] == [0.5, 0.9]
+    with canvas.style():
+        sheet = canvas.sheet_of(surface, "", "")
+    told = {text.get_text() for axes in sheet.axes for text in axes.texts}
+    assert told == {"0.5", "0.9"}
+    contours = [trace for trace in plot(surface).figure.data if trace.type == "contour"]
+    assert [trace.contours.start for trace in contours] == [0.5, 0.9]
+
+
+@pytest.mark.parametrize("levels", [[2.0], [0.5, 0.9]])
+@pytest.mark.parametrize("x", ["range", "window"])
+def test_levels_that_nothing_reaches_or_across_words_leave_the_map(levels, x, tmp_path):
+    other = {"range": "window", "window": "range"}[x]
+    asked = {"kind": "surface", "variable": "pd_shot", "x": x, "y": other, "levels": levels}
+    axes = WINDOWS | {"target.range": ["1 km", "4 km", "9 km"]}
+    assert all(map(shows, draw(stored(tmp_path, axes, figures=[asked]))))
+
+
+def test_a_picture_says_what_it_was_drawn_from(asked, tmp_path):
+    png, pdf, svg = (draw(asked, tmp_path, form)[0] for form in ("png", "pdf", "svg"))
+    spec = Study.of(asked).spec
+    told = source(spec.id, spec.figures[0])
+    with Image.open(png) as image:
+        assert image.info[canvas.SOURCE] == told
+    assert told in svg.read_text() and told.encode() in pdf.read_bytes()

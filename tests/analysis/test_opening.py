@@ -110,7 +110,7 @@ def test_each_kind_of_store_is_refused_where_another_is_asked_for(surface, scene
 
 def test_a_group_for_each_scanner_holds_what_the_table_of_outputs_says(scene_store):
     tree = open_scene(scene_store)
-    assert set(tree.children) == {"square", "pair"}
+    assert set(tree.children) == {"square", "pair", "scene_map"}
     for name, navigates in (("square", True), ("pair", False)):
         group = tree.children[name].to_dataset(inherit=False)
         outputs = (

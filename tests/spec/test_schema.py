@@ -24,6 +24,7 @@ IDS = {
     "beam_coupling": "ad013b5a",
     "beam_divergence": "94ca14c4",
     "cfar": "81937f26",
+    "descent": "b0af76ab 3353ee53",
     "estimators": "43fc2385",
     "expanded_pattern": "9ba46e5a 96bd30ac",
     "fft_size": "ededf940",
@@ -31,8 +32,9 @@ IDS = {
     "gale_crater_descent": "6cf8e0b8 48dbaca0",
     "morpheus_three_beam": "a65525b3 7422a280",
     "oblique_descent": "caffeb12 a09399cd",
-    "quickstart": "980ba9fd",
+    "quickstart": "947e690f",
     "range_angle": "ced74998",
+    "range_angle_coarse": "980ba9fd",
     "scan_pattern_comparison": "b072d2a3 15a2ffe4 f8fe970d c3bbf3c2",
     "single_shot_2000m": "0eaab3b9",
     "single_shot_45deg": "e5f6c0b7",
@@ -46,7 +48,8 @@ IDS = {
 """Of the study, and of the geometry of each scanner: the first digits."""
 
 POINTS = {
-    "quickstart": 4500,
+    "quickstart": 199 * 90 * 3,
+    "range_angle_coarse": 4500,
     "single_shot_2000m": 1,
     "single_shot_45deg": 2,
     "range_angle": 900_000,
@@ -60,7 +63,7 @@ POINTS = {
     "cfar": 4 * 2 * 12,
     "estimators": 8 * 7 * 2,
 }
-NEW = ("beam_coupling", "speckled_target", "cfar", "estimators")
+NEW = ("quickstart", "beam_coupling", "speckled_target", "cfar", "estimators")
 """Studies of what the thesis has nothing of."""
 
 

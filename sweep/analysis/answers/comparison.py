@@ -10,7 +10,8 @@ import pandas
 import xarray as xr
 
 from sweep.analysis import labels
-from sweep.analysis.answers.physical import parameter, si, study_of
+from sweep.analysis.answers import provenance
+from sweep.analysis.answers.physical import STUDY_ID, parameter, si, study_of
 from sweep.analysis.charts import LOG, Axis, Chart, Line, Panel
 from sweep.model.accuracy import clopper_pearson
 from sweep.model.accuracy import half_width as half_width_of
@@ -51,6 +52,7 @@ def compare(ours: xr.Dataset, other: xr.Dataset) -> xr.Dataset:
     """
     if not isinstance(other, xr.Dataset):
         raise ValueError(ONE_OF_EACH)
+    ours, other = (provenance.proven(dataset, every_axis=True) for dataset in (ours, other))
     names = [n for n in {**OUTPUTS, **SPECTRA_OUTPUTS} if n in ours and n in other]
     return differences(ours, other, names, bounded=PROMISED)
 
@@ -103,7 +105,7 @@ def _matched(ours: xr.Dataset, other: xr.Dataset) -> tuple[xr.Dataset, xr.Datase
         other = other.drop_vars([n for n, c in other.coords.items() if dim in c.dims])
         other = other.assign_coords({n: c for n, c in ours.coords.items() if c.dims == (dim,)})
     scalars = [n for n, c in other.coords.items() if not c.dims]
-    return ours, other.drop_vars(scalars)
+    return ours.drop_vars(STUDY_ID, errors="ignore"), other.drop_vars(scalars)
 
 
 def _at_fixed(dataset: xr.Dataset, reference: xr.Dataset) -> xr.Dataset:
@@ -196,18 +198,30 @@ def compare_flights(ours: xr.DataTree, other: xr.DataTree) -> xr.DataTree:
     """
     if not isinstance(other, xr.DataTree):
         raise ValueError(ONE_OF_EACH)
-    scanners = [name for name in ours.attrs["scanners"] if name in other.attrs["scanners"]]
+    scanners = [name for name in scanner_names(ours) if name in scanner_names(other)]
     if not scanners:
-        has = (", ".join(tree.attrs["scanners"]) for tree in (ours, other))
+        has = (", ".join(scanner_names(tree)) for tree in (ours, other))
         raise ValueError("the flights have no scanner in common: {}; and {}".format(*has))
     parts = {name: _scanner(ours, other, name) for name in scanners}
     whole = xr.Dataset(attrs={"ours": titled(ours), "other": titled(other)})
     return xr.DataTree.from_dict({"/": whole, **parts})
 
 
+def scanner_names(tree: xr.DataTree) -> list[str]:
+    """Return the names of a flight's scanners; netCDF makes a word of a list of one."""
+    names = tree.attrs["scanners"]
+    return [names] if isinstance(names, str) else [str(name) for name in names]
+
+
 def _scanner(ours: xr.DataTree, other: xr.DataTree, scanner: str) -> xr.Dataset:
     """Differences at the shots of a scanner."""
-    left, right = (tree.children[scanner].to_dataset(inherit=False) for tree in (ours, other))
+    left, right = (
+        provenance.proven(
+            tree.children[scanner].to_dataset(inherit=False).assign_attrs(tree.attrs),
+            every_axis=True,
+        )
+        for tree in (ours, other)
+    )
     shots, matching = _pairs(left, right, scanner)
     when = {name: left[name].isel(shot=shots).compute() for name in ("time", "beam")}
     # a store is complete where no draw is left to compute; a missing point would not tell

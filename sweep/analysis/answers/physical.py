@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -17,12 +19,39 @@ from sweep.units import QuantityError, read_quantity
 CLOSE = 1e-9
 """Relative difference up to which a value is one on the grid."""
 
+STUDY_ID = "study_id"
+"""Coordinate with the id of the study that points are of; an attribute of the same name, too."""
+
+SPECS = "specs"
+"""Attribute of a join of studies: JSON with the spec and the variables of each by its id."""
+
 
 def study_of(dataset: xr.Dataset | xr.DataTree) -> Spec | SceneSpec:
     """Return the study that a dataset, or a flight's tree, comes from."""
     text = dataset.attrs.get("spec")
+    if STUDY_ID in dataset.coords:
+        identity = dataset.coords[STUDY_ID]
+        if identity.dims:
+            raise ValueError(
+                f"the dataset has several studies along '{identity.dims[0]}': select one of them, "
+                f"ds.isel({identity.dims[0]}=0)"
+            )
+        if SPECS in dataset.attrs:
+            text = json.loads(dataset.attrs[SPECS]).get(str(identity.item()), {}).get("spec")
+        elif dataset.attrs.get(STUDY_ID) != str(identity.item()):
+            text = None
     if not text:
-        raise ValueError("the dataset lacks the attribute 'spec': take one that sweep.open gave")
+        raise ValueError(
+            "the dataset lacks the spec of its study, an attribute that an operation has dropped "
+            "or taken from another: use a dataset of sweep.open, or "
+            "xarray.set_options(keep_attrs=True)"
+        )
+    return _from_stored(text)
+
+
+@lru_cache(maxsize=8)
+def _from_stored(text: str) -> Spec | SceneSpec:
+    """Read the spec of a store; answers ask for that of one dataset again and again."""
     return from_stored(text)
 
 
@@ -85,12 +114,24 @@ def si(array: xr.DataArray) -> xr.DataArray:
 
 def parameter(dataset: xr.Dataset, path: str, spec: Spec | SceneSpec | None = None) -> xr.DataArray:
     """SI value of a parameter at each point: along its axis, or one value for all."""
-    for array in dataset.coords.values():
-        if array.attrs.get("path") == path:
-            return si(array).drop_vars(list(array.coords), errors="ignore").assign_coords(
-                {n: c for n, c in array.coords.items() if n in array.dims}
-            )  # fmt: skip
-    return xr.DataArray((spec or spec_of(dataset)).parameters()[path])
+    array = parameter_coordinate(dataset, path)
+    if array is not None:
+        return si(array).drop_vars(list(array.coords), errors="ignore").assign_coords(
+            {n: c for n, c in array.coords.items() if n in array.dims}
+        )  # fmt: skip
+    spec = spec or spec_of(dataset)
+    if any(member.path == path for axis in spec.axes for member in axis.members):
+        raise ValueError(
+            f"the dataset lacks the coordinate of {path}, an axis of its study: select one value "
+            "and keep it, ds.sweep.sel(...), or isel without drop=True"
+        )
+    return xr.DataArray(spec.parameters()[path])
+
+
+def parameter_coordinate(dataset: xr.Dataset, path: str) -> xr.DataArray | None:
+    """Return the coordinate of a parameter, by its dotted path."""
+    found = (array for array in dataset.coords.values() if array.attrs.get("path") == path)
+    return next(found, None)
 
 
 def select(

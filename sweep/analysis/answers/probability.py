@@ -56,9 +56,10 @@ def detection_probability(dataset: xr.Dataset, segment: str = "shot") -> xr.Data
     reach = half_width(dataset, segment)
     low, high = (pd, pd) if reach is None else ((pd - reach).clip(0, 1), (pd + reach).clip(0, 1))
     result = xr.Dataset({"pd": pd, "low": low, "high": high}).assign_attrs(dataset.attrs)
+    of_pd = pd.attrs.get("long_name", pd.name)
     for name, words in (("low", "lower"), ("high", "upper")):
         result[name].attrs = {
-            "units": "1", "long_name": f"{words} end of the interval of {pd.attrs['long_name']}",
+            "units": "1", "long_name": f"{words} end of the interval of {of_pd}",
             **confidence(dataset, reach),
         }  # fmt: skip
     return result

@@ -33,6 +33,7 @@ from sweep.analysis.scenes.recording import (
     within,
 )
 from sweep.model.pairing import TRUE
+from sweep.storage.opening import MAP
 
 SUN_AZIMUTH, SUN_ELEVATION = 315.0, 40.0
 """Direction of the light that shades the ground [deg], from north by east; and its height."""
@@ -55,9 +56,9 @@ class Ground:
     @classmethod
     def of(cls, tree: xr.DataTree) -> Ground | None:
         """Return the map of a store, or None if it has none, or nothing is on it."""
-        if "map_height" not in tree.ds:
+        if MAP not in tree.children:
             return None
-        x, y, height = (np.asarray(tree.ds[f"map_{name}"].values) for name in ("x", "y", "height"))
+        x, y, height = (np.asarray(tree[MAP][name].values) for name in ("x", "y", "height"))
         return cls(x, y, height) if np.isfinite(height).any() else None
 
     def cropped(

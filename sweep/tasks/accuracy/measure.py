@@ -361,12 +361,11 @@ class Measured:
             "question": "What does accuracy cost in time?",
             "spec": spec.to_json(),
             "reference": self.ladder.about,
-            "environment": {"processor": store.processor(), **store.software()},
             "unit": self.bench.unit,
             "points": len(self.done),
             "study_points": self.bench.whole,
             "storing_seconds": self.stored,
-            "notes": list(self.ladder.notes),
+            "notes": "\n".join(self.ladder.notes),
             # 0 where the thesis's way was not tried, or nothing is seen
             "thesis_beamlets": int(np.nan_to_num(np.fmax.reduce(beamlets, axis=None, initial=0))),
             "stopped": self.stopped,
