@@ -180,7 +180,7 @@ def shapes(window: Window, fft_size: int, power: bool, tier: int, *, shared: boo
 
 
 def part_class(window: Window, least: np.ndarray) -> np.ndarray:
-    """Number of :data:`PART_STEP` by which the least of an echo's samples falls short of all."""
+    """Count the :data:`PART_STEP` by which the least of an echo's samples falls short of all."""
     ratio = window.length / np.maximum(least, 1)
     return np.ceil(np.log(ratio) / math.log(PART_STEP) - 1e-9).astype(np.int64)
 
@@ -410,7 +410,7 @@ def _corrections(taylor: np.ndarray, y: np.ndarray, length: int) -> np.ndarray:
 
 
 def _sums_of_powers() -> np.ndarray:
-    """Sums of n^j e^{-i theta n} as polynomials in cot(theta / 2), by j and power."""
+    """Compute sums of n^j e^{-i theta n} as polynomials in cot(theta / 2), by j and power."""
     number = DERIVATIVES + 2
     sums = np.zeros((DERIVATIVES + 1, number), complex)
     sums[0, :2] = 0.5, -0.5j

@@ -492,7 +492,11 @@ def resolved_bound(view: View, used: Sequence[bool] | np.ndarray | None = None) 
     Cramer and Rao in white noise, and what the laser's phase adds; looks tell independently.
     """
     shots, i = view.shots, view.i
-    rate, looks, laser = float(shots.sample_rate[i]), math.sqrt(shots.looks.number), _laser(shots, i)
+    rate, looks, laser = (
+        float(shots.sample_rate[i]),
+        math.sqrt(shots.looks.number),
+        _laser(shots, i),
+    )
     lengths = np.full(len(view.signals), shots.window.length)
     if shots.first_sample is not None:
         lengths = np.maximum(lengths - shots.first_sample[:, i], 2)

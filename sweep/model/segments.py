@@ -394,10 +394,14 @@ def _no_shape(window: Window, fft_size: int, power: bool, segments: int) -> Shap
     return line_shape.whole_shapes(window, fft_size, power, phase, first)
 
 
-def _sorted(part: np.ndarray, which: np.ndarray, shapes: Shapes, *modes: np.ndarray) -> Together:
+def _sorted(
+    part: np.ndarray, which: np.ndarray, shapes: Shapes, centre: np.ndarray, modes: np.ndarray,
+    number: np.ndarray,
+) -> Together:  # fmt: skip
     """Points by their shapes, so that each of these is made once."""
     order = np.argsort(which, kind="stable")
-    return Together(part[order], which[order], shapes, *map(np.ascontiguousarray, modes))
+    parts = map(np.ascontiguousarray, (centre, modes, number))
+    return Together(part[order], which[order], shapes, next(parts), next(parts), next(parts))
 
 
 def _different(shots: Shots, some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

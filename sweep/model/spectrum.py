@@ -71,6 +71,7 @@ MOST_CELLS = WINDOW * CELLS[1] + POINTS + SPARE_CELLS
 BESIDE = WINDOW + EDGE + 1
 """Bins by which tables may hold less about a line than on either side of a cell."""
 
+
 @njit(cache=True, error_model="numpy")
 def add_near(first, count, lines, table, sizes, room):
     """Add n lines to F in bins ``first`` .. where their shape's table holds these.

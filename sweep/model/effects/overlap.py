@@ -1,8 +1,8 @@
 """Overlap: the echo exists from its delay on and until the chirp ends, within its segment.
 
-A record of L samples begins at the acquisition delay t_0. The laser's chirp, sent from 0 to T, comes
-back from tau = 2 R / c on, and beats with the chirp that is being sent until this ends. So the
-sample at t holds an echo where
+A record of L samples begins at the acquisition delay t_0. The laser's chirp, sent from 0 to T,
+comes back from tau = 2 R / c on, and beats with the chirp that is being sent until this ends. So
+the sample at t holds an echo where
 
     tau(t) = tau_0 - beta t <= t <= T.
 
@@ -16,9 +16,10 @@ The line shape is that of the samples that the echo has, with what the window is
 
     G(y) = sum_{n >= n_0} w_n exp(-2 pi i y n / N),    n_0 = ceil((tau_0 / (1 + beta) - t_0) f_s).
 
-For a cosine sum this is a sum of partial Dirichlet kernels; :mod:`sweep.model.line_shape` has it for
-all phase errors. The peak falls by the window's share before n_0 (by 1 - n_0 / L in amplitude for a
-rectangular window), its width grows, and its sidelobes fall as 1/y, as the echo begins with a step.
+For a cosine sum this is a sum of partial Dirichlet kernels; :mod:`sweep.model.line_shape` has it
+for all phase errors. The peak falls by the window's share before n_0 (to 1 - n_0 / L of its
+amplitude for a rectangular window), its width grows, and its sidelobes fall as 1/y, as the echo
+begins with a step.
 [T] takes chirps to be far longer than delays, where records that begin at 0 are whole
 (``overlap: off``).
 

@@ -256,9 +256,9 @@ def drift_time(shots: Shots) -> np.ndarray:
 
 @lru_cache(maxsize=8)
 def _slope_of_square(window: Window) -> np.ndarray:
-    """Slope of the best line to x^2 over the places x = -1..1 of the samples from each on, (L + 1,).
+    """Slope of the best line to x^2 over the samples from each on, (L + 1,), under the window.
 
-    Under the window; 0 for all samples.
+    The places x of all samples are -1..1, whose slope is 0.
     """
     x = 2 * np.arange(window.length) / window.length - 1
     powers = (window.samples() * x**k for k in range(4))

@@ -218,9 +218,7 @@ def remainders(sizes: Mapping[str, Size], points: Points) -> dict[str, np.ndarra
     slope = steep * np.exp(-0.5 * (at - b) ** 2)
     small = np.minimum(high, 1.0)
     return {
-        name: np.minimum(
-            np.maximum(_sum(share * slope, points), _most(share * small, points)), 1.0
-        )
+        name: np.minimum(np.maximum(_sum(share * slope, points), _most(share * small, points)), 1.0)
         for name, share in left.items()
     }
 
