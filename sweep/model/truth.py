@@ -5,8 +5,8 @@ sample; the records add up, are windowed and transformed. Every fast path is hel
 It shares the link budget, the noise and the footprint with the fast path, and nothing of lines,
 kernels or bins. Seconds a shot; its own floor, from rounding f t, is 1e-11 of the peak.
 
-Where shots have the effect of overlap, a beamlet's echo exists in samples from its own delay tau(t)
-on, and until the chirp ends.
+With the effect of overlap a beamlet's echo exists in samples from its own delay tau(t) on, and until
+the chirp ends.
 """
 
 from fractions import Fraction

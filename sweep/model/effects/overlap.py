@@ -8,30 +8,28 @@ the sample at t holds an echo where
 
 Records end by T, so that what may lack are the first samples, up to all of them: those before
 t = tau_0 / (1 + beta). They hold noise alone. The window and its sum, the noise of bins and the
-threshold are those of the whole record. What lights the ground before, as the chirp of the segment
-before this one, beats at frequencies that sweep through the receiver's band in nanoseconds; nothing
-is counted of it.
+threshold are those of the whole record. Before tau the ground still sends back the segment before
+this one. Its beat sweeps through the receiver's band in nanoseconds, and is left out.
 
 The line shape is that of the samples that the echo has, with what the window is there:
 
     G(y) = sum_{n >= n_0} w_n exp(-2 pi i y n / N),    n_0 = ceil((tau_0 / (1 + beta) - t_0) f_s).
 
-For a cosine sum this is a sum of partial Dirichlet kernels; :mod:`sweep.model.line_shape` has it
-for all phase errors. The peak falls by the window's share before n_0 (to 1 - n_0 / L of its
-amplitude for a rectangular window), its width grows, and its sidelobes fall as 1/y, as the echo
-begins with a step.
-[T] takes chirps to be far longer than delays, where records that begin at 0 are whole
-(``overlap: off``).
+For a cosine sum this is a sum of partial Dirichlet kernels. :mod:`sweep.model.line_shape` has it
+for all phase errors. The peak falls by the window's share before n_0: for a rectangular window to
+1 - n_0 / L of its amplitude. The line grows wider, and its sidelobes fall as 1/y, as the echo
+begins with a step. [T] takes chirps to be far longer than delays, where records that begin at 0 are
+whole (``overlap: off``).
 
-One n_0 serves all lines of a footprint's segment, that of the beam's axis. A beamlet that is d
-farther away has 2 d f_s / c samples fewer. That is left out; :func:`left` bounds it, and it is
-part of what a point's effects leave out (``effects_error``).
+One n_0 serves all lines of a footprint's segment: that of the beam's axis. A beamlet that is d
+farther away has 2 d f_s / c samples fewer. This is left out, and :func:`left` bounds it. It counts
+in what a point's effects leave out (``effects_error``).
 
-Size: with c the largest bin's magnitude over that of all lines on a bin, and b the share of
-sum |w| in the samples that lack, no bin changes by more than b, and the largest by b / c of itself.
-The planner takes the sidelobes of leakage and images to be those of the window and those of a
-rectangular one times the step at n_0. Where no sample has an echo, nothing is detected, while a bin
-without signal crosses as noise does: the effect is always kept there.
+Size: c is the largest bin's magnitude over that of all lines on a bin, and b the share of sum |w|
+in the samples that lack. No bin changes by more than b, and so the largest by b / c of itself at
+most. The planner takes sidelobes of leakage and images to be those of the window, and those of a
+rectangular one times the step at n_0. If no sample has an echo nothing is detected, while a bin
+without signal crosses as noise does: there the effect is always kept.
 
 Checks: :mod:`sweep.model.truth` gates each sample of each beamlet by its own delay.
 """
