@@ -5,7 +5,7 @@ sample; the records add up, are windowed and transformed. Every fast path is hel
 It shares the link budget, the noise and the footprint with the fast path, and nothing of lines,
 kernels or bins. Seconds a shot; its own floor, from rounding f t, is 1e-11 of the peak.
 
-With the effect of overlap a beamlet's echo exists in samples from its own delay tau(t) on, and until
+With the effect of overlap a beamlet has an echo in samples from its own delay tau(t) on, and until
 the chirp ends.
 """
 

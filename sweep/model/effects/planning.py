@@ -45,15 +45,18 @@ class Plan(NamedTuple):
     change: np.ndarray
     """(effects, tiles): largest change that it may make, 0..1."""
     error: np.ndarray
-    """(tiles,): sum of what is left out may change, and of what effects that are simulated leave
-    out; above the tolerance only by these, and by what is off."""
+    """(tiles,): sum of what is left out may change, and :attr:`left`; above the tolerance only by
+    this, and by what is off."""
+    left: np.ndarray
+    """(tiles,): change by what effects that are simulated leave out."""
     all_kept: np.ndarray
     """(tiles,) bool: whether nothing is left out that any mode leaves a choice about."""
 
     def some(self, tiles: np.ndarray) -> "Plan":
         """Of some of the tiles, by a mask."""
         kept, change = self.kept[:, tiles], self.change[:, tiles]
-        return Plan(self.names, kept, change, self.error[tiles], self.all_kept[tiles])
+        error, left = self.error[tiles], self.left[tiles]
+        return Plan(self.names, kept, change, error, left, self.all_kept[tiles])
 
 
 def plan(
@@ -88,11 +91,11 @@ def plan(
     number = max((value.size for value in found.values()), default=1)
     change = np.array([found.get(name, np.zeros(number)) for name in names])
     kept = _kept(change, there, effects, decided, tolerance)
-    error = np.where(kept, 0.0, change).sum(axis=0)
+    error, left = np.where(kept, 0.0, change).sum(axis=0), np.zeros(number)
     for name, value in remain.items():
-        error = error + np.where(kept[names.index(name)], value, 0.0)
+        left = left + np.where(kept[names.index(name)], value, 0.0)
     choice = there & np.array([name not in decided for name in names])
-    return Plan(names, kept, change, error, kept[choice].all(axis=0))
+    return Plan(names, kept, change, error + left, left, kept[choice].all(axis=0))
 
 
 def sizes_of(points: Points, effects: Sequence[Effect] = EFFECTS) -> dict[str, Size]:
