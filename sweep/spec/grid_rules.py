@@ -205,14 +205,17 @@ def _time_findings(grid: Grid) -> Iterator[Finding]:
     A grid some points of which have no echo is simulated: nothing is detected there.
     """
     late = _least_late(grid)
-    if late is not None and late >= 0:
+    if late is not None and late.chirp >= 0:
+        rule = "must exceed the echo's delay 2R/c, and falls short by "
+        rule += f"{late.chirp:.6g} s at its best"
+        yield grid.finding(DURATION, rule, "shorten the range or lengthen the chirp")
+        return
+    if late is not None and late.record >= 0:
         rule = (
-            "must exceed the echo's delay 2R/c, and so must the end of the record (the acquisition "
-            "delay and fft_size samples) anywhere on the grid: the earliest echo arrives "
-            f"{late:.6g} s after its record has ended"
+            "must let records of fft_size samples last until an echo arrives, and the whole grid's "
+            f"end {late.record:.6g} s or more before the echo's delay 2R/c"
         )
-        remedy = "shorten the range, lengthen the chirp, or raise the acquisition delay or fft_size"
-        yield grid.finding(DURATION, rule, remedy)
+        yield grid.finding(DELAY, rule, "raise it to the delay of the farthest echo, or fft_size")
         return
     samples = _fewest_samples(grid)
     if samples is not None and np.floor(samples + 1e-6) < 2:
@@ -220,26 +223,35 @@ def _time_findings(grid: Grid) -> Iterator[Finding]:
         yield grid.finding(DURATION, rule, "raise the sample rate or lengthen the chirp")
 
 
-def _least_late(grid: Grid) -> float | None:
-    """Least time [s] from a record's end to its echo's arrival; None where it can't be told."""
+class _Late(NamedTuple):
+    """Least time [s] over a grid from an end to the echo's arrival; negative if that is before."""
+
+    chirp: float
+    """From the chirp's end."""
+    record: float
+    """From the record's end, where that matters; else from the chirp's."""
+
+
+def _least_late(grid: Grid) -> _Late | None:
+    """Find how late the earliest echo arrives; None where it can't be told."""
     if not grid.knows(*ECHO_TIMES):
         return None
-    shapes = [axis.size for axis in grid.axes]
     values: dict[str, np.ndarray] = {
         path: np.asarray(grid.values[path], float) for path in ECHO_TIMES if path in grid.values
     }
     size = 1
     for number, axis in enumerate(grid.axes):
-        shape = [-1 if k == number else 1 for k in range(len(shapes))]
+        shape = [-1 if k == number else 1 for k in range(len(grid.axes))]
         own = {m.path: m for m in axis.members if m.path in ECHO_TIMES}
         size *= axis.size if own else 1
         values |= {p: np.asarray(m.values, float).reshape(shape) for p, m in own.items()}
     if size > _POINTS_MAX:
         return None
-    end = values[DURATION]
+    end, delay = values[DURATION], 2 / SPEED_OF_LIGHT * values[RANGE]
+    of_chirp = float(np.min(delay - end))
     if grid.modes.get("overlap") != OFF:
         end = np.minimum(values[DELAY] + values[FFT_SIZE] / values[SAMPLE_RATE], end)
-    return float(np.min(2 / SPEED_OF_LIGHT * values[RANGE] - end))
+    return _Late(of_chirp, float(np.min(delay - end)))
 
 
 def _fewest_samples(grid: Grid) -> float | None:

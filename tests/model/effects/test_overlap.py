@@ -339,7 +339,7 @@ def test_range_walk_is_put_right_for_the_part_of_the_record_that_the_echo_has(ta
 
 @pytest.mark.parametrize("record", ["real", "complex"])
 def test_beats_that_fold_are_flagged_as_misread(table_4_1, record):
-    """Up to 22.5 km beats of Table 4.1 lie within half the sample rate, or all of it with I/Q."""
+    """Beats of Table 4.1 lie within half the sample rate up to 22.5 km."""
     ranges = np.linspace(1e3, 60e3, 60)
     scene = table_4_1(range=ranges, radial_velocity=0.0, beamlets=1, duration=500e-6)
     scene |= {RECORD: record, "footprint.speckle": "none"}
