@@ -58,14 +58,17 @@ def size(points: Points) -> Size | None:
     least = points.powers[0] / np.where(points.near_image, 2.0, 1.01) / (1 + points.smear.reach)
     c = _IMAGE * np.sqrt(least) - besides
     magnitude = np.where(late.lost > 0, np.where(c > 0, late.lost / c, np.inf), 0.0)
-    more, gone = left(points), late.all.any(axis=0).astype(float)
+    each, gone = left(points), late.all.any(axis=0).astype(float)
+    remain = {"left": np.minimum(2 * each, 1.0), "left_of_all": each * points.footprint.gain}
     if not points.may_add:
-        more = np.where(c > late.lost, more / (c - late.lost), more)
-        return Size(magnitude=magnitude, chance=gone, left=more)
+        lone = points.lobe.near(points.offset) - late.lost  # powers: each line by its own share
+        own = np.where(lone > 0, np.minimum(each / np.maximum(lone, 1e-300), 1.0), 1.0)
+        remain["left"] = np.where(each > 0, own, 0.0)
+        return Size(magnitude=magnitude, chance=gone, **remain)
     alone = np.where(points.may_cancel, 0.0, magnitude)
     whole = np.where(points.may_cancel, 2 * late.lost / points.lobe.worst, points.image)
     added = np.where(late.lost > 0, whole, 0.0)
-    return Size(magnitude=alone, added=added, chance=gone, left=2 * more)
+    return Size(magnitude=alone, added=added, chance=gone, **remain)
 
 
 def left(points: Points) -> np.ndarray:

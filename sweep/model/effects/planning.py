@@ -218,12 +218,15 @@ def remainders(sizes: Mapping[str, Size], points: Points) -> dict[str, np.ndarra
     b = points.looks.scaled(points.threshold)
     at = np.minimum(np.maximum(0.5 * (b + np.sqrt(b * b + 2)), low), high)
     steep = np.sqrt(at * points.looks.sharper * points.threshold / (2 * math.pi))
-    slope = steep * np.exp(-0.5 * (at - b) ** 2)
-    small = np.minimum(high, 1.0)
-    return {
-        name: np.minimum(np.maximum(_sum(share * slope, points), _most(share * small, points)), 1.0)
-        for name, share in left.items()
-    }
+    near = np.exp(-0.5 * (at - b) ** 2)
+    found = {}
+    for name, share in left.items():
+        # of itself, and of the magnitude that all lines make together in a whole record
+        more = sizes[name].left_of_all * points.level * points.looks.sharper
+        total = np.minimum(share * steep, 0.5 * more) * near
+        most = np.minimum(share * np.minimum(high, 1.0), more / np.maximum(low, 1.0))
+        found[name] = np.minimum(np.maximum(_sum(total, points), _most(most, points)), 1.0)
+    return found
 
 
 def plausible(sizes: Mapping[str, Size], points: Points) -> tuple[np.ndarray, np.ndarray]:
