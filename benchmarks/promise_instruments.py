@@ -45,7 +45,7 @@ class Off(NamedTuple):
     leakage: np.ndarray
     """Of either chirp, where it is asked for; else nan."""
     told: np.ndarray
-    """What is said to be left out."""
+    """Bound on what effects that are left out may change."""
 
 
 def studies(number: int, rng: np.random.Generator) -> Iterator[dict[str, Any]]:
@@ -59,7 +59,8 @@ def studies(number: int, rng: np.random.Generator) -> Iterator[dict[str, Any]]:
     ]
     sizes = {window: f"2^{rng.integers(10, 15)}" for window in WINDOWS}
     for window, phases, beamlets, asked in kinds:
-        points = [_point(rng, asked) for _ in range(-(-number // len(kinds)))]
+        size = 2 ** int(sizes[window].removeprefix("2^"))
+        points = [_point(rng, asked, size) for _ in range(-(-number // len(kinds)))]
         yield {
             "title": f"{window} {phases} {beamlets} {asked}",
             "instrument": {
@@ -76,8 +77,11 @@ def studies(number: int, rng: np.random.Generator) -> Iterator[dict[str, Any]]:
         }  # fmt: skip
 
 
-def _point(rng: np.random.Generator, asked: str) -> dict[str, str]:
-    """An instrument and a target; sizes of effects over many decades, some of them 0."""
+def _point(rng: np.random.Generator, asked: str, fft_size: int) -> dict[str, str]:
+    """An instrument and a target; sizes of effects over many decades, some of them 0.
+
+    Echoes arrive before the record, within it, or rarely after it.
+    """
 
     def some(low: float, high: float) -> float:
         """Log-uniform between two powers of ten, of either sign, or 0."""
@@ -91,8 +95,11 @@ def _point(rng: np.random.Generator, asked: str) -> dict[str, str]:
     beat = abs(edge + rng.uniform(-1, 1) * NEAR * SAMPLE_RATE / 2**13)
     distance = (beat + sign * 2 * velocity / wavelength) * LIGHT / (2 * slope)
     distance = max(abs(float(distance)), 2.0)
-    delay = 2 * distance / LIGHT
+    delay, record = 2 * distance / LIGHT, fft_size / SAMPLE_RATE
+    late = record * rng.choice([0.0, 10 ** rng.uniform(-5, 0), rng.uniform(0, 1)])
+    start = float(np.clip(delay - late, 0.0, duration - record))
     found = {
+        "instrument.processing.acquisition_delay": f"{start!r} s",
         "instrument.chirp.bandwidth": f"{bandwidth!r} Hz",
         "instrument.chirp.duration": f"{duration!r} s",
         "instrument.laser.power": f"{10 ** rng.uniform(-4.5, 0)!r} W",
@@ -142,7 +149,8 @@ def off(written: dict[str, Any], tolerances: tuple[float, ...] = TOLERANCES) -> 
         most = effects_tolerance(parameters | {"accuracy.tolerance": tolerance}, number)
         made = plan(points, each, spec.modes(), most)
         own = found(tolerance, flags_of(made.kept & there))
-        rows.append(_apart(own, exact, made.error, "leakage" in written["effects"]))
+        told = made.error - made.left
+        rows.append(_apart(own, exact, told, "leakage" in written["effects"]))
     return rows
 
 

@@ -101,7 +101,9 @@ def shape_of(window, fft_size, *, power=False, phase=None, view=IMAGED):
         centre, modes = np.zeros((1, 1)), np.zeros((1, 1, 2, most))
         count = np.zeros((1, 1), np.int64)
         at = phase(line_shape.record_places(2 * most))[None, None]
-        line_shape.find_modes(at, line_shape.to_modes(2 * most), centre, modes, count)
+        line_shape.find_modes(
+            at, np.empty((0, 0, 0)), line_shape.to_modes(2 * most), centre, modes, count
+        )
         number = int(count[0, 0])
         if number:
             shapes = line_shape.shapes(window, fft_size, power, tier)

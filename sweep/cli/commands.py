@@ -39,6 +39,7 @@ from sweep.cli.terminal import (
     tell_inconsistencies,
     warn_before,
     warn_of,
+    warn_of_echoes,
 )
 from sweep.messages import PrintableStream, as_command
 from sweep.storage.locations import Location
@@ -261,6 +262,7 @@ def plan(spec: Path, workers: int | None) -> None:
         click.echo(folded(f"{name:>12}  {text}", 2 + len(name)))
     tell_effects(effects)
     warn_of(study)
+    warn_of_echoes(study, _default_store(spec))
 
 
 @main.command()

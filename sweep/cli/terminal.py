@@ -659,9 +659,19 @@ def fewer_alarms(study: Spec | SceneSpec) -> str:
     return " and ".join(told)
 
 
+def warn_of_echoes(study: Spec | SceneSpec, store: Location) -> None:
+    """Warn of echoes that arrive after their record, and of those that are read as others."""
+    from sweep.tasks.echoes import warnings_of
+    from sweep.tasks.studies import study_of
+
+    for warning in warnings_of(study_of(study, store.absolute())):
+        tell(f"warning: {warning}", err=True)
+
+
 def warn_before(study: Spec | SceneSpec, store: Location) -> None:
-    """Before a run: what :func:`warn_of` has, and effects forced off that matter."""
+    """Before a run: what :func:`warn_of` has, echoes that lack, and effects off that matter."""
     warn_of(study)
+    warn_of_echoes(study, store)
     if "off" in study.modes().values():
         warn(effects_of(study, store, costs=False))
 

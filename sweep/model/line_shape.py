@@ -23,6 +23,13 @@ A phase error is taken apart into a shift of the line, by its mean slope, and fe
 exp(2 pi i psi) = sum_j a_j T_j(x). All of the above is linear in a_j, so each shape is a sum over
 modes of tables that are made once for a window. Phases that need too many modes, windows that are
 no sum of cosines, and short or much padded records have a table of all bins, by one FFT.
+
+An echo that arrives after the record has begun has the last L' of its samples. They are a record of
+their own, with a window that is the rest of the whole one. In the place x' = -1 .. 1 within it,
+w exp(2 pi i psi) is smooth and has few Chebyshev modes, each with a transform that depends on the
+product of y and L' alone. These are tabulated once for all windows and lengths; a shape is their
+sum, interpolated at its own places. Its far sidelobes fall as 1/y, as its window begins with a step
+(:func:`build_part`).
 """
 
 import math
@@ -31,6 +38,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+from numpy.polynomial.chebyshev import cheb2poly, chebfit
 from scipy.special import i0
 
 from sweep.kernels import njit
@@ -80,6 +88,36 @@ _MARGIN = 1.05
 _BEYOND = TAPS.size - 1
 """Cells on either side of a table that its filter looks at."""
 
+KERNEL_DEGREE = 13
+
+SPARE_CELLS = 2
+"""Cells of no weight beyond those among which a line is shared out, for whole vectors."""
+
+PART_STEP = math.sqrt(2.0)
+"""Most to least samples of the echoes whose shapes share a table's width."""
+
+_PART_SAMPLES_PER_BIN = 16
+"""Least samples of an echo to the bins of fs/L' in its table: sums over it are then integrals and
+six of Euler and Maclaurin's corrections."""
+
+_PART_BESIDE = 16
+"""Bins of fs/L' by which the table of such an echo holds more than those that its ends do not tell:
+as many as lines that are shared out together need."""
+
+_PART_PADDED_MAX = 16
+"""Most padding N/L' of an echo whose shape is made of modes."""
+
+_PART_CELLS = 2
+"""Tabulated values in a bin of fs/L'."""
+
+EULER_MACLAURIN = {
+    1: 1 / 12, 3: -1 / 720, 5: 1 / 30240, 7: -1 / 1209600, 9: 1 / 47900160,
+    11: -691 / 1307674368000,
+}  # fmt: skip
+"""B_(m+1) / (m+1)! by the order m of the derivatives at the ends."""
+
+_ORDER_MAX = max(EULER_MACLAURIN)
+
 
 class Shapes(NamedTuple):
     """Line shapes of one window and FFT, as the compiled code takes them; see `segments`."""
@@ -101,7 +139,16 @@ class Shapes(NamedTuple):
     """(segments, 2, cells * columns): tables that hold all bins; else empty."""
     outlines: np.ndarray
     """(segments, 2, m): their envelopes, as of :func:`build`; else empty."""
+    lengths: np.ndarray
+    """(segments, shapes) int64: samples of the record that the echo has, where these are not all
+    and shapes are made of modes; else empty. ``modes`` then are transforms over u = -U .. U, in
+    steps of half a bin of fs/L', with the kernel divided out."""
+    taylor: np.ndarray
+    """(modes, DERIVATIVES + 1): Taylor's coefficients of such modes at x = 1; else empty."""
 
+
+_ALL_SAMPLES = np.empty((0, 0), np.int64), np.empty((0, 0))
+"""Of shapes of echoes that have all samples of the record."""
 
 _gauss_legendre = lru_cache(maxsize=8)(np.polynomial.legendre.leggauss)
 
@@ -129,7 +176,67 @@ def shapes(window: Window, fft_size: int, power: bool, tier: int, *, shared: boo
         modes, edges = (np.hstack([one, _in_table(one, CELLS[power])]) for one in (modes, edges))
     sizes = [fft_size, length, bins, CELLS[power], power, False, math.ceil(clear / ratio)]
     ends, reach, none = _ends(taylor, length), _distances(bins, fft_size), np.empty((0, 2, 0))
-    return Shapes(np.array(sizes), modes, edges, ends, reach, none, none)
+    return Shapes(np.array(sizes), modes, edges, ends, reach, none, none, *_ALL_SAMPLES)
+
+
+def part_class(window: Window, least: np.ndarray) -> np.ndarray:
+    """Count the :data:`PART_STEP` by which the least of an echo's samples falls short of all."""
+    ratio = window.length / np.maximum(least, 1)
+    return np.ceil(np.log(ratio) / math.log(PART_STEP) - 1e-9).astype(np.int64)
+
+
+def part_has_modes(
+    window: Window, fft_size: int, tier: int, least: np.ndarray, largest: np.ndarray
+) -> np.ndarray:
+    """Return true for echoes of some samples whose shapes may be made of modes, (n,).
+
+    ``least`` and ``largest`` are the samples of the segments that have fewest and most.
+    """
+    if window.name not in COSINE_SUMS:
+        return np.zeros(least.shape, np.bool_)
+    held = TIERS[tier][1] + _PART_BESIDE
+    enough = (least >= _PART_SAMPLES_PER_BIN * held) & (least * _PART_PADDED_MAX >= fft_size)
+    widest = window.length * PART_STEP ** (1.0 - part_class(window, least))
+    return np.asarray(enough & (largest <= 1.01 * widest))
+
+
+def part_window(window: Window, x: np.ndarray, length: np.ndarray) -> np.ndarray:
+    """Window at places x, -1 .. 1, of the last ``length`` samples of the record, (*length, x)."""
+    share = np.asarray(length)[..., None] / window.length
+    place = 1.0 - share * (1.0 - x)
+    cosines = [float(c) for c in COSINE_SUMS[window.name]]
+    return np.asarray(sum(c * np.cos(np.pi * m * place) for m, c in enumerate(cosines)))
+
+
+@lru_cache(maxsize=48)
+def part_shapes(window: Window, fft_size: int, power: bool, tier: int, step: int) -> Shapes:
+    """Prepare the tables for echoes that have part of a record's samples, of a class of them."""
+    clear = TIERS[tier][1]
+    beside = clear + _PART_BESIDE
+    least = window.length * PART_STEP ** (-float(step)) / fft_size
+    bins = math.ceil(beside / least)
+    sizes = [fft_size, window.length, bins, CELLS[power], power, False, math.ceil(clear / least)]
+    modes, taylor = _part_modes(tier)
+    none, no_ends = np.empty((0, 2, 0)), np.empty((0, 4, 1))
+    reach = _distances(bins, fft_size)
+    return Shapes(
+        np.array(sizes), modes, np.empty((2, 0)), no_ends, reach, none, none,
+        np.empty((0, 0), np.int64), taylor,
+    )  # fmt: skip
+
+
+@lru_cache(maxsize=len(TIERS))
+def _part_modes(tier: int) -> tuple[np.ndarray, np.ndarray]:
+    """Half the integrals of T_j(x) exp(-i pi u x) with the kernel divided out; their Taylor."""
+    number, clear, _ = TIERS[tier]
+    half = math.ceil((1.02 * PART_STEP * (clear + _PART_BESIDE) + 14) * _PART_CELLS + POINTS)
+    u = np.arange(-half, half + 1) / _PART_CELLS
+    order = 4 * ((math.ceil(math.pi * u[-1]) + number) // 4) + 96
+    x, weight = _gauss_legendre(order)
+    strength = np.cos(np.outer(np.arange(number), np.arccos(x))) * weight / 2
+    return _integrals(strength / kernel_transform(np.pi / _PART_CELLS * x), x, u), _taylor(
+        ("1",), number
+    )
 
 
 def has_modes(window: Window, fft_size: int) -> bool:
@@ -138,8 +245,13 @@ def has_modes(window: Window, fft_size: int) -> bool:
     return long and window.name in COSINE_SUMS
 
 
-def whole_shapes(window: Window, fft_size: int, power: bool, phase: np.ndarray) -> Shapes:
-    """Shapes that have tables of all bins, of phase errors [cycles] by segment, (segments, L)."""
+def whole_shapes(
+    window: Window, fft_size: int, power: bool, phase: np.ndarray, first: np.ndarray | None = None
+) -> Shapes:
+    """Shapes that have tables of all bins, of phase errors [cycles] by segment, (segments, L).
+
+    ``first`` (segments,) is the first sample that the echo has, by default 0.
+    """
     cells, half, length = CELLS[power], fft_size // 2, window.length
     number = cells * fft_size
     place = (np.arange(fft_size) - half) * cells - np.arange(cells)[:, None]
@@ -148,8 +260,10 @@ def whole_shapes(window: Window, fft_size: int, power: bool, phase: np.ndarray) 
     reach = _distances(half, fft_size)
     outlines = np.zeros((len(phase), 2, reach.shape[1]))
     w, x = samples(window.name, length), 2 * np.arange(length) / length - 1
-    for table, outline, psi in zip(whole, outlines, phase, strict=True):
+    begins = np.zeros(len(phase), np.int64) if first is None else first
+    for table, outline, psi, begin in zip(whole, outlines, phase, begins, strict=True):
         record = w * np.exp(2j * np.pi * (psi - np.rint(psi)))
+        record[:begin] = 0.0
         square = np.abs(np.fft.fft(record, number)) ** 2
         _outline_of_all(square, cells, outline)
         if power:
@@ -163,7 +277,7 @@ def whole_shapes(window: Window, fft_size: int, power: bool, phase: np.ndarray) 
             table[0], table[1] = found.real, found.imag
     sizes = np.array([fft_size, length, half, cells, power, True, half])
     none = np.empty((0, 0)), np.empty((2, 0)), np.empty((0, 4, 1))
-    return Shapes(sizes, *none, reach, whole, outlines)
+    return Shapes(sizes, *none, reach, whole, outlines, *_ALL_SAMPLES)
 
 
 def _outline_of_all(square: np.ndarray, cells: int, outline: np.ndarray) -> None:
@@ -183,6 +297,16 @@ def kernel(z: np.ndarray) -> np.ndarray:
     """Evaluate the kernel that shares lines out among cells, at z cells, |z| <= POINTS / 2."""
     root = np.sqrt(np.maximum(1 - (2 * z / POINTS) ** 2, 0.0))
     return np.asarray(i0(WIDEN * root) / i0(WIDEN))
+
+
+_s = np.cos(np.pi * (np.arange(KERNEL_DEGREE + 1) + 0.5) / (KERNEL_DEGREE + 1))
+KERNEL_BASIS = np.zeros((KERNEL_DEGREE + 1, POINTS + SPARE_CELLS))
+"""Polynomials of the kernel, by power of s = -1 .. 1 across a cell and by cell."""
+
+for _j in range(POINTS):
+    KERNEL_BASIS[:, _j] = cheb2poly(
+        chebfit(_s, kernel((_s + 1) / 2 - _j + POINTS // 2 - 1), KERNEL_DEGREE)
+    )
 
 
 def kernel_transform(theta: np.ndarray) -> np.ndarray:
@@ -285,15 +409,32 @@ def _corrections(taylor: np.ndarray, y: np.ndarray, length: int) -> np.ndarray:
     return np.where(parity > 0, found.real, found.imag)
 
 
-def _ends(taylor: np.ndarray, length: int) -> np.ndarray:
-    """Polynomials A and B of modes, (modes, 4, DERIVATIVES + 2)."""
+def _sums_of_powers() -> np.ndarray:
+    """Compute sums of n^j e^{-i theta n} as polynomials in cot(theta / 2), by j and power."""
     number = DERIVATIVES + 2
-    sums = np.zeros((DERIVATIVES + 1, number), complex)  # of n^j e^{-i theta n} in cot(theta / 2)
+    sums = np.zeros((DERIVATIVES + 1, number), complex)
     sums[0, :2] = 0.5, -0.5j
     for j in range(DERIVATIVES):
         slope = sums[j, 1:] * np.arange(1, number)
         sums[j + 1, : number - 1] -= 0.5j * slope
         sums[j + 1, 2:] -= 0.5j * slope[: number - 2]
+    return sums
+
+
+_SUMS = _sums_of_powers()
+_SUMS_RE, _SUMS_IM = np.ascontiguousarray(_SUMS.real), np.ascontiguousarray(_SUMS.imag)
+
+_CORRECTIONS = np.zeros((_ORDER_MAX + 1, _ORDER_MAX + 1))
+"""Factors of Taylor's coefficients i at an end in the power d of -i theta of its correction."""
+
+for _m, _share in EULER_MACLAURIN.items():
+    for _i in range(_m + 1):
+        _CORRECTIONS[_m - _i, _i] += _share * math.comb(_m, _i) * math.factorial(_i)
+
+
+def _ends(taylor: np.ndarray, length: int) -> np.ndarray:
+    """Polynomials A and B of modes, (modes, 4, DERIVATIVES + 2)."""
+    sums = _SUMS
     step = (2 / length) ** np.arange(DERIVATIVES + 1)
     last = ((taylor * step)[:, :, None] * sums).sum(axis=1)
     parity = (-1.0) ** (np.arange(len(taylor))[:, None] + np.arange(DERIVATIVES + 1))
@@ -302,10 +443,11 @@ def _ends(taylor: np.ndarray, length: int) -> np.ndarray:
 
 
 @njit(cache=True, error_model="numpy")
-def find_modes(phase, matrix, centre, found, number):
-    """Take phase errors apart.
+def find_modes(phase, weight, matrix, centre, found, number):
+    """Take phase errors, and a window beside them, apart.
 
-    ``phase`` (segments, n, nodes) [cycles] is at :func:`record_places`, ``matrix`` is
+    ``phase`` (segments, n, nodes) [cycles] is at :func:`record_places`, and so is the window
+    ``weight``, of the same shape or empty where it is not among the modes; ``matrix`` is
     :func:`to_modes`. Results: ``centre`` (segments, n), shift of the line [bins of fs/L]. ``found``
     (segments, n, 2, >= nodes // 2), real and imaginary parts of the modes. ``number`` (segments,
     n), modes that count, 0 where half as many as there are nodes are too few.
@@ -323,6 +465,8 @@ def find_modes(phase, matrix, centre, found, number):
             for k in range(nodes):
                 place = 0.5 * nodes * matrix[k, 1]
                 sine, cosine = sincos_cycles(phase[s, i, k] - slope * place)
+                if weight.size:
+                    sine, cosine = sine * weight[s, i, k], cosine * weight[s, i, k]
                 for j in range(nodes):
                     one[j] += matrix[k, j] * cosine
                     other[j] += matrix[k, j] * sine
@@ -397,8 +541,121 @@ def build(segment, numbers, parts, shapes, table, form):
 
 
 @njit(cache=True, error_model="numpy")
+def same_part(segment, which, parts, lengths, segments):
+    """First segment before this one whose shape is the same, -1 for none; as of :func:`build`."""
+    number = parts[2][segment, which]
+    for s in range(segment):
+        if not segments[s] or lengths[s, which] != lengths[segment, which]:
+            continue
+        alike = parts[2][s, which] == number
+        for j in range(number):
+            alike &= parts[1][s, which, 0, j] == parts[1][segment, which, 0, j]
+            alike &= parts[1][s, which, 1, j] == parts[1][segment, which, 1, j]
+        if alike:
+            return s
+    return -1
+
+
+@njit(cache=True, error_model="numpy")
+def build_part(segment, which, parts, shapes, table, form):
+    """Build the shape of an echo that has the last ``sizes[1]`` samples of the record.
+
+    Arguments and results as of :func:`build`. With f = w exp(2 pi i psi) over these samples and
+    theta = 2 pi y / N,
+
+        G(y) = L'/2 int f(x) e^{-i pi r' y x} dx + (f(-1) e^{i pi r' y} - f(1) e^{-i pi r' y}) / 2
+               + sum_m B_{m+1} / (m+1)! [ d^m / dn^m (f e^{-i theta n}) ] at the ends,
+
+    whose derivatives are polynomials in theta.
+    """
+    sizes, modes, taylor, reach = shapes.sizes, shapes.modes, shapes.taylor, shapes.reach
+    re, im = parts[1][segment, which, 0], parts[1][segment, which, 1]
+    number, power = parts[2][segment, which], sizes[4] != 0
+    envelope, ends = form[1:3], form[3:7, : DERIVATIVES + 2]
+    half, step, ratio = 0.5 * sizes[1], 2.0 / sizes[1], sizes[1] / sizes[0]
+    series = np.zeros((2, modes.shape[1]))
+    first, last = np.zeros((2, DERIVATIVES + 1)), np.zeros((2, DERIVATIVES + 1))
+    for j in range(number):
+        a, b = re[j], im[j]
+        for i in range(DERIVATIVES + 1):
+            value = taylor[j, i]
+            sign = -1.0 if (i + j) & 1 else 1.0
+            last[0, i], last[1, i] = last[0, i] + a * value, last[1, i] + b * value
+            first[0, i] += sign * a * value
+            first[1, i] += sign * b * value
+        if j & 1:
+            a, b = -b, a
+        for i in range(modes.shape[1]):
+            series[0, i] += a * modes[j, i]
+            series[1, i] += b * modes[j, i]
+    scale = 1.0
+    for i in range(DERIVATIVES + 1):
+        for k in range(2):
+            first[k, i], last[k, i] = first[k, i] * scale, last[k, i] * scale
+        scale *= step
+    ends[:] = 0.0
+    for i in range(DERIVATIVES + 1):
+        for d in range(DERIVATIVES + 2):
+            p, q = _SUMS_RE[i, d], _SUMS_IM[i, d]
+            ends[0, d] += first[0, i] * p - first[1, i] * q
+            ends[1, d] += first[0, i] * q + first[1, i] * p
+            ends[2, d] += last[0, i] * p - last[1, i] * q
+            ends[3, d] += last[0, i] * q + last[1, i] * p
+    # Corrections of the two ends by power of theta: (-i)^d turns real and imaginary parts about.
+    at_ends = np.zeros((4, _ORDER_MAX + 1))
+    for d in range(_ORDER_MAX + 1):
+        a, b, c, e = 0.0, 0.0, 0.0, 0.0
+        for i in range(_ORDER_MAX + 1 - d):
+            factor = _CORRECTIONS[d, i]
+            a, b = a - factor * first[0, i], b - factor * first[1, i]
+            c, e = c + factor * last[0, i], e + factor * last[1, i]
+        if d == 0:  # the first sample counts whole, the end not at all
+            a, b = a + 0.5 * first[0, 0], b + 0.5 * first[1, 0]
+            c, e = c - 0.5 * last[0, 0], e - 0.5 * last[1, 0]
+        for _ in range(d % 4):
+            a, b, c, e = b, -a, e, -c
+        at_ends[0, d], at_ends[1, d], at_ends[2, d], at_ends[3, d] = a, b, c, e
+    cells, bins = sizes[3], sizes[2]
+    places = 2 * bins * cells + cells + 2 * _BEYOND
+    begin = -bins * cells - cells + 1 - _BEYOND
+    raw, weight = np.empty((2, places)), np.empty(POINTS + SPARE_CELLS)
+    middle = modes.shape[1] // 2
+    for i in range(places):
+        y = (begin + i) / cells
+        u = ratio * y
+        at = u * _PART_CELLS + middle
+        cell = math.floor(at)
+        s = 2.0 * (at - cell) - 1.0
+        weight[:] = KERNEL_BASIS[KERNEL_DEGREE]
+        for d in range(KERNEL_DEGREE - 1, -1, -1):
+            for j in range(POINTS + SPARE_CELLS):
+                weight[j] = weight[j] * s + KERNEL_BASIS[d, j]
+        x, z = 0.0, 0.0
+        start = np.uint64(cell - POINTS // 2 + 1)
+        for j in range(np.uint64(POINTS)):
+            x += weight[j] * series[0, start + j]
+            z += weight[j] * series[1, start + j]
+        theta = 2.0 * np.pi * y / sizes[0]
+        a, b, c, e = 0.0, 0.0, 0.0, 0.0
+        for d in range(_ORDER_MAX, -1, -1):
+            a, b = a * theta + at_ends[0, d], b * theta + at_ends[1, d]
+            c, e = c * theta + at_ends[2, d], e * theta + at_ends[3, d]
+        sine, cosine = sincos_cycles(0.5 * u)
+        raw[0, i] = 2.0 * half * x + (a * cosine - b * sine) + (c * cosine + e * sine)
+        raw[1, i] = 2.0 * half * z + (a * sine + b * cosine) + (e * cosine - c * sine)
+    if not power:
+        _put_table(raw[0], sizes, table[0])
+        _put_table(raw[1], sizes, table[1])
+    for i in range(places):
+        raw[0, i] = raw[0, i] * raw[0, i] + raw[1, i] * raw[1, i]
+    if power:
+        _put_table(raw[0], sizes, table[0])
+    _put_envelope(raw[0], ends, sizes, reach, envelope)
+
+
+@njit(cache=True, error_model="numpy")
 def _put_table(square, sizes, table):
-    """Powers at cells with the kernel divided out of them, in rows by cell of a bin."""
+    """Values at cells with the kernel divided out of them, in rows by cell of a bin."""
     cells, columns = sizes[3], 2 * sizes[2] + 1
     number = np.uint64(cells * columns)
     filtered = np.empty(cells * columns)

@@ -61,6 +61,7 @@ from sweep.model.philox import STREAM_LASER_PHASE, STREAM_RECORD, normals, unifo
 from sweep.model.preparation import Parameters, Shots
 from sweep.model.segments import whole_spectrum
 from sweep.model.shot import fit
+from sweep.model.window import last_part
 
 VALUES = ("pfa_bin", "false_alarms", "range", "radial_velocity", "range_2", "radial_velocity_2")
 """Values that are averaged over draws; the last two are squares of bounds."""
@@ -106,7 +107,10 @@ def signal_of(
     """
     magnitude = whole_spectrum(shots, i, segment)
     if (laser := _laser(shots, i))["line_width"] > 0:  # as it is before its phase walks
-        kept = seen_line(window=shots.window, looks=shots.looks.added, **laser)[0][0]
+        shape = shots.window
+        if shots.first_sample is not None:
+            shape = last_part(shape, int(shots.first_sample[0, i]))
+        kept = seen_line(window=shape, looks=shots.looks.added, **laser)[0][0]
         magnitude = magnitude / math.sqrt(kept)
     window, last = shots.window, magnitude.size - 1
     least = 0 if shots.real_ends or shots.complex_record else 1  # at DC and Nyquist taken as 0
@@ -121,15 +125,16 @@ def signal_of(
     total = (magnitude**2).sum()
     if not shots.complex_record:  # and as much at negative frequencies
         total = 2 * total - magnitude[0] ** 2 - magnitude[-1] ** 2
-    power = total / (shots.fft_size * window.energy)
+    power = total / (shots.fft_size * max(float(shots.echo_energy(segment)[i]), 1e-300))
     first, end = int(high[0]) - beside, int(high[-1]) + beside
     if not shots.complex_record:
         first, end = max(first, least), min(end, last - least)
-    phases = _tone_phases(place, shots)
+    begun = 0 if shots.first_sample is None else int(shots.first_sample[segment, i])
+    phases = _tone_phases(place, shots, begun)
     if high[-1] - high[0] > beside:  # wider than a tone: in step, as in one's main lobe
         apart = np.arange(first, end + 1) - k
         phases[(k + apart) % phases.size] = phases[k] * np.exp(
-            -1j * np.pi * apart * (window.length / shots.fft_size)
+            -1j * np.pi * apart * ((window.length + begun) / shots.fft_size)
         )
     if not is_searched(shots, segment, i, k - index_of_zero(shots)):
         first, end = 1, 0
@@ -142,7 +147,7 @@ def signal_of(
         for number, own in enumerate(echoes):
             if (own - first) % magnitude.size > end - first:
                 at = _between(shots, magnitude, int(own))
-                phases = np.where(echo == number, _tone_phases(at, shots), phases)
+                phases = np.where(echo == number, _tone_phases(at, shots, begun), phases)
     return Signal(
         spectrum=magnitude * phases,
         strongest=k,
@@ -187,11 +192,15 @@ def _between(shots: Shots, magnitude: np.ndarray, k: int) -> float:
     return k + sub_bin(below, magnitude[k], above, interpolator(shots.window, shots.fft_size))
 
 
-def _tone_phases(place: float, shots: Shots) -> np.ndarray:
-    """Phase factors of a lone tone at a place, by index; 1 where it vanishes."""
+def _tone_phases(place: float, shots: Shots, begun: int) -> np.ndarray:
+    """Phase factors of a lone tone at a place, by index; 1 where it vanishes.
+
+    It begins with sample ``begun`` of the record.
+    """
     size = shots.fft_size
     cycles = (place - index_of_zero(shots)) / size
     record = taper(shots.window) * phasors(-cycles, shots.window.length)
+    record[:begun] = 0.0
     tone = transformed(shots, record if shots.complex_record else record.real)
     magnitude = np.abs(tone)
     return np.where(magnitude > 0, tone / np.where(magnitude > 0, magnitude, 1.0), 1.0)
@@ -483,8 +492,16 @@ def resolved_bound(view: View, used: Sequence[bool] | np.ndarray | None = None) 
     Cramer and Rao in white noise, and what the laser's phase adds; looks tell independently.
     """
     shots, i = view.shots, view.i
-    length, rate = shots.window.length, float(shots.sample_rate[i])
-    walk, looks = phase_deviation(**_laser(shots, i)), math.sqrt(shots.looks.number)
+    rate, looks, laser = (
+        float(shots.sample_rate[i]),
+        math.sqrt(shots.looks.number),
+        _laser(shots, i),
+    )
+    lengths = np.full(len(view.signals), shots.window.length)
+    if shots.first_sample is not None:
+        lengths = np.maximum(lengths - shots.first_sample[:, i], 2)
+        laser["duration"] = lengths[0] / np.asarray(rate)
+    walk = phase_deviation(**laser)
     more = 2 if shots.complex_record else 1  # as much noise has two samples for one
     if used is None:
         used = (True, shots.slopes != waveform.SIGNS, True)
@@ -493,7 +510,7 @@ def resolved_bound(view: View, used: Sequence[bool] | np.ndarray | None = None) 
         if s is None or not there
         else np.hypot(beat_deviation(cnr=more * s.cnr, samples=length, sample_rate=rate), walk)
         / looks
-        for s, there in zip(view.signals, used, strict=True)
+        for s, there, length in zip(view.signals, used, lengths.tolist(), strict=True)
     )
     return resolved_deviation(
         up=up, doppler=doppler, down=down, carriers=_carriers(shots, i),

@@ -102,6 +102,12 @@ OUTPUTS: dict[str, Output] = {
     "radial_velocity_error": Output(
         "m s-1", "reported less true radial velocity, without noise", f"{CLOSING}; {NO_ECHO}"
     ),
+    "misread": Output(
+        "1",
+        "1 where the peaks are read as another range or velocity than the echo's, else 0",
+        "without noise; beats beyond half the sample rate, or of another order than assumed. "
+        f"What is detected then has a wrong range or velocity; {NO_ECHO}",
+    ),
 }  # fmt: skip
 
 STRONGEST_OUTPUTS: dict[str, Output] = _by_segment(
@@ -173,7 +179,9 @@ SPREAD_OF = LOGARITHMS | np.array([f"{name}_error" in ERROR_OUTPUTS for name in 
 RUNNING_COLUMNS = len(OUTPUTS) + int(SPREAD_OF.sum()) + int(LOGARITHMS.sum())
 """Numbers a point that further draws need besides the means: counts, spreads, logarithms."""
 
-KEPT = ("snr_up", "snr_down", "snr_doppler", "beamlets", "beamlets_error", "noise_variance")
+KEPT = (
+    "snr_up", "snr_down", "snr_doppler", "beamlets", "beamlets_error", "noise_variance", "misread",
+)  # fmt: skip
 """Of :data:`OUTPUTS`, what does not depend on the detector."""
 
 _AT_FAULT = "adjacent flagged bins, none of them among those that the signal occupies"
@@ -306,7 +314,8 @@ SIMULATED: dict[str, Output] = _over(("shot",), {
     "effects_error": Output(
         "1", "largest change by effects that were left out",
         "sum over them of what each may change: of pd in all three segments, of log10 of "
-        "the probability of a false alarm, or of a relative magnitude, whichever is most",
+        "the probability of a false alarm, or of a relative magnitude, whichever is most; and what "
+        "overlap leaves of beamlets farther and nearer than the beam's axis",
     ),
 })  # fmt: skip
 """Effects that were simulated of each shot; none of the effects where nothing is seen."""

@@ -10,7 +10,7 @@ footprint's geometry is worked out once and serves every point that has it, what
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -160,6 +160,9 @@ class Shots:
     """(3, rows, beamlets): further phases [cycles] in up, Doppler and down segment; or empty."""
     starts: tuple[np.ndarray | float, ...] = (0.0, 0.0, 0.0)
     """Time [s] from the shot's start to each segment's, in which the target moves on."""
+    first_sample: np.ndarray | None = None
+    """(segments, n) int64: samples of the record before the echo arrives, up to all of them; None
+    where echoes fill records."""
     phase_errors: tuple[PhaseError, ...] = ()
     look_drift: np.ndarray | float = 0.0
     """(segments, n): bins by which lines move on from look to look."""
@@ -240,6 +243,27 @@ class Shots:
     def record_duration(self) -> np.ndarray:
         """Length of the record L/fs [s]."""
         return self.window.length / self.sample_rate
+
+    @property
+    def echo_record(self) -> dict[str, Any]:
+        """Start, since the segment's own, and duration [s] of the record that the echo has.
+
+        By ``start`` and ``duration``: (n,) or scalars; tuples by segment where it has not all.
+        """
+        if self.first_sample is None:
+            return {"start": self.acquisition_delay, "duration": self.record_duration}
+        missing = [first / self.sample_rate for first in self.first_sample]
+        left = [(self.window.length - first) / self.sample_rate for first in self.first_sample]
+        return {
+            "start": tuple(self.acquisition_delay + time for time in missing),
+            "duration": tuple(left),
+        }
+
+    def echo_energy(self, segment: int) -> np.ndarray:
+        """Sum w^2 over the samples that the echo has in a segment, (n,)."""
+        if self.first_sample is None:
+            return np.full(self.size, self.window.energy)
+        return energy_left(self.window)[self.first_sample[segment]]
 
     @cached_property
     def relative_echo(self) -> np.ndarray:
@@ -651,6 +675,12 @@ def bare(p: Mapping[str, np.ndarray], size: int, ground: Ground) -> Shots:
         complex_record=in_quadrature,
         looks=looks,
     )
+
+
+@lru_cache(maxsize=8)
+def energy_left(window: Window) -> np.ndarray:
+    """Sum w^2 over the samples from each on, (L + 1,)."""
+    return np.append(np.cumsum(window.samples()[::-1] ** 2)[::-1], 0.0)
 
 
 def approach(p: Mapping[str, np.ndarray]) -> np.ndarray:

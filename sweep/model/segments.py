@@ -22,14 +22,17 @@ from sweep.model.ground import different_rows
 from sweep.model.leakage import MOST_POINTS, inspect, of_bins
 from sweep.model.line_shape import Shapes
 from sweep.model.lines import (
+    AMPLITUDE_TOLERANCES,
     IM,
     LEAST_WIDTH,
     MOST_NODES,
     PLACE,
+    POWER_TOLERANCES,
     RE,
     X,
     add_images,
     fold_lines,
+    node_limits,
     nodes_for,
     place_lines,
     put_on_nodes,
@@ -118,6 +121,8 @@ class Together(NamedTuple):
     """(segments, u, 2, k): real and imaginary parts."""
     number: np.ndarray
     """(segments, u): modes that count."""
+    partly: bool = False
+    """True where echoes have part of the record's samples."""
 
 
 def find(shots: Shots, *, every_bin: bool = False) -> np.ndarray:
@@ -157,17 +162,35 @@ def runs_of(
     levels = table[11] if least is None else np.broadcast_to(least, shots.size)
     some = np.arange(shots.size) if points is None else points
     for together in _together(shots, some):
-        leaks = _way_to_leakage(shots, together.shapes, every_bin) if leakage else NO_LEAKAGE
+        leaks = _way_to_leakage(shots, together, every_bin) if leakage else NO_LEAKAGE
         floor = table[12] * table[10] if leaks == BIN_BY_BIN else np.inf
         lowest, done = np.minimum(levels, floor), 0
         while done < together.part.size:
             held = keep or (shots.looks.several and bool(leaks))
             held |= shots.leak_amplitude is not None or shots.band is not None
             runs, number = _some(shots, table, lowest, together, leaks, done, held)
-            runs = runs if whole else cut(shots, runs)
+            runs = runs if whole else cut(shots, _without_echo(shots, runs))
             runs = _of_looks(shots, runs, bool(leaks)) if shots.looks.several else runs
             yield runs if shots.leak_amplitude is None else beside_leak(shots, runs)
             done += number
+
+
+def _without_echo(shots: Shots, runs: Runs) -> Runs:
+    """Empty the runs of segments whose echo has no sample of the record: nothing is detected."""
+    if shots.first_sample is None:
+        return runs
+    dark = (shots.first_sample[:, runs.part] >= shots.window.length) & (runs.bins > 0)
+    if not dark.any():
+        return runs
+    return runs._replace(
+        bins=np.where(dark, 0, runs.bins),
+        peak=np.where(dark, 0, runs.peak),
+        exempted=np.where(dark, 0, runs.exempted),
+        pd=np.where(dark, 0.0, runs.pd),
+        miss=np.where(dark, 1.0, runs.miss),
+        leakage=np.where(dark, 0.0, runs.leakage),
+        inside=runs.inside & ~dark,
+    )
 
 
 def _of_looks(shots: Shots, runs: Runs, leakage: bool) -> Runs:
@@ -221,11 +244,12 @@ def view(shots: Shots) -> int:
     return COMPLEX if shots.complex_record else IMAGED if shots.image else FOLDED
 
 
-def _way_to_leakage(shots: Shots, shapes: Shapes, every_bin: bool) -> int:
+def _way_to_leakage(shots: Shots, together: Together, every_bin: bool) -> int:
+    shapes = together.shapes
     if not shots.leakage:
         return NO_LEAKAGE
     averaged = shots.gaussian_width is not None and not shots.incoherent
-    averaged |= shots.looks.several or every_bin or shots.band is not None
+    averaged |= shots.looks.several or every_bin or shots.band is not None or together.partly
     smooth = shapes.sizes[0] == shapes.sizes[1] and not shapes.sizes[5]
     if smooth and not averaged and view(shots) != COMPLEX:
         return INTEGRAL
@@ -234,6 +258,11 @@ def _way_to_leakage(shots: Shots, shapes: Shapes, every_bin: bool) -> int:
 
 def _together(shots: Shots, points: np.ndarray) -> Iterator[Together]:
     """Yield groups of points whose line shapes can be computed together, in any order."""
+    if shots.first_sample is not None:
+        there = shots.segments
+        late = (shots.first_sample[there][:, points] > 0).any(axis=0)
+        yield from _partly_filled(shots, points[late])
+        points = points[~late]
     window, fft_size, power = shots.window, shots.fft_size, shots.incoherent
     simple = line_shape.has_modes(window, fft_size)
     segments = len(shots.waveform)
@@ -261,7 +290,9 @@ def _together(shots: Shots, points: np.ndarray) -> Iterator[Together]:
             centre = np.zeros(phase.shape[:2])
             number = np.zeros(phase.shape[:2], np.int64)
             modes = np.zeros((*phase.shape[:2], 2, nodes // 2))
-            line_shape.find_modes(phase, line_shape.to_modes(nodes), centre, modes, number)
+            line_shape.find_modes(
+                phase, _NO_WEIGHT, line_shape.to_modes(nodes), centre, modes, number
+            )
             told = (number > 0).all(axis=0)
             place = np.full(point.size, -1)
             place[left[told]] = np.arange(np.count_nonzero(told))
@@ -286,26 +317,103 @@ def _together(shots: Shots, points: np.ndarray) -> Iterator[Together]:
             )  # fmt: skip
 
 
+_NO_WEIGHT = np.empty((0, 0, 0))
+
+
+def _partly_filled(shots: Shots, points: np.ndarray) -> Iterator[Together]:
+    """Yield groups of points whose echoes have part of the record's samples, in any order."""
+    window, fft_size, power = shots.window, shots.fft_size, shots.incoherent
+    there, segments = shots.segments, len(shots.waveform)
+    assert shots.first_sample is not None
+    dark = (shots.first_sample[there][:, points] >= window.length).all(axis=0)
+    if dark.any():
+        shapes = _no_shape(window, fft_size, power, segments)
+        nothing = np.zeros((segments, 1)), np.zeros((segments, 1, 2, 1))
+        some = points[dark]
+        yield Together(some, 0 * some, shapes, *nothing, np.ones((segments, 1), np.int64), True)
+        points = points[~dark]
+    for begin in range(0, points.size, POINTS):
+        some = points[begin : begin + POINTS]
+        point, which = _different(shots, some)
+        lengths = window.length - shots.first_sample[:, point]
+        lengths[~there] = lengths[there][0]
+        least, largest = lengths.min(axis=0), lengths.max(axis=0)
+        steps = line_shape.part_class(window, least)
+        left = np.ones(point.size, np.bool_)
+        for tier in range(len(line_shape.TIERS)):
+            tried = left & line_shape.part_has_modes(window, fft_size, tier, least, largest)
+            for step in np.unique(steps[tried]).tolist():
+                these = np.flatnonzero(tried & (steps == step))
+                nodes = 2 * line_shape.TIERS[tier][0]
+                x = line_shape.record_places(nodes)
+                phase = _phases(shots, point[these], x)
+                weight = line_shape.part_window(window, x, lengths[:, these])
+                centre = np.zeros(phase.shape[:2])
+                number = np.zeros(phase.shape[:2], np.int64)
+                modes = np.zeros((*phase.shape[:2], 2, nodes // 2))
+                line_shape.find_modes(
+                    phase, weight, line_shape.to_modes(nodes), centre, modes, number
+                )
+                told = (number > 0).all(axis=0)
+                place = np.full(point.size, -1)
+                place[these[told]] = np.arange(np.count_nonzero(told))
+                left[these[told]] = False
+                members = place[which] >= 0
+                if members.any():
+                    shapes = line_shape.part_shapes(window, fft_size, power, tier, step)
+                    shapes = shapes._replace(lengths=np.ascontiguousarray(lengths[:, these[told]]))
+                    group = _sorted(
+                        some[members], place[which[members]], shapes, centre[:, told],
+                        modes[:, told], number[:, told],
+                    )  # fmt: skip
+                    yield group._replace(partly=True)
+        for each in np.flatnonzero(left):  # tables of all bins, one after the other
+            these = some[which == each]
+            first = window.length - lengths[:, each]
+            phase = np.zeros((segments, window.length))
+            for s in np.flatnonzero(there & (lengths[:, each] > 0)):
+                x = 2 * np.arange(lengths[s, each]) / lengths[s, each] - 1
+                phase[s, first[s] :] = _phases(shots, point[each : each + 1], x)[s, 0]
+            yield Together(
+                these, 0 * these, line_shape.whole_shapes(window, fft_size, power, phase, first),
+                np.zeros((segments, 1)), np.zeros((segments, 1, 2, 1)),
+                np.ones((segments, 1), np.int64), partly=True,
+            )  # fmt: skip
+
+
 @lru_cache(maxsize=2)
 def _plain(window: Window, fft_size: int, power: bool, segments: int) -> Shapes:
     """Tables of all bins of lines without a phase error."""
     return line_shape.whole_shapes(window, fft_size, power, np.zeros((segments, window.length)))
 
 
-def _sorted(part: np.ndarray, which: np.ndarray, shapes: Shapes, *modes: np.ndarray) -> Together:
+@lru_cache(maxsize=2)
+def _no_shape(window: Window, fft_size: int, power: bool, segments: int) -> Shapes:
+    """Tables of all bins of echoes that have no sample of the record."""
+    phase, first = np.zeros((segments, window.length)), np.full(segments, window.length)
+    return line_shape.whole_shapes(window, fft_size, power, phase, first)
+
+
+def _sorted(
+    part: np.ndarray, which: np.ndarray, shapes: Shapes, centre: np.ndarray, modes: np.ndarray,
+    number: np.ndarray,
+) -> Together:  # fmt: skip
     """Points by their shapes, so that each of these is made once."""
     order = np.argsort(which, kind="stable")
-    return Together(part[order], which[order], shapes, *map(np.ascontiguousarray, modes))
+    parts = map(np.ascontiguousarray, (centre, modes, number))
+    return Together(part[order], which[order], shapes, next(parts), next(parts), next(parts))
 
 
 def _different(shots: Shots, some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points of which no two have the same phase errors; which of these each of some points has."""
+    """Points of which no two have the same line shapes; which of these each of some points has."""
+    begins = () if shots.first_sample is None else shots.first_sample[shots.segments]
     of_all = (
         np.broadcast_to(np.asarray(one, float), shots.size)[some]
-        for error in shots.phase_errors
-        for value in error.values.values()
+        for value in (
+            *begins, *(v for error in shots.phase_errors for v in error.values.values())
+        )
         for one in (value if isinstance(value, tuple) else (value,))
-    )
+    )  # fmt: skip
     varying = (v for v in of_all if (v != v[0]).any())
     first_varying = next(varying, None)
     if first_varying is None:
@@ -317,7 +425,10 @@ def _different(shots: Shots, some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _phases(shots: Shots, points: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Phase errors [cycles] of points at places x of the record, (segments, points, places)."""
+    """Phase errors [cycles] of points at places x of the record, (segments, points, places).
+
+    Of the part of it that the echo has, where it has not all.
+    """
     found = np.zeros((len(shots.waveform), points.size, x.size))
     for segment in np.flatnonzero(shots.segments):
         for error in shots.phase_errors:
@@ -352,7 +463,7 @@ def _some(
         shots.footprint,
         (together.centre, together.modes, together.number, shifts),
         shapes._replace(sizes=np.append(shapes.sizes, (view(shots), rule[1]))),
-        (shots.window.node_limits(shots.incoherent), tangents(shots.fft_size)),
+        (_node_limits(shots, together), tangents(shots.fft_size)),
         (shots.segments, levels[part], np.array([leaks * each.leaks for each in shots.waveform]),
          shots.window.sum, rule),
         (np.empty((segments, 2, places)), form),
@@ -365,6 +476,14 @@ def _some(
         part[:done], low, count, peak, exempted, pd, miss, magnitude, leakage, start, magnitudes,
         exempt, np.ones(low.shape, np.bool_),
     ), done  # fmt: skip
+
+
+def _node_limits(shots: Shots, together: Together) -> np.ndarray:
+    """Limits of nodes of the record's window; of part of it, as if all were at the record's end."""
+    if not together.partly:
+        return shots.window.node_limits(shots.incoherent)
+    tolerances = POWER_TOLERANCES if shots.incoherent else AMPLITUDE_TOLERANCES
+    return node_limits((0.0, 1.0), tolerances)
 
 
 @lru_cache(maxsize=4)
@@ -474,11 +593,21 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
     numbers, values, magnitudes, exempts = out
     keep, at = magnitudes.size > 0, np.int64(0)
     before, made_of = -1.0, np.int64(-1)  # a literal would compile what takes it once more
+    lengths, length = shapes.lengths, sizes[1]
+    partly = lengths.size > 0
     for i in range(points.shape[0]):
         p, row, which = points[i], where[0, i], where[1, i]
+        begun = p[7]
         if which != made_of:
             for s in range(segments.size):
-                if segments[s]:
+                if segments[s] and partly:
+                    twin = line_shape.same_part(s, which, modes, lengths, segments)
+                    if twin >= 0:
+                        table[s], form[s, 1:] = table[twin], form[twin, 1:]
+                    else:
+                        sizes[1] = lengths[s, which]
+                        line_shape.build_part(s, which, modes, shapes, table[s], form[s])
+                elif segments[s]:
                     line_shape.build(s, (which, made_of), modes, shapes, table[s], form[s])
             made_of = which
         sigma, level = p[10], p[11]
@@ -488,6 +617,9 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
         for s in range(segments.size):
             if not segments[s]:
                 continue
+            if partly:  # what the echo has of the record is a record of its own
+                sizes[1] = lengths[s, which]
+                p[7] = begun + (length - lengths[s, which]) / p[6]
             shift = shifts[i, s][:, : np.count_nonzero(shifts[i, s, 1])]  # zeros are last
             origin, n, total, lowest, highest = _take_lines(
                 p, (s, row), footprint, centre[s, which], shift, window_sum, limits, sizes, room

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from sweep.model import waveform
+from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection import any_two
 from sweep.model.effects.catalogue import CORE, DEFAULTS, EFFECTS, NAMES, SHARED
 from sweep.model.effects.effect import Effect, Scene
@@ -137,6 +138,7 @@ def statistics(shots: Shots, found: np.ndarray | None = None) -> dict[str, np.nd
         "noise_variance": shots.noise_variance,
         "range_error": reported.range - shots.range,
         "radial_velocity_error": reported.radial_velocity - shots.radial_velocity,
+        "misread": misread(shots, reported).astype(float),
     }
     if shots.any_two:
         results["pd_both_chirps"] = shots.both(pd[0], pd[2], (magnitude[0], magnitude[2]))
@@ -182,6 +184,37 @@ def report(shots: Shots, found: np.ndarray) -> waveform.Resolution:
         signed=shots.complex_record,
         assumed=shots.two_beats,
     )
+
+
+MISREAD_BINS = 4
+"""Bins of range or velocity by which what is read of an echo may be off: roundings of three peaks,
+and motion between and within records."""
+
+
+def misread(shots: Shots, reported: waveform.Resolution) -> np.ndarray:
+    """Return true where peaks without noise are read as another range or velocity than the echo's.
+
+    The footprint's own extent, and what the target does between and within records, are none of
+    it. Beats beyond half the sample rate fold, and readings by an assumption may be wrong.
+    """
+    bins = MISREAD_BINS * shots.sample_rate / shots.fft_size
+    rows, last = shots.row, max(float(np.max(start)) for start in shots.schedule)
+    time = last + np.asarray(shots.duration) + np.abs(shots.walk)
+    moved = (np.abs(shots.approach) + np.abs(shots.radial_velocity)) * time
+    moved = moved + np.abs(shots.acceleration) * time * time
+    # An acceleration shifts beats between segments, which read as range and as velocity.
+    shifted = np.abs(shots.acceleration) * time
+    carrier = np.asarray(shots.carriers[0])
+    per_metre = shots.chirp_rate * 2 / SPEED_OF_LIGHT
+    metres = (bins + 2 * carrier / SPEED_OF_LIGHT * shifted) / per_metre + moved
+    metres = metres + np.abs(shots.offset).max(axis=1)[rows] * shots.range
+    own = SPEED_OF_LIGHT / 2 * np.abs(shots.doppler).max(axis=1)[rows]
+    metres = metres + 2 * carrier / SPEED_OF_LIGHT * own / per_metre
+    speed = bins * SPEED_OF_LIGHT / (2 * carrier) + shifted + own
+    speed = speed + per_metre * metres * SPEED_OF_LIGHT / (2 * carrier)
+    off = np.abs(reported.range - shots.range) > metres
+    off |= np.abs(reported.radial_velocity - shots.radial_velocity) > speed
+    return np.asarray(off)
 
 
 def fit(

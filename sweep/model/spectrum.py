@@ -16,12 +16,11 @@ all that lines can lift to a level, and what it takes to be sure of the largest.
 import math
 
 import numpy as np
-from numpy.polynomial.chebyshev import cheb2poly, chebfit
 
 from sweep.kernels import njit
 from sweep.model.detection import mark
 from sweep.model.elementary import sincos_cycles
-from sweep.model.line_shape import CELLS, POINTS, kernel
+from sweep.model.line_shape import CELLS, KERNEL_BASIS, KERNEL_DEGREE, POINTS, SPARE_CELLS
 from sweep.model.lines import IM, PLACE, RE, X, put_on_nodes
 
 CELL_RE, CELL_IM, A_RE, A_IM, B_RE, B_IM = np.arange(7, 13)
@@ -67,22 +66,10 @@ WINDOW = 8
 EDGE = POINTS // 2 // CELLS[0] + 1
 """Bins beside a window in which its lines have cells."""
 
-_SPARE = 2
-"""Cells of no weight beyond those among which a line is shared out, for whole vectors."""
-
-MOST_CELLS = WINDOW * CELLS[1] + POINTS + _SPARE
+MOST_CELLS = WINDOW * CELLS[1] + POINTS + SPARE_CELLS
 
 BESIDE = WINDOW + EDGE + 1
 """Bins by which tables may hold less about a line than on either side of a cell."""
-
-DEGREE = 13
-
-_s = np.cos(np.pi * (np.arange(DEGREE + 1) + 0.5) / (DEGREE + 1))
-BASIS = np.zeros((DEGREE + 1, POINTS + _SPARE))
-"""Polynomials of the kernel, by power of s = -1 .. 1 across a cell and by cell."""
-
-for _j in range(POINTS):
-    BASIS[:, _j] = cheb2poly(chebfit(_s, kernel((_s + 1) / 2 - _j + POINTS // 2 - 1), DEGREE))
 
 
 @njit(cache=True, error_model="numpy")
@@ -100,7 +87,7 @@ def add_near(first, count, lines, table, sizes, room):
         if least > most:  # tables hold nothing of these lines there
             continue
         number = min(WINDOW, last + 1 - start) * cells + POINTS
-        for c in range(number + _SPARE):
+        for c in range(number + SPARE_CELLS):
             room[CELL_RE, c], room[CELL_IM, c] = 0.0, 0.0
         for b in range(n):
             if start <= room[PLACE, b] < start + WINDOW:
@@ -115,10 +102,10 @@ def _share_out(place, re, im, room):
     """Share a line at a place among cells out among POINTS of them."""
     cell = np.uint64(math.floor(place))
     part = 2.0 * (place - math.floor(place)) - 1.0
-    for j in range(np.uint64(POINTS + _SPARE)):
-        weight = BASIS[DEGREE, j]
-        for d in range(DEGREE):
-            weight = weight * part + BASIS[DEGREE - 1 - d, j]
+    for j in range(np.uint64(POINTS + SPARE_CELLS)):
+        weight = KERNEL_BASIS[KERNEL_DEGREE, j]
+        for d in range(KERNEL_DEGREE):
+            weight = weight * part + KERNEL_BASIS[KERNEL_DEGREE - 1 - d, j]
         room[CELL_RE, cell + j] += re * weight
         room[CELL_IM, cell + j] += im * weight
 

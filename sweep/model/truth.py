@@ -4,6 +4,9 @@ The beat of each beamlet follows from the exact delay tau(t) of PHYSICS section 
 sample; the records add up, are windowed and transformed. Every fast path is held against this.
 It shares the link budget, the noise and the footprint with the fast path, and nothing of lines,
 kernels or bins. Seconds a shot; its own floor, from rounding f t, is 1e-11 of the peak.
+
+With the effect of overlap a beamlet has an echo in samples from its own delay tau(t) on, and until
+the chirp ends.
 """
 
 from fractions import Fraction
@@ -15,6 +18,7 @@ from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection import detect_rows
 from sweep.model.effects.segment_motion import looks_of
 from sweep.model.preparation import Shots
+from sweep.model.waveform import SAMPLE_SLACK
 
 
 def spectrum(
@@ -128,7 +132,11 @@ def analytic_record(
     )
     amplitude = _at(shots.beat_scale, i) * shots.amplitude[shots.row[i], beamlet]
     amplitude = amplitude * shots.whitening[segment][i]
-    return amplitude * gain * np.exp(2j * np.pi * (cycles - np.rint(cycles) + start))
+    record = amplitude * gain * np.exp(2j * np.pi * (cycles - np.rint(cycles) + start))
+    if shots.first_sample is not None:
+        arrived = t >= delay_0 + change - SAMPLE_SLACK / shots.sample_rate[i]
+        record *= arrived & (t <= _at(shots.duration, i))
+    return np.asarray(record)
 
 
 def _start_phase(

@@ -149,11 +149,28 @@ def beat_frequency(
     return carrier * beta - slope * chirp_rate * (2 * range / SPEED_OF_LIGHT) * (1 + beta)
 
 
+SAMPLE_SLACK = 1e-6
+"""Share of a sample by which one on a limit of time counts as within."""
+
+
 def record_length(p: Mapping[str, Any]) -> np.ndarray:
     """Return the record's length [samples]: the FFT's, or what the chirp leaves after the delay."""
     left = p["instrument.chirp.duration"] - p["instrument.processing.acquisition_delay"]
-    available = np.floor(left * p["instrument.processing.sample_rate"] + 1e-6)
+    available = np.floor(left * p["instrument.processing.sample_rate"] + SAMPLE_SLACK)
     return np.minimum(p["instrument.processing.fft_size"], available).astype(np.int64)
+
+
+def samples_before_echo(
+    *, delay: np.ndarray, beta: np.ndarray | float, start: np.ndarray,
+    sample_rate: np.ndarray, length: int,
+) -> np.ndarray:  # fmt: skip
+    """Count the samples of a record, 0 to all ``length``, that are taken before the echo arrives.
+
+    The delay tau_0 at a segment's start [s] changes as tau(t) = tau_0 - beta t; the record begins
+    at ``start`` [s]. The sample at t has an echo where t >= tau(t).
+    """
+    late = (np.asarray(delay) / (1 + np.asarray(beta)) - start) * sample_rate
+    return np.clip(np.ceil(late - SAMPLE_SLACK), 0, length).astype(np.int64)
 
 
 def fold(frequency: np.ndarray, sample_rate: np.ndarray) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 import math
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -43,6 +43,16 @@ class Window:
     reach: np.ndarray
     envelope: np.ndarray
     """(m,): max |W(y)| / sum over |y| >= `reach` [bins of fs/L]."""
+    missing: int = 0
+    """First samples that are 0, as of :func:`last_part`."""
+
+    def samples(self) -> np.ndarray:
+        """All samples (L,)."""
+        w = samples(self.name, self.length)
+        if self.missing:
+            w = w.copy()
+            w[: self.missing] = 0.0
+        return w
 
     def band_weights(self, power: bool) -> tuple[float, ...]:
         """Shares of the sum that |w| has at places |t| evenly spaced over 0..1, the record's end.
@@ -121,6 +131,26 @@ def window(name: str, length: int) -> Window:
     if name in COSINE_SUMS and length >= _SHORTEST_CLOSED_FORM:
         return _closed_form(name, length)
     return _tabulated(name, length)
+
+
+PARTS = 32
+"""Steps of the length in which :func:`last_part` counts the samples that lack."""
+
+
+def last_part(window: Window, missing: int) -> Window:
+    """Return the window with some of its first samples 0, to a step of :data:`PARTS` of them.
+
+    For the sums over a window that depend little on how many these are: the envelope stays.
+    """
+    step = min(round(PARTS * missing / window.length), PARTS - 1)
+    return _last_part(window, step) if step else window
+
+
+@lru_cache(maxsize=2 * PARTS)
+def _last_part(window: Window, step: int) -> Window:
+    part = replace(window, missing=step * window.length // PARTS)
+    w = part.samples()
+    return replace(part, sum=float(w.sum()), energy=float((w**2).sum()))
 
 
 def transform(window: Window, y: np.ndarray) -> np.ndarray:

@@ -194,20 +194,64 @@ def _spare(grid: Grid, weights: Mapping[str, float]) -> float | None:
     return sum(weights[path] * found[path] for path in weights) if found else None
 
 
+ECHO_TIMES = (DURATION, DELAY, RANGE, SAMPLE_RATE, FFT_SIZE)
+_POINTS_MAX = 10**7
+"""Points of the grid of these parameters up to which all are looked at."""
+
+
 def _time_findings(grid: Grid) -> Iterator[Finding]:
-    """Chirps too short for their echo, or for two samples."""
-    spare = _spare(grid, {DURATION: 1.0, DELAY: -1.0, RANGE: -2.0 / SPEED_OF_LIGHT})
-    if spare is not None and spare <= 0:
-        rule = (
-            "must exceed the acquisition delay and the echo's delay 2R/c over the whole grid, "
-            f"and falls short by {-spare:.6g} s at its worst"
-        )
+    """Grids in which no echo arrives before its record ends, or records of less than two samples.
+
+    A grid some points of which have no echo is simulated: nothing is detected there.
+    """
+    late = _least_late(grid)
+    if late is not None and late.chirp >= 0:
+        rule = "must exceed the echo's delay 2R/c, and falls short by "
+        rule += f"{late.chirp:.6g} s at its best"
         yield grid.finding(DURATION, rule, "shorten the range or lengthen the chirp")
+        return
+    if late is not None and late.record >= 0:
+        rule = (
+            "must let records of fft_size samples last until an echo arrives, and the whole grid's "
+            f"end {late.record:.6g} s or more before the echo's delay 2R/c"
+        )
+        yield grid.finding(DELAY, rule, "raise it to the delay of the farthest echo, or fft_size")
         return
     samples = _fewest_samples(grid)
     if samples is not None and np.floor(samples + 1e-6) < 2:
         rule = f"must leave 2 samples after the acquisition delay, and leaves {samples:.3g}"
         yield grid.finding(DURATION, rule, "raise the sample rate or lengthen the chirp")
+
+
+class _Late(NamedTuple):
+    """Least time [s] over a grid from an end to the echo's arrival; negative if that is before."""
+
+    chirp: float
+    """From the chirp's end."""
+    record: float
+    """From the record's end, where that matters; else from the chirp's."""
+
+
+def _least_late(grid: Grid) -> _Late | None:
+    """Find how late the earliest echo arrives; None where it can't be told."""
+    if not grid.knows(*ECHO_TIMES):
+        return None
+    values: dict[str, np.ndarray] = {
+        path: np.asarray(grid.values[path], float) for path in ECHO_TIMES if path in grid.values
+    }
+    size = 1
+    for number, axis in enumerate(grid.axes):
+        shape = [-1 if k == number else 1 for k in range(len(grid.axes))]
+        own = {m.path: m for m in axis.members if m.path in ECHO_TIMES}
+        size *= axis.size if own else 1
+        values |= {p: np.asarray(m.values, float).reshape(shape) for p, m in own.items()}
+    if size > _POINTS_MAX:
+        return None
+    end, delay = values[DURATION], 2 / SPEED_OF_LIGHT * values[RANGE]
+    of_chirp = float(np.min(delay - end))
+    if grid.modes.get("overlap") != OFF:
+        end = np.minimum(values[DELAY] + values[FFT_SIZE] / values[SAMPLE_RATE], end)
+    return _Late(of_chirp, float(np.min(delay - end)))
 
 
 def _fewest_samples(grid: Grid) -> float | None:

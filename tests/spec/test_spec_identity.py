@@ -140,6 +140,7 @@ def other_value(path):
         "accuracy.tolerance": 0.2,
         "accuracy.confidence": 0.9,
         "instrument.processing.bits": 12,
+        "instrument.processing.fft_size": "2^16",
         **dict.fromkeys((PFA_BIN, PFA_SEGMENT, PFA_SHOT), 0.01),
         "instrument.receiver.field_of_view": "1 mrad",
         "instrument.receiver.iq_gain_imbalance": "0.5 dB",

@@ -25,16 +25,43 @@ def refused(changes=None, **sections):
     except SpecError as error:
         (mistake,) = error.mistakes
         axes = sections.get("axes", {})
-        on = [key for key, values in axes.items() if DURATION in (key, *values_of_zip(values))]
-        assert mistake.path == (f"axes.{on[0]}" if on else DURATION)
+        field = DELAY if "last until an echo arrives" in str(mistake) else DURATION
+        on = [key for key, values in axes.items() if field in (key, *values_of_zip(values))]
+        assert mistake.path == (f"axes.{on[0]}" if on else field)
         return str(mistake)
     return ""
 
 
+OFF = {"overlap": "off"}
+
+
 def test_a_chirp_shorter_than_the_echos_delay_is_refused():
-    assert not refused({RANGE: "74.9 km"})
-    assert "echo's delay 2R/c" in refused({RANGE: "75 km"})
-    assert "falls short" in refused({RANGE: "60 km", DELAY: "100 us"})
+    assert not refused({RANGE: "74.9 km"}, effects=OFF)
+    assert "echo's delay 2R/c" in refused({RANGE: "75 km"}, effects=OFF)
+    assert "falls short by 3.46143e-07 s" in refused({RANGE: "75 km"})
+
+
+def test_a_record_that_ends_before_its_echo_arrives_is_refused():
+    """2^17 samples at 600 MHz are 218.45 us, 32.745 km, from the acquisition delay on."""
+    assert not refused({RANGE: "32.7 km"})
+    told = refused({RANGE: "32.8 km"})
+    assert "end 3.64713e-07 s or more before the echo's delay" in told
+    assert not refused({RANGE: "60 km", DELAY: "300 us"})
+    assert "raise it to the delay" in refused({RANGE: "60 km", DELAY: "100 us"})
+
+
+def test_an_echo_that_arrives_within_its_record_is_not_refused():
+    """At 300 m it takes 2.001 us: 1.9 us of a record from 2 us to 3.9 us remain."""
+    short = {RANGE: "300 m", DURATION: "3.9 us", DELAY: "2 us"}
+    assert not refused(short)
+    assert not refused(short | {RANGE: "584 m"})
+    assert "falls short" in refused(short | {RANGE: "585 m"})
+
+
+def test_a_grid_is_simulated_if_any_of_its_points_has_an_echo():
+    assert not refused(axes={RANGE: ["1 km", "60 km", "90 km"]})
+    assert refused(axes={RANGE: ["60 km", "90 km"]})
+    assert not refused(axes={RANGE: ["60 km", "90 km"], DELAY: ["0 us", "300 us"]})
 
 
 def test_a_record_of_fewer_than_two_samples_is_refused():
@@ -61,21 +88,23 @@ def test_a_responsivity_of_more_than_one_electron_a_photon_is_refused():
 
 
 def test_extremes_of_plain_axes_are_combined():
-    assert not refused(axes={RANGE: ["1 km", "60 km"], DURATION: ["420 us", "500 us"]})
-    assert refused(axes={RANGE: ["1 km", "60 km"], DURATION: ["390 us", "500 us"]})
+    far = {RANGE: ["60 km", "61 km"], DURATION: ["390 us", "500 us"]}
+    assert not refused(axes=far, effects=OFF)
+    assert refused(axes=far | {DURATION: ["390 us", "400 us"]}, effects=OFF)
 
 
 def test_a_chirp_that_stands_on_an_axis_alone_is_held_to_the_same_rules():
     mapping = {DURATION: ..., RANGE: "60 km"}
-    assert not refused(mapping, axes={DURATION: ["401 us", "500 us"]})
-    assert "echo's delay 2R/c" in refused(mapping, axes={DURATION: ["400 us", "500 us"]})
+    assert not refused(mapping, axes={DURATION: ["300 us", "401 us"]}, effects=OFF)
+    told = refused(mapping, axes={DURATION: ["300 us", "400 us"]}, effects=OFF)
+    assert "echo's delay 2R/c" in told
 
 
 def test_zipped_values_are_combined_only_as_they_occur():
-    good = {"zip": {RANGE: ["1 km", "60 km"], DURATION: ["10 us", "500 us"]}}
-    bad = {"zip": {RANGE: ["60 km", "1 km"], DURATION: ["10 us", "500 us"]}}
-    assert not refused(axes={"pair": good})
-    assert refused(axes={"pair": bad})
+    good = {"zip": {RANGE: ["2 km", "60 km"], DURATION: ["10 us", "500 us"]}}
+    bad = {"zip": {RANGE: ["80 km", "2 km"], DURATION: ["500 us", "10 us"]}}
+    assert not refused(axes={"pair": good}, effects=OFF)
+    assert refused(axes={"pair": bad}, effects=OFF)
     rates = {"zip": {RATE: ["100 kHz", "4 kHz"], DURATION: ["20 us", "500 us"]}}
     assert not refused(axes={"pair": rates})
 
@@ -100,10 +129,10 @@ def test_the_grid_is_refused_just_when_a_point_of_it_is(
         list(zip(durations, rates, strict=True)) if zip_1 else itertools.product(durations, rates)
     )
     second = list(zip(delays, ranges, strict=True)) if zip_2 else itertools.product(delays, ranges)
-    bad = any(
-        (t - (delay - 1)) * 1e-6 - 2 * 50 * distance / LIGHT <= 0
-        or np.floor((t - (delay - 1)) * 1e-6 * 40e3 * rate + 1e-6) < 2
-        for (t, rate), (delay, distance) in itertools.product(list(first), list(second))
+    points = list(itertools.product(list(first), list(second)))
+    bad = all(t * 1e-6 - 2 * 50 * distance / LIGHT <= 0 for (t, _), (_, distance) in points) or any(
+        np.floor((t - (delay - 1)) * 1e-6 * 40e3 * rate + 1e-6) < 2
+        for (t, rate), (delay, _) in points
     )
     assert bool(refused(axes=axes)) == bad
 

@@ -54,10 +54,11 @@ CASES += [
 TOGETHER = {
     "record that begins when the chirp has ended": (
         {"instrument.processing.acquisition_delay": "500 us"}, "instrument.chirp.duration",
-        "must exceed the acquisition delay", "falls short by 1.33426e-05 s", "lengthen the chirp",
+        "must leave 2 samples after the acquisition delay", "leaves 0", "lengthen the chirp",
     ),
     "window that a record of few samples has not": (
-        {"instrument.processing.fft_size": 5, "instrument.processing.window": "dpss(2.5)"},
+        {"instrument.processing.fft_size": 5, "instrument.processing.window": "dpss(2.5)",
+         "effects.overlap": "off"},
         "instrument.processing.window", "must be one that has 5 samples",
         "dpss(2.5) has none of so few", "raise instrument.processing.fft_size",
     ),

@@ -14,7 +14,7 @@ from sweep.model import estimators, waveform
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.catalogue import NAMES
 from sweep.model.looks import COHERENT
-from sweep.model.window import transform, window
+from sweep.model.window import Window, transform, window
 
 _SEGMENTS = ("up", "doppler", "down")
 _INSTRUMENT = "instrument."
@@ -65,7 +65,8 @@ def _errors(dataset: xr.Dataset, quantity: str) -> xr.Dataset:
     values |= {
         name: parameter(dataset, f"target.{name}", spec) for name in ("range", "radial_velocity")
     }
-    for name, effect in (("walks", "range_walk"), ("moves", "segment_motion")):
+    marks = {"walks": "range_walk", "moves": "segment_motion", "late": "overlap"}
+    for name, effect in marks.items():
         values[name] = (dataset["effects"] & (1 << NAMES.index(effect))) > 0
     snr = [dataset[f"snr_{name}"] for name in _SEGMENTS]
 
@@ -127,10 +128,10 @@ def _alike(snr: list[np.ndarray], p: dict[str, np.ndarray]) -> estimators.Deviat
     deviations = []
     order = waveform.order_of(str(p["architecture"][0]), str(p["segments"][0]))
     starts = waveform.segment_starts(order, duration=p["duration"], gap=p["gap"])
-    late = 0.5 * (p["looks"] - 1) * len(order) * (p["duration"] + p["gap"])
+    middle_look = 0.5 * (p["looks"] - 1) * len(order) * (p["duration"] + p["gap"])
     for segment, slope in enumerate(slopes):
         carrier, seen = carriers[segment], snr[segment]
-        moved = np.where(p["moves"], (starts[segment] + late) * p["radial_velocity"], 0.0)
+        moved = np.where(p["moves"], (starts[segment] + middle_look) * p["radial_velocity"], 0.0)
         beat = waveform.beat_frequency(
             slope, carrier=carrier, chirp_rate=chirp_rate, range=p["range"] - moved,
             radial_velocity=p["radial_velocity"],
@@ -140,14 +141,21 @@ def _alike(snr: list[np.ndarray], p: dict[str, np.ndarray]) -> estimators.Deviat
         beat = np.where(p["walks"], beat + walk, beat)
         place = waveform.fold(beat, p["sample_rate"]) / rate * size
         # in bins of fs/L: a padded FFT's bins are finer than the window's
-        offset = (place - np.rint(place)) * length / size
-        cnr = estimators.carrier_to_noise_ratio(
-            snr=seen / main_lobe(shape.name, length)(np.abs(offset)) ** 2, window=shape
-        )
-        deviation = estimators.beat_deviation(cnr=cnr, samples=length, sample_rate=rate)
+        first = waveform.samples_before_echo(
+            delay=2 / SPEED_OF_LIGHT * (p["range"] - moved), beta=0.0, start=p["delay"],
+            sample_rate=p["sample_rate"], length=length,
+        )  # fmt: skip
+        left = length - np.where(p["late"], first, 0)  # samples that the echo has
+        weight, narrowness = last_samples(shape)
+        offset = (place - np.rint(place)) * narrowness[left] * length / size
+        # of less of the window the line stands lower, over the noise of all of it
+        lower = main_lobe(shape.name, length)(np.abs(offset)) * weight[left]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            cnr = estimators.carrier_to_noise_ratio(snr=seen / lower**2, window=shape)
+            deviation = estimators.beat_deviation(cnr=cnr, samples=left, sample_rate=rate)
         walked = estimators.phase_deviation(
             line_width=np.where(p["line_shape"] == "lorentzian", p["line_width"], 0.0),
-            delay=2 * p["range"] / SPEED_OF_LIGHT, duration=length / rate,
+            delay=2 * p["range"] / SPEED_OF_LIGHT, duration=np.maximum(left, 1) / rate,
         )  # fmt: skip
         # The stored SNR is that of a sum of looks, or of each of those that tell by themselves.
         deviation = deviation / np.sqrt(np.where(p["combine"] == COHERENT, 1.0, p["looks"]))
@@ -160,6 +168,21 @@ def _alike(snr: list[np.ndarray], p: dict[str, np.ndarray]) -> estimators.Deviat
     )  # fmt: skip
     dark = np.isnan(snr[0]) | np.isnan(snr[2])
     return estimators.Deviation(*(np.where(dark, np.nan, b) for b in found))
+
+
+@lru_cache(maxsize=8)
+def last_samples(shape: Window) -> tuple[np.ndarray, np.ndarray]:
+    """Sum, and width in time, of a window's last samples over those of all, (L + 1,) each.
+
+    By the number of samples. The width is the standard deviation of the places under the window,
+    by which its main lobe is narrow.
+    """
+    w, place = shape.samples()[::-1], np.arange(shape.length) / shape.length
+    total, first, second = (np.append(0.0, np.cumsum(w * place**k)) for k in range(3))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        width = np.sqrt(np.maximum(second / total - (first / total) ** 2, 0.0))
+    width = np.where(np.isfinite(width), width, 0.0)
+    return total / total[-1], np.minimum(width / width[-1], 1.0)
 
 
 @lru_cache(maxsize=32)

@@ -110,6 +110,10 @@ class Size(NamedTuple):
     """Sigmas by which bins that leak move, besides what the largest moves by."""
     chance: Sized = 0.0
     """Change of a probability itself, summed over the segments where there is one of each."""
+    left: Sized = 0.0
+    """Relative change of the largest bin's magnitude that remains where the effect is simulated."""
+    left_of_all: Sized = 0.0
+    """The same as a share of what all amplitudes make in phase; the less of both counts."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

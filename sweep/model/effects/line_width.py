@@ -21,7 +21,8 @@ own length only: there the record's length takes the delay's place in the split.
 |X| does not tell a phase that the whole record has, and of what turns with it little at all: of the
 phase, less its mean under the window, the mean of exp(i phi) is the line that |X| sees, and only
 the part of the pedestal in phase with that changes |X| (:func:`seen_line`). Both are drawn as they
-are where whole spectra are (:func:`walked_phase`).
+are where whole spectra are (:func:`walked_phase`). An echo that arrives within the record has the
+line and the pedestal of the samples that it has, told to a 32nd of the record.
 """
 
 import math
@@ -35,9 +36,9 @@ from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.effect import Effect, Parameter, Scene, Size
 from sweep.model.effects.phase_errors import added, means
 from sweep.model.effects.points import Points, Smear, by_power
-from sweep.model.preparation import LASER, Shots
+from sweep.model.preparation import LASER, Shots, energy_left
 from sweep.model.unsupported import UnsupportedShot
-from sweep.model.window import Window, samples
+from sweep.model.window import Window, last_part, samples
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
@@ -252,7 +253,10 @@ def _places(window: Window) -> "tuple[np.ndarray, CubicSpline]":
     from scipy.interpolate import CubicSpline  # slow to import
 
     w, x = samples(window.name, _PLACES), np.arange(_PLACES + 1) / _PLACES
-    twice = CubicSpline(x, np.append(w, w[0]) / w.mean()).antiderivative(2)
+    end = w[0]
+    if window.missing:
+        w = np.where(x[:-1] < window.missing / window.length, 0.0, w)
+    twice = CubicSpline(x, np.append(w, end) / w.mean()).antiderivative(2)
     return w / w.sum(), twice
 
 
@@ -294,8 +298,7 @@ def autocorrelation(window: Window) -> "CubicSpline":
     """Sum_n w_n w_(n+j) as a function of the lag j, 0..L [samples]."""
     from scipy.interpolate import CubicSpline  # slow to import
 
-    w = samples(window.name, window.length)
-    spectrum = np.abs(np.fft.rfft(w, 2 * window.length)) ** 2
+    spectrum = np.abs(np.fft.rfft(window.samples(), 2 * window.length)) ** 2
     r = np.fft.irfft(spectrum, 2 * window.length)[: window.length + 1]
     return CubicSpline(np.arange(window.length + 1), r)
 
@@ -330,7 +333,7 @@ def size(points: Points) -> Size | None:
     known, deviation = means(points.window), _deviation(points)
     spread = np.minimum((2 * np.pi * deviation) ** 2 * known.variance, 1.0)
     smeared = 1 + 2 * points.smeared / points.margin
-    least = points.powers[0] / np.where(points.near_image, 2.0, 1.01) / smeared
+    least = points.left_of(points.powers[0] / np.where(points.near_image, 2.0, 1.01) / smeared)
     magnitude = by_power(known.most**2 * spread / least)
     if not points.may_add:
         return Size(magnitude=magnitude)
@@ -354,6 +357,23 @@ def _lorentzian(points: Points) -> Size:
     )
 
 
+def _seen_lines(shots: Shots, timing: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return :func:`seen_line` of points by the part of the record that the up-chirp's echo has."""
+    looks = shots.looks.added
+    if shots.first_sample is None:
+        return seen_line(window=shots.window, looks=looks, **timing)
+    first = shots.first_sample[0]
+    windows = [last_part(shots.window, number) for number in first.tolist()]
+    share, in_phase = np.empty((2, shots.size))
+    timing = {name: np.broadcast_to(values, shots.size) for name, values in timing.items()}
+    for window in dict.fromkeys(windows):
+        here = np.array([window is other for other in windows])
+        part = {name: values[here] for name, values in timing.items()}
+        share[here], in_phase[here] = seen_line(window=window, looks=looks, **part)
+        in_phase[here] *= energy_left(shots.window)[first[here]] / window.energy
+    return share, in_phase
+
+
 def act(shots: Shots, scene: Scene) -> Shots:
     """Give the beat a Gaussian line; or dim the pure line and add a pedestal of noise."""
     width = np.asarray(scene.parameters[_WIDTH], float)
@@ -369,7 +389,7 @@ def act(shots: Shots, scene: Scene) -> Shots:
             f"{np.min(shots.record_duration):.3g} s, and this one takes {np.max(delay):.3g} s: "
             "raise instrument.processing.fft_size, or take instrument.looks.combine: power"
         )
-    share, in_phase = seen_line(window=shots.window, looks=shots.looks.added, **timing)
+    share, in_phase = _seen_lines(shots, timing)
     power = (shots.beat_scale / 2) ** 2 * shots.relative_echo
     return replace(
         shots,

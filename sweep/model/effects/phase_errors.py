@@ -166,6 +166,10 @@ def phase_size(points: Points, name: str) -> Size | None:
         besides = missed(others, points.window)
         far = _TURN * (sum(others.powers) + others.rest)
         turned = missed(own, points.window) * np.minimum(far, 2.0)
+    late = points.missing
+    if late is not None:  # what lacks of the record is not turned; the rest has another middle
+        besides = besides + late.lost
+        turned = turned + late.lost * np.minimum(_TURN * (sum(own.powers) + own.rest), 2.0)
     a = np.minimum(odd, 2 * known.most) + np.minimum(root * root / 2, 2 * known.most) + turned
     b = np.minimum(even, known.most) + turned
     least = points.powers[0] / np.where(points.near_image, 2.0, 1.01) / (1 + others.reach)
@@ -174,6 +178,8 @@ def phase_size(points: Points, name: str) -> Size | None:
     moved = rest / _TURN * known.steady[4]
     for value, steady in zip(own.powers, known.steady, strict=False):
         moved = moved + value * steady
+    if late is not None:
+        moved = moved + late.middle * (2 * two + 3 * three + 4 * four)
     shift = 2 * moved * points.margin
     if not points.may_add:
         return Size(magnitude=magnitude, shift=shift)
@@ -183,8 +189,8 @@ def phase_size(points: Points, name: str) -> Size | None:
 
 def _with_phase(shots: Shots, phase: Callable[..., np.ndarray], **values: Any) -> Shots:
     """Shots with a further phase error."""
-    record = {"start": shots.acquisition_delay, "duration": shots.record_duration}
-    return replace(shots, phase_errors=(*shots.phase_errors, PhaseError(phase, values | record)))
+    error = PhaseError(phase, values | shots.echo_record)
+    return replace(shots, phase_errors=(*shots.phase_errors, error))
 
 
 def record_times(x: np.ndarray, *, start: np.ndarray, duration: np.ndarray) -> np.ndarray:
@@ -233,8 +239,36 @@ def walk(shots: Shots, scene: Scene) -> Shots:
     shots = _with_phase(
         shots, walk_phase, chirp_rate=shots.chirp_rate, radial_velocity=velocity, slide=slide
     )
+    return replace(shots, walk=shots.walk + drift_time(shots))
+
+
+def drift_time(shots: Shots) -> np.ndarray:
+    """Slope of t^2 over the records that the echo has of both chirps [s], (n,) or scalar.
+
+    That of the best straight line under the window: twice the time of the middle of a whole record.
+    """
     within = 2 * shots.acquisition_delay + shots.record_duration
-    return replace(shots, walk=shots.walk + within)
+    if shots.first_sample is None:
+        return np.asarray(within)
+    slope = _slope_of_square(shots.window)[shots.first_sample[::2]].mean(axis=0)
+    return np.asarray(within + 0.5 * shots.record_duration * slope)
+
+
+@lru_cache(maxsize=8)
+def _slope_of_square(window: Window) -> np.ndarray:
+    """Slope of the best line to x^2 over the samples from each on, (L + 1,), under the window.
+
+    The places x of all samples are -1..1, whose slope is 0.
+    """
+    x = 2 * np.arange(window.length) / window.length - 1
+    powers = (window.samples() * x**k for k in range(4))
+    zero, one, two, three = (np.cumsum(v[::-1])[::-1] for v in powers)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        one, two, three = one / zero, two / zero, three / zero
+        slope = (three - one * two) / (two - one * one)
+    slope = np.clip(np.where(np.isfinite(slope), slope, 2 * x), np.minimum(2 * x, 0.0), 2.0)
+    slope[0] = 0.0
+    return np.append(slope, 2.0)
 
 
 RANGE_WALK = Effect(

@@ -45,14 +45,18 @@ class Plan(NamedTuple):
     change: np.ndarray
     """(effects, tiles): largest change that it may make, 0..1."""
     error: np.ndarray
-    """(tiles,): sum of what is left out may change; above the tolerance only by what is off."""
+    """(tiles,): sum of what is left out may change, and :attr:`left`; above the tolerance only by
+    this, and by what is off."""
+    left: np.ndarray
+    """(tiles,): change by what effects that are simulated leave out."""
     all_kept: np.ndarray
     """(tiles,) bool: whether nothing is left out that any mode leaves a choice about."""
 
     def some(self, tiles: np.ndarray) -> "Plan":
         """Of some of the tiles, by a mask."""
         kept, change = self.kept[:, tiles], self.change[:, tiles]
-        return Plan(self.names, kept, change, self.error[tiles], self.all_kept[tiles])
+        error, left = self.error[tiles], self.left[tiles]
+        return Plan(self.names, kept, change, error, left, self.all_kept[tiles])
 
 
 def plan(
@@ -75,19 +79,23 @@ def plan(
     decided = _decided(effects, modes or {})
     points.at_rest = decided.get("doppler") == "off"
     points.at_one_range = decided.get("segment_motion") == "off"
+    points.fills_records = decided.get("overlap") == "off"
     with np.errstate(all="ignore"):  # of what exceeds all numbers nothing is known: it is kept
         sizes = sizes_of(points, effects)
         leaking = None
         if decided.get("leakage") == "on" and "leakage" in sizes:
             leaking = {effect.name: effect.stage in _MOVING for effect in effects}
         found = {name: tiles(change) for name, change in changes(sizes, points, leaking).items()}
+        remain = {name: tiles(change) for name, change in remainders(sizes, points).items()}
     there = np.array([name in found for name in names])
     number = max((value.size for value in found.values()), default=1)
     change = np.array([found.get(name, np.zeros(number)) for name in names])
     kept = _kept(change, there, effects, decided, tolerance)
-    error = np.where(kept, 0.0, change).sum(axis=0)
+    error, left = np.where(kept, 0.0, change).sum(axis=0), np.zeros(number)
+    for name, value in remain.items():
+        left = left + np.where(kept[names.index(name)], value, 0.0)
     choice = there & np.array([name not in decided for name in names])
-    return Plan(names, kept, change, error, kept[choice].all(axis=0))
+    return Plan(names, kept, change, error + left, left, kept[choice].all(axis=0))
 
 
 def sizes_of(points: Points, effects: Sequence[Effect] = EFFECTS) -> dict[str, Size]:
@@ -198,6 +206,26 @@ def changes(
             most = np.maximum(most, np.minimum(moved, sizes["leakage"].chance))
         change = np.maximum(_sum(total, points), _most(most, points))
         found[name] = np.fmin(np.maximum(change, size.chance), 1.0)
+    return found
+
+
+def remainders(sizes: Mapping[str, Size], points: Points) -> dict[str, np.ndarray]:
+    """Change of pd or |X| that each effect leaves where it is simulated, as of :func:`changes`."""
+    left = {name: size.left for name, size in sizes.items() if _is_there(size.left)}
+    if not left:
+        return {}
+    low, high = plausible(sizes, points)
+    b = points.looks.scaled(points.threshold)
+    at = np.minimum(np.maximum(0.5 * (b + np.sqrt(b * b + 2)), low), high)
+    steep = np.sqrt(at * points.looks.sharper * points.threshold / (2 * math.pi))
+    near = np.exp(-0.5 * (at - b) ** 2)
+    found = {}
+    for name, share in left.items():
+        # of itself, and of the magnitude that all lines make together in a whole record
+        more = sizes[name].left_of_all * points.level * points.looks.sharper
+        total = np.minimum(share * steep, 0.5 * more) * near
+        most = np.minimum(share * np.minimum(high, 1.0), more / np.maximum(low, 1.0))
+        found[name] = np.minimum(np.maximum(_sum(total, points), _most(most, points)), 1.0)
     return found
 
 

@@ -6,7 +6,7 @@ that exist. All points share words and the parameters that :meth:`Points.whole` 
 """
 
 from collections.abc import Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,7 +35,7 @@ from sweep.model.preparation import (
     relative_amplitude,
 )
 from sweep.model.threshold import tnr_of
-from sweep.model.window import Window, canonical_name, window
+from sweep.model.window import Window, canonical_name, samples, window
 
 _CHEBYSHEV = (1.4, 2.5, 8.0)
 _NEAR_EDGE = 8.0
@@ -72,6 +72,50 @@ class Smear(NamedTuple):
 NO_SMEAR = Smear()
 
 
+class Missing(NamedTuple):
+    """Samples of the record that are taken before the echo arrives, by segment."""
+
+    lost: np.ndarray
+    """Sum |w| over them, over sum w."""
+    step: np.ndarray
+    """Factor on the sidelobes of a rectangular window that bounds what their lack adds to others,
+    relative to sum w."""
+    cells: np.ndarray
+    """Most that |w| of a sample about the first one comes to, over sum w."""
+    middle: np.ndarray
+    """Bound on the mean place, -1..1, of what is left in the record."""
+    all: np.ndarray
+    """True where all samples lack."""
+
+
+def missing_of(window: Window, first: np.ndarray) -> Missing:
+    """Bounds for records of which the first samples have no echo.
+
+    The transform of the samples that lack is at most their variation over 2 sin(pi y / L), and so
+    is that of the samples that are left, which is what the sidelobes are where these are fewer.
+    """
+    lost, before, after, level = _of_samples(window)
+    share = lost[first]
+    step = np.minimum(before[first], after[first]) * (window.length / window.sum)
+    with np.errstate(divide="ignore"):
+        middle = np.minimum(share / np.maximum(1 - share, 1e-300), 1.0)
+    step = np.where(first > 0, step, 0.0)
+    return Missing(share, step, level[first], middle, first >= window.length)
+
+
+@lru_cache(maxsize=8)
+def _of_samples(window: Window) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Bounds of :func:`missing_of` by the number of samples that lack, (L + 1,) each."""
+    w = samples(window.name, window.length)
+    size = np.abs(w)
+    lost = np.append(0.0, np.cumsum(size)) / window.sum
+    rises = np.append(0.0, np.cumsum(np.abs(np.diff(w))))  # up to each sample
+    before = 0.5 * (size[0] + rises + size)
+    after = 0.5 * (size + rises[-1] - rises + size[-1])
+    before, after = np.append(0.0, before), np.append(after, 0.0)
+    return lost, before, after, np.append(size, size[-1]) / window.sum
+
+
 def by_power(change: np.ndarray) -> np.ndarray:
     """Relative change of a magnitude by that of its power, downwards, which is the larger one."""
     return np.asarray(1 - np.sqrt(1 - np.minimum(change, 1.0)))
@@ -102,6 +146,8 @@ class Points:
         """True where the Doppler effect is off."""
         self.at_one_range = False
         """True where the target stands still between segments."""
+        self.fills_records = False
+        """True where the effect of overlap is off."""
         self.smears: dict[str, Smear] = {}
         """Of the effects that smear lines, by name."""
         number = self.whole(resolution.BEAMLETS)
@@ -330,6 +376,40 @@ class Points:
         return self.carriers * beta - self.signs * beat
 
     @cached_property
+    def missing(self) -> Missing | None:
+        """Samples of the record without an echo; None where echoes fill all records."""
+        if self.fills_records:
+            return None
+        delay = self.delay
+        if not self.at_one_range:
+            delay = delay - (2 / SPEED_OF_LIGHT * self.approach + self.faster / 2) * self.starts
+        first = waveform.samples_before_echo(
+            delay=delay, beta=self.faster + (0.0 if self.at_rest else self.beta),
+            start=self.start, sample_rate=self.sample_rate, length=self.window.length,
+        )  # fmt: skip
+        if not first.any():
+            return None
+        return missing_of(self.window, np.broadcast_to(first, self.frequency.shape))
+
+    def tail(self, distance: np.ndarray) -> np.ndarray:
+        """Largest magnitude of a bin at least ``distance`` [bins] from a line, over its peak's.
+
+        The peak is that of a whole record.
+        """
+        found = self.lobe.tail(distance)
+        if self.missing is None:
+            return found
+        other = lobe("rectangular", self.window.length, self.fft_size)
+        more = self.missing.step * other.tail(distance - self.margin)
+        return np.asarray(found + np.minimum(more, self.missing.lost))
+
+    def left_of(self, power: np.ndarray) -> np.ndarray:
+        """Least power of the largest bin, by that of a whole record, over that of all on a bin."""
+        if self.missing is None:
+            return power
+        return np.asarray(np.maximum(np.sqrt(power) - self.missing.lost, 0.0) ** 2)
+
+    @cached_property
     def metres_between(self) -> np.ndarray:
         """Most metres by which the target moves from the shot's start to a segment's own."""
         last = self.starts + self.late
@@ -457,7 +537,7 @@ class Points:
         """Most that images add to the largest bin, over the magnitude that lines make in phase."""
         smeared = 1 + 2 * self.smeared / self.margin
         uphill = np.exp(np.minimum(self.tilt * self.spread.extreme, 50.0))
-        outside = self.lobe.tail(self.apart) * np.sqrt(smeared)
+        outside = self.tail(self.apart) * np.sqrt(smeared)
         return np.asarray(uphill * outside / self.lobe.near(self.offset))
 
     @property

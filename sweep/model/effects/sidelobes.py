@@ -56,13 +56,13 @@ def image_size(points: Points) -> Size | None:
     """
     if points.word(RECORD) == "complex":
         return None
-    alarms, form, apart = _alarm_change(points), points.lobe, points.apart
+    alarms, apart = _alarm_change(points), points.apart
     beside = _beside(points)
     if points.adds_amplitudes:
         return Size(added=points.image, alarms=alarms, beside=beside)
-    least = points.powers[0] / (1 + 2 * points.smeared / points.margin)
-    outside = form.tail(apart)
-    inside, further = form.tail(1.5 * apart), form.tail(0.5 * apart)
+    least = points.left_of(points.powers[0] / (1 + 2 * points.smeared / points.margin))
+    outside = points.tail(apart)
+    inside, further = points.tail(1.5 * apart), points.tail(0.5 * apart)
     far = further * further + outside * outside
     power = np.maximum(inside * inside, np.maximum(far - least, 0.0)) / least
     return Size(magnitude=np.sqrt(1 + power) - 1, alarms=alarms, beside=beside)
@@ -74,7 +74,7 @@ def _beside(points: Points) -> np.ndarray:
     These cross with probabilities of y e^-y a^2 / 2 where a is small, y = b^2 / 2. Images fall no
     slower than 1 / k from ``apart`` on, so all bins have ``apart`` times the nearest's a^2.
     """
-    image = points.level * points.footprint.gain * points.lobe.tail(points.apart)
+    image = points.level * points.footprint.gain * points.tail(points.apart)
     square, b = np.minimum(image, _HUGE) ** 2, points.threshold
     y = 0.5 * b * b
     alone = np.minimum(square / b, np.sqrt(square))
@@ -94,9 +94,19 @@ def _alarm_change(points: Points) -> np.ndarray | float:
     extreme = np.minimum(points.spread.extreme + points.smeared, half)
     whole = np.maximum(points.level * points.footprint.gain, 1e-300)
     away = np.minimum(form.within(points.threshold / whole), half)
+    if points.missing is not None:  # sidelobes of an echo that begins with a step
+        step = np.maximum(whole * points.missing.step, 1e-300)
+        edge = lobe("rectangular", points.window.length, points.fft_size)
+        away = np.minimum(
+            np.maximum(
+                form.within(0.5 * points.threshold / whole),
+                edge.within(0.5 * points.threshold / step) + points.margin,
+            ),
+            half,
+        )
     moved: np.ndarray | float = 0.0
     for distance in (np.maximum(2 * points.apart - away, points.apart), 2 * points.apart + away):
-        share = np.minimum(whole * form.tail(distance) / points.threshold, 1.0)
+        share = np.minimum(whole * points.tail(distance) / points.threshold, 1.0)
         moved = moved + (share if points.adds_amplitudes else share * share / 2)
     reach = away + extreme
     bins = (moved * reach)[chirps].sum(axis=0)
@@ -136,20 +146,33 @@ def leakage_size(points: Points) -> Size:
     over = points.level * points.footprint.gain * np.where(near, 2.0, _IMAGES) / b
     over = np.where(np.isnan(over), np.inf, over)
     reach = np.where(near, np.inf, points.spread.extreme + points.smeared)
-    row = np.searchsorted(_REACHES, reach)
+    if points.missing is None:
+        return Size(chance=_chance(points, points.window.name, over, reach))
+    # Sidelobes of two kinds, of which one is the larger in any bin.
+    late = 2 * over * points.missing.step
+    chance = _chance(points, points.window.name, 2 * over, reach)
+    return Size(chance=chance + _chance(points, "rectangular", late, reach + points.margin))
+
+
+def _chance(points: Points, window_name: str, over: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """Probability in all segments together, of sidelobes of a window.
+
+    By their lines' magnitude over the threshold, and the bins that light may be moved by.
+    """
+    b, row = points.threshold, np.searchsorted(_REACHES, reach)
     octave = np.clip(np.log2(over), _FAINTEST, _STRONGEST)
     place = np.minimum((octave - _FAINTEST) * _OCTAVES + 1, (_STRONGEST - _FAINTEST) * _OCTAVES)
     place = place.astype(np.int64)
     step = np.floor(np.log(np.clip(b, 1e-3, 1e4)) / math.log(_LEVELS))
     steps, which = np.unique(step, return_inverse=True)
-    shape = points.window
+    length = points.window.length
     tables = np.array([
-        table(shape.name, shape.length, points.fft_size, _LEVELS**float(v), points.looks)
+        table(window_name, length, points.fft_size, _LEVELS**float(v), points.looks)
         for v in steps
     ])  # fmt: skip
     chance = tables[which.reshape(np.shape(b)), row, place]
     faint = np.minimum(over / 2.0**_FAINTEST, 1.0) ** 2
-    return Size(chance=(chance * faint).sum(axis=0))
+    return np.asarray((chance * faint).sum(axis=0))
 
 
 @lru_cache(maxsize=256)

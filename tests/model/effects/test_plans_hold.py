@@ -124,6 +124,7 @@ FURTHER = {
         "instrument.telescope.coupling": "single_mode",
         "instrument.telescope.misalignment": sizes_of_many(rng, -7, -4),
     },
+    "overlap": lambda rng: {},
     "saturation": lambda rng: {
         "instrument.processing.full_scale": 10 ** rng.uniform(-3, 0, POINTS)
     },
@@ -142,7 +143,8 @@ def test_no_further_effect_changes_more_than_its_size(table_4_1, kind, name):
             table_4_1, POINTS, seed, fft_size=2**13, bins_counted="all",
             **{"beamlets": 7, "radial_velocity": slow} | KINDS[kind],
         ) | FURTHER[name](rng)  # fmt: skip
-        others = some_of(rng, "") | {"doppler"} | ({"range_walk"} if seed % 2 else set()) - {name}
+        others = some_of(rng, "") | {"doppler"} | ({"range_walk"} if seed % 2 else set())
+        others = (others | ({"overlap"} if seed > 1 else set())) - {name}
         made = planned(points_of(parameters), {}, 1.0)
         most = made.change[made.names.index(name)]
         on, off = found(parameters, others | {name}), found(parameters, others)

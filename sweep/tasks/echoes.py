@@ -1,0 +1,208 @@
+"""Echoes of a study that arrive after their record, or that are read as another range, in words.
+
+A record begins at the acquisition delay and ends fft_size samples later, or where the chirp does.
+An echo is there from 2 R / c on. Beats beyond half the sample rate fold, and the readings of three
+peaks, or of two by an assumption, then give another range. Both follow from a few parameters, so
+they are told of a whole grid, and of shots spread over a flight, before anything runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from sweep.model import waveform
+from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.effects.catalogue import DEFAULTS
+from sweep.model.effects.points import missing_of
+from sweep.model.preparation import CHIRP, LASER, PROCESSING, RECEIVER, RECORD, categories
+from sweep.model.shot import MISREAD_BINS
+from sweep.model.window import canonical_name, window
+from sweep.tasks.flight_study import FlightStudy
+
+if TYPE_CHECKING:
+    from sweep.tasks.grid_study import GridStudy
+
+LOSS_DB = 3.0
+"""Loss of an echo's power beyond which is warned of."""
+
+POINTS_MAX = 200_000
+"""Points of the grid of the parameters that matter; of larger grids so many, spread over them."""
+
+FLIGHT_TILES = 16
+"""Tiles of a flight's shots that are looked at, of each scanner."""
+
+PARAMETERS = (
+    "target.range", "target.radial_velocity", LASER + "wavelength", CHIRP + "bandwidth",
+    CHIRP + "duration", CHIRP + "start_frequency", waveform.ORDER, waveform.DOPPLER_SLOPE,
+    waveform.DOWN_SLOPE, PROCESSING + "acquisition_delay", PROCESSING + "sample_rate",
+    PROCESSING + "fft_size", PROCESSING + "window", waveform.TWO_BEATS, RECORD,
+    RECEIVER + "architecture",
+)  # fmt: skip
+"""Parameters by which echoes arrive and are read."""
+
+
+class Echoes(NamedTuple):
+    """Echoes of n points."""
+
+    range: np.ndarray
+    """(n,) [m]."""
+    lost: np.ndarray
+    """(n,): share of the window's sum before the echo arrives, 0..1; 1: it never does."""
+    misread: np.ndarray
+    """(n,): true where its beats are read as another range or velocity."""
+
+
+def echoes_of(parameters: Mapping[str, Any]) -> Echoes:
+    """Find when the echoes of points arrive, and how their beats are read, without a footprint."""
+    needed = {path: v for path, v in parameters.items() if path in PARAMETERS}
+    number = max((np.size(value) for value in needed.values()), default=1)
+    needed["target.range"] = np.broadcast_to(needed["target.range"], (number,))
+    needed |= {path: DEFAULTS[path] for path in DEFAULTS if path not in needed}
+    needed |= {"footprint.beamlets": 1}
+    found = Echoes(np.zeros(number), np.zeros(number), np.zeros(number, bool))
+    for index, p in categories(needed):
+        shape = window(canonical_name(str(p[PROCESSING + "window"])), int(p["record"]))
+        range_, velocity = (p[name] for name in ("target.range", "target.radial_velocity"))
+        first = waveform.samples_before_echo(
+            delay=2 / SPEED_OF_LIGHT * range_, beta=0.0,
+            start=p[PROCESSING + "acquisition_delay"],
+            sample_rate=p[PROCESSING + "sample_rate"], length=shape.length,
+        )  # fmt: skip
+        found.range[index] = range_
+        found.lost[index] = np.where(
+            first >= shape.length, 1.0, np.minimum(missing_of(shape, first).lost, 1.0)
+        )
+        found.misread[index] = _is_misread(p, range_, np.asarray(velocity))
+    return found
+
+
+def _is_misread(p: Mapping[str, Any], range_: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+    """Return true where a target's beats, as a spectrum shows them, tell another target, (n,)."""
+    carriers, slopes = waveform.carriers_of(p), waveform.slopes_of(p)
+    rate = p[CHIRP + "bandwidth"] / p[CHIRP + "duration"]
+    sample_rate, signed = p[PROCESSING + "sample_rate"], str(p[RECORD]) == "complex"
+    width = sample_rate / int(p[PROCESSING + "fft_size"])
+    there = waveform.order_of(str(p[RECEIVER + "architecture"]), str(p[waveform.ORDER]))
+    peaks = []
+    for slope, carrier in zip(slopes, carriers, strict=True):
+        beat = waveform.beat_frequency(
+            slope, carrier=carrier, chirp_rate=rate, range=range_, radial_velocity=velocity
+        )
+        turned = beat - sample_rate * np.floor(beat / sample_rate + 0.5)
+        peaks.append((turned if signed else np.abs(turned)) + 0 * range_)
+    assumed = str(p[waveform.TWO_BEATS])
+    if slopes == waveform.SIGNS:
+        read = waveform.resolve(
+            up=peaks[0], doppler=peaks[1] if "doppler" in there else None, down=peaks[2],
+            carrier=carriers[0], bandwidth=p[CHIRP + "bandwidth"], duration=p[CHIRP + "duration"],
+            sample_rate=sample_rate, bin_width=width, signed=signed, assumed=assumed,
+        )  # fmt: skip
+    else:
+        shape = 3, range_.size
+        weights = [float(name in there) for name in waveform.SEGMENTS]
+        columns = [np.broadcast_to(carrier, range_.shape) for carrier in carriers]
+        rates = [np.broadcast_to(slope * rate, range_.shape) for slope in slopes]
+        read = waveform.fit(
+            np.array(peaks), weights=np.broadcast_to(np.reshape(weights, (3, 1)), shape),
+            carriers=np.array(columns), rates=np.array(rates),
+            sample_rate=np.broadcast_to(sample_rate, range_.shape),
+            bin_width=np.broadcast_to(width, range_.shape), signed=signed, assumed=assumed,
+        )  # fmt: skip
+    metres = MISREAD_BINS * width / (2 / SPEED_OF_LIGHT * rate)
+    speed = MISREAD_BINS * width * SPEED_OF_LIGHT / carriers[0]
+    off = np.abs(read.range - range_) > metres
+    return np.asarray(off | (np.abs(read.radial_velocity - velocity) > speed))
+
+
+def warnings_of(study: GridStudy | FlightStudy) -> Iterator[str]:
+    """Echoes that a study has not, has in part, or reads as others, a sentence each."""
+    flight = isinstance(study, FlightStudy)
+    echoes = _of_flight(study) if isinstance(study, FlightStudy) else _of_grid(study)
+    if not echoes.range.size:
+        return
+    points, gated = "shots" if flight else "points", study.spec.modes()["overlap"] != "off"
+    none = (echoes.lost >= 1) if gated else np.zeros(echoes.lost.shape, bool)
+    if none.any():
+        yield (
+            f"no echo arrives before its record ends at {_share(none)} of the {points}, "
+            f"{_where(none, echoes.range)}: nothing is detected there. A record lasts from "
+            "processing.acquisition_delay for processing.fft_size samples, up to chirp.duration, "
+            "and an echo arrives after 2R/c"
+        )
+    with np.errstate(divide="ignore"):
+        weak = gated & ~none & (20 * np.log10(1 - np.minimum(echoes.lost, 1.0)) < -LOSS_DB)
+    if weak.any():
+        yield (
+            f"echoes that arrive after their record has begun lose more than {LOSS_DB:g} dB at "
+            f"{_share(weak)} of the {points}, {_where(weak, echoes.range, none)}: raise "
+            "processing.acquisition_delay to the largest 2R/c, and chirp.duration with it"
+        )
+    wrong = echoes.misread & ~none
+    if wrong.any():
+        yield (
+            f"the peaks are read as another range or velocity at {_share(wrong)} of the {points}, "
+            f"{_where(wrong, echoes.range, none)} (misread): beats beyond half the sample rate "
+            "fold, and two beats are read by processing.two_beats. What is detected there has a "
+            "wrong range or velocity: raise processing.sample_rate, or lower chirp.bandwidth over "
+            "chirp.duration"
+        )
+
+
+def _share(some: np.ndarray) -> str:
+    return f"{100 * np.count_nonzero(some) / some.size:.3g} %"
+
+
+def _where(some: np.ndarray, ranges: np.ndarray, dark: np.ndarray | None = None) -> str:
+    """Ranges of some points: from one on where all beyond are among them, or are ``dark``."""
+    if dark is not None and dark.any():
+        some, ranges = some[~dark], ranges[~dark]
+    low, high = ranges[some].min(), ranges[some].max()
+    if some.all():
+        return "at all ranges"
+    if some[ranges >= low].all():
+        return f"from {low:,.6g} m on"
+    if some[ranges <= high].all():
+        return f"up to {high:,.6g} m"
+    return f"at ranges of {low:,.6g} to {high:,.6g} m"
+
+
+def _of_grid(study: GridStudy) -> Echoes:
+    axes = study.spec.axes
+    sizes = [axis.size for axis in axes]
+    used = [
+        np.arange(axis.size if any(m.path in PARAMETERS for m in axis.members) else 1)
+        for axis in axes
+    ]
+    number = int(np.prod([v.size for v in used], dtype=np.int64)) if used else 1
+    few = np.arange(number)
+    if number > POINTS_MAX:
+        few = np.unique(np.linspace(0, number - 1, POINTS_MAX).astype(np.int64))
+    if sizes:
+        few = np.ravel_multi_index(np.unravel_index(few, [v.size for v in used]), sizes)
+    return echoes_of(study.grid.parameters_at(few))
+
+
+def _of_flight(study: FlightStudy) -> Echoes:
+    from sweep.model.eyepoints import seen_ground
+    from sweep.scenes.eyepoint_arrays import from_arrays
+
+    found = []
+    ends = {tuple(k * (int(axis.size) - 1) for axis in study.spec.axes) for k in (0, 1)}
+    for eyepoints in study.eyepoint_studies():
+        seen = from_arrays(eyepoints.cast(eyepoints.tiles(FLIGHT_TILES)), eyepoints.weight)
+        there = seen.seen.nonzero()[0]
+        if not there.size:
+            continue
+        for place in sorted(ends):
+            part = study.scanners[eyepoints.scanner].first_part(place)
+            parameters = DEFAULTS | dict(study.parameters_at(part))
+            shots, _ = seen_ground(seen.some(there), parameters, study.surfaces)
+            found.append(echoes_of(shots))
+    return (
+        Echoes(*map(np.concatenate, zip(*found, strict=True)))
+        if found
+        else Echoes(*[np.empty(0)] * 3)
+    )

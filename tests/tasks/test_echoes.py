@@ -1,0 +1,149 @@
+"""Echoes that arrive after their record, or are read as others: told in plan and run, flagged."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from small import STUDY, quiet, small
+from small_flights import SCENE, small_scene
+
+import sweep
+from sweep.cli import main
+from sweep.model.pairing import FLAGS
+from sweep.tasks.echoes import warnings_of
+from sweep.tasks.studies import study_of
+
+WITHIN = {"range": "1 km", "grazing_angle": "90 deg", "radial_velocity": "0 m/s",
+          "reflectance": 0.1}  # fmt: skip
+
+
+def told(spec):
+    return list(warnings_of(study_of(spec, Path("nowhere.zarr").absolute())))
+
+
+def along(*ranges, **sections):
+    """The small study, of records of 27.3 us from 0 on, over some ranges."""
+    return small(target=WITHIN, axes={"target.range": list(ranges)}, **sections)
+
+
+def record(**processing):
+    """Instrument of the small study with other records."""
+    return {**STUDY["instrument"], "processing": STUDY["instrument"]["processing"] | processing}
+
+
+def test_records_that_hold_all_of_their_echoes_are_not_told_of():
+    assert told(along("1 km", "2 km", instrument=record(acquisition_delay="14 us"))) == []
+    assert told(along("1 m", "100 m")) == []
+
+
+def test_no_echo_and_half_an_echo_are_told_with_the_range_from_which_on():
+    ranges = [f"{r} m" for r in (500, 1000, 2000, 3000, 4000, 4200, 5000)]
+    none, weak = told(along(*ranges))
+    assert none.startswith("no echo arrives") and "28.6 % of the points" in none
+    assert "from 4,200 m on" in none and "nothing is detected" in none
+    # Hamming's window of 4,093 m has lost 3 dB of its sum where 0.29 of its power is missing
+    assert "more than 3 dB at 42.9 % of the points, from 2,000 m on" in weak
+    assert "processing.acquisition_delay" in weak
+
+
+def test_nothing_is_told_of_overlap_where_it_is_off():
+    assert told(along("1 km", "5 km", effects={"overlap": "off"})) == []
+
+
+def test_axes_that_change_no_echo_do_not_change_what_is_told():
+    ranges, wide = ["1 km", "5 km"], {"linear": ["1 W", "5 W"], "number": 5000}
+    one = told(along(*ranges))
+    axes = {"target.range": ranges, "instrument.laser.power": wide}
+    assert told(small(target=WITHIN, axes=axes)) == one
+
+
+@pytest.mark.parametrize("kind", ["real", "complex"])
+def test_beats_that_fold_are_told_with_the_range_from_which_on(kind):
+    """1 GHz in 500 us are 13.34 kHz a metre: 300 MHz, half the sample rate, at 22.48 km."""
+    instrument = record(fft_size="2^17", acquisition_delay="0 us")
+    instrument["receiver"] = instrument["receiver"] | {"record": kind}
+    ranges = [f"{km} km" for km in range(1, 61)]
+    off = {"effects": {"overlap": "off"}, "instrument": instrument}
+    (wrong,) = told(along(*ranges, **off))
+    assert "read as another range or velocity" in wrong
+    assert "from 23,000 m on" in wrong
+
+
+def test_points_that_fold_are_flagged_in_the_store(tmp_path):
+    spec = along(
+        "20 km", "22 km", "23 km", "30 km", instrument=record(fft_size="2^17", tnr=5),
+        effects={"overlap": "off"},
+    )  # fmt: skip
+    assert quiet(spec, tmp_path / "far.zarr").complete
+    found = sweep.open(tmp_path / "far.zarr")
+    assert found.misread.values.tolist() == [0, 0, 1, 1]
+    assert (np.abs(found.range_error.values[2:]) > 1e3).all()
+
+
+def test_plan_and_run_warn_in_the_same_words(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    spec = along("1 km", "4 km", "5 km")
+    Path("late.yaml").write_text(spec.to_yaml() if hasattr(spec, "to_yaml") else spec.to_json())
+    runner = CliRunner()
+    for command in (["plan", "late.yaml"], ["run", "late.yaml", "--scheduler", "none"]):
+        result = runner.invoke(main, command)
+        assert result.exit_code == 0, result.output
+        words = " ".join(result.stderr.split())
+        assert "warning: no echo arrives before its record ends at 33.3 % of the points" in words
+        assert "from 5,000 m on" in words and "more than 3 dB" in words
+
+
+# Flights
+
+
+def hover(height, **processing):
+    """A lidar that hovers above a plain, in dim light so that noise decides nothing."""
+    instrument = SCENE["instrument"] | {
+        "chirp": STUDY["instrument"]["chirp"] | {"duration": "20 us", "bandwidth": "40 MHz"},
+        "processing": STUDY["instrument"]["processing"]
+        | {"fft_size": "2^12", "acquisition_delay": "2 us"} | processing,
+    }  # fmt: skip
+    return small_scene(
+        instrument=instrument,
+        scene={"objects": {"ground": {"kind": "plane", "size": "8 km", "reflectance": 0.1}}},
+        platform={
+            "path": {
+                "kind": "straight", "from": ["0 m", "0 m", height], "to": ["9 m", "0 m", height],
+                "initial_speed": "10 m/s",
+            },
+            "attitude": {"kind": "nadir"},
+        },
+        scanners={"down": {"kind": "line", "half_angle": "0.5 deg", "line_rate": "1 Hz",
+                           "rate": "10 Hz"}},
+        axes={},
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("height, seen", [("290 m", True), ("1400 m", False)])
+def test_a_flight_sees_nothing_where_echoes_arrive_after_the_record(tmp_path, height, seen):
+    """Records last from 2 us to 8.83 us: 1,323 m."""
+    spec = hover(height)
+    words = told(spec)
+    assert bool(words) != seen
+    if not seen:
+        assert "100 % of the shots, at all ranges" in words[0]
+    assert quiet(spec, tmp_path / "hover.zarr").complete
+    found = sweep.open_scene(tmp_path / "hover.zarr")["down"].to_dataset()
+    assert bool((found.pd_shot.fillna(0) > 0.5).all()) == seen
+    assert bool((found.flags.values & FLAGS["true"] > 0).any()) == seen
+    if not seen:
+        assert (found.pd_up.fillna(0) == 0).all() and (found.snr_up.fillna(0) == 0).all()
+        assert not (found.flags.values & FLAGS["misread"]).any()
+        assert (found.surfaces_seen == 0).all()
+
+
+def test_a_flight_in_which_beats_fold_is_told_of_and_flags_its_points(tmp_path):
+    """40 MHz in 20 us, 2 THz/s: a beat of 3 MHz, half the sample rate, is 225 m."""
+    spec = hover("400 m", sample_rate="6 MHz", fft_size="2^6", acquisition_delay="3 us", tnr=5)
+    words = told(spec)
+    assert any("read as another range or velocity at 100 % of the shots" in w for w in words)
+    assert quiet(spec, tmp_path / "fold.zarr").complete
+    found = sweep.open_scene(tmp_path / "fold.zarr")["down"].to_dataset()
+    flags = found.flags.values
+    assert (flags & FLAGS["misread"]).any() and not (flags & FLAGS["true"]).any()
