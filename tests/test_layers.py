@@ -33,6 +33,7 @@ NOT_IN_THE_MODEL = {
 }  # fmt: skip
 """Pure physics: arrays in, arrays out."""
 
+
 @cache
 def _nodes(path: Path) -> list[ast.AST]:
     """All that a module is made of."""
