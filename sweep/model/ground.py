@@ -89,7 +89,7 @@ class Plane:
         self._columns, self._size = [np.atleast_1d(column) for column in columns], size
 
     def mean_phasor(self, turn: np.ndarray, delay_cycles: np.ndarray) -> np.ndarray:
-        """Mean of exp(2 pi i (turn dbeta - delay_cycles dR / R)) over the beam's power, (n,) complex.
+        """Mean of exp(2 pi i (turn dbeta - delay_cycles dR / R)) over the beam, (n,) complex.
 
         Parameters
         ----------
