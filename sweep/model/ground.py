@@ -110,7 +110,9 @@ class Plane:
         sigma = (further[0] if further else self._columns[1]) / 4
         phase = (4 * np.pi / SPEED_OF_LIGHT) * np.asarray(turn, float)  # by 1 m/s
         t = 2 * np.pi * (np.asarray(turn, float) * slopes.beta - delay_cycles * slopes.range)
-        bent = 1 / (1 + 1j * phase * radial * sigma**2)
+        curve = phase * radial * sigma**2
+        curve = curve + 2 * np.pi * np.asarray(delay_cycles, float) * (self._columns[1] / 4) ** 2
+        bent = 1 / (1 + 1j * curve)
         mean = (1 + 1j * slopes.echo * t * bent) * np.exp(-0.5 * t * t * bent) * bent
         return np.asarray(mean + np.zeros(self._size))
 
