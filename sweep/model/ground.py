@@ -57,6 +57,17 @@ class Footprints(NamedTuple):
     """(rows, beamlets): power fraction x backscatter [1/sr] x (R_0/R_b)^2, for reflectance 1."""
 
 
+class Slopes(NamedTuple):
+    """Changes across a beam for one of its standard deviations, (n,) each."""
+
+    beta: np.ndarray
+    """Of the Doppler ratio 2 v_r / c."""
+    range: np.ndarray
+    """Of the range over that on the axis."""
+    echo: np.ndarray
+    """Of the echo power over that on the axis."""
+
+
 class Plane:
     """A flat plane, for `size` points of one category, parameters as arrays.
 
@@ -77,24 +88,43 @@ class Plane:
         columns = np.broadcast_arrays(p["target.grazing_angle"], places, *velocities, *further)
         self._columns, self._size = [np.atleast_1d(column) for column in columns], size
 
-    def turned(self, turn: np.ndarray) -> np.ndarray:
-        """Mean over the beam's power of exp(2 pi i turn (beta_b - beta_0)), (n,) complex.
+    def mean_phasor(self, turn: np.ndarray, delay_cycles: np.ndarray) -> np.ndarray:
+        """Mean of exp(2 pi i (turn dbeta - delay_cycles dR / R)) over the beam, (n,) complex.
 
-        ``turn`` [cycles per beta] is (n,) or a scalar. To second order a beamlet x across and y
-        along the slope, in standard deviations, has the phase t y + c (x^2 + y^2), and its echo
-        goes as 1 + k y. With Gaussian x and y the mean is
+        Parameters
+        ----------
+        turn
+            Cycles per unit of Doppler ratio, (n,) or scalar; dbeta is beta_b - beta_0.
+        delay_cycles
+            Cycles per unit of relative range, (n,) or scalar; dR / R is (R_b - R_0) / R_0.
+
+        Notes
+        -----
+        To second order a beamlet x across and y along the slope, in standard deviations, has the
+        phase t y + c (x^2 + y^2), and its echo goes as 1 + k y. With Gaussian x and y the mean is
 
             (1 + i k t / (1 - 2 i c)) exp(-t^2 / 2 / (1 - 2 i c)) / (1 - 2 i c)
         """
-        angle, places, radial, transverse, *further = self._columns
+        _, _, radial, _, *further = self._columns
+        slopes = self.slopes
+        sigma = (further[0] if further else self._columns[1]) / 4
         phase = (4 * np.pi / SPEED_OF_LIGHT) * np.asarray(turn, float)  # by 1 m/s
+        t = 2 * np.pi * (np.asarray(turn, float) * slopes.beta - delay_cycles * slopes.range)
+        curve = phase * radial * sigma**2
+        curve = curve + 2 * np.pi * np.asarray(delay_cycles, float) * (self._columns[1] / 4) ** 2
+        bent = 1 / (1 + 1j * curve)
+        mean = (1 + 1j * slopes.echo * t * bent) * np.exp(-0.5 * t * t * bent) * bent
+        return np.asarray(mean + np.zeros(self._size))
+
+    @property
+    def slopes(self) -> "Slopes":
+        """Changes for a standard deviation of the beam towards the near side, (n,) each."""
+        angle, places, _, transverse, *further = self._columns
+        lean = (places / 4) / np.tan(angle)
         sigma = (further[0] if further else places) / 4
-        t = phase * transverse * sigma
-        bent = 1 / (1 + 1j * phase * radial * sigma**2)
         power = 3 if self._law == "lambert" else 2
-        lean = power * (places / 4) / np.tan(angle)
-        found = (1 + 1j * lean * t * bent) * np.exp(-0.5 * t * t * bent) * bent
-        return np.asarray(found + np.zeros(self._size))
+        columns = 2 / SPEED_OF_LIGHT * transverse * sigma, -lean, power * lean
+        return Slopes(*(np.broadcast_to(column, self._size) for column in columns))
 
     def axis(self, size: int) -> Footprints:
         """One line for each point: a row for each distinct grazing angle."""

@@ -245,16 +245,36 @@ def _spread(p: Mapping[str, np.ndarray], size: int, most: int) -> Spread:
     )
     if "target.roughness" not in p or not np.any(p["target.roughness"]):
         return spread
-    # Speckle that is drawn turns by Doppler shifts until the last segment, a few records later.
+    # Amplitudes that are drawn turn against each other from segment to segment, by Doppler shifts
+    # and, as the echoes of segments differ in optical frequency, by ranges.
     starts = waveform.segment_starts(
         waveform.order_of("", str(p[waveform.ORDER])),
         duration=p[CHIRP + "duration"], gap=p[waveform.GAP],
     )  # fmt: skip
-    later = 2 * np.maximum.reduce(starts) * bins
-    # by twice as much, as sums over records hardly look at their ends
-    slope, curve = (np.vstack([rows, later * rows[1]]) for rows in (spread.slope, spread.curve))
-    moved = later * per_speed * velocities.rms + nothing
+    later = np.maximum.reduce(starts) * bins
+    delay = 2 / SPEED_OF_LIGHT * p["target.range"]
+    apart = _carriers_apart(p) * delay
+    # Each by twice as much, as sums over records hardly look at their ends.
+    slope = np.vstack([spread.slope, 2 * (later * spread.slope[1] + apart * slope)])
+    curve = np.vstack([spread.curve, 2 * (later * spread.curve[1] + apart * sigma**2 / 2)])
+    moved = 2 * (later * per_speed * velocities.rms + apart * rms) + nothing
     return Spread(np.maximum(spread.deviation, moved), slope, curve)
+
+
+def _carriers_apart(p: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Largest difference between two segments of the optical frequency in mid-record [Hz].
+
+    Equation (1) of :mod:`sweep.model.speckle_correlation`.
+    """
+    rate = p[CHIRP + "bandwidth"] / p[CHIRP + "duration"]
+    length = p["record"] / p[PROCESSING + "sample_rate"]
+    middle = p[PROCESSING + "acquisition_delay"] + length / 2
+    since = middle - 2 / SPEED_OF_LIGHT * p["target.range"]
+    frequencies = [
+        carrier + slope * rate * since
+        for carrier, slope in zip(waveform.carriers_of(p), waveform.slopes_of(p), strict=True)
+    ]
+    return np.max(frequencies, axis=0) - np.min(frequencies, axis=0)
 
 
 def nodes_needed(

@@ -36,14 +36,17 @@ peaks are drawn, and in the probabilities of a flight, its leaked signal fades w
 
 import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.effect import Effect, Parameter, Realisation, Scene, Size
 from sweep.model.effects.points import Points
-from sweep.model.ground import Plane
+from sweep.model.ground import Plane, Slopes
 from sweep.model.preparation import Shots
+from sweep.model.speckle_correlation import NARROW, SEGMENT_PAIRS, LineSpread, bin_correlation
 
 _ROUGHNESS = "target.roughness"
 _LAW = "footprint.speckle"
@@ -179,30 +182,113 @@ def fade(shots: Shots, scene: Scene) -> Shots:
     law = str(scene.parameters[_LAW])
     if law == "none" or shots.architecture == "direct" or not shots.incoherent:
         return shots
-    up, doppler, down = shots.schedule
-    turns = np.stack([shots.carriers[0] * lag for lag in (doppler - up, down - up, down - doppler)])
-    if not shots.doppler.any():
-        found = np.ones((3, shots.size), complex)
-    elif isinstance(scene.ground, Plane):
-        found = np.stack([scene.ground.turned(turn) for turn in turns])
+    phases = segment_phases(shots)
+    if isinstance(scene.ground, Plane):
+        slopes = scene.ground.slopes
+        correlations = [scene.ground.mean_phasor(*phase) for phase in phases]
+        across = [np.zeros(shots.size)] * len(phases)
     else:
-        found = _turned(shots, turns)
-    return replace(shots, fading=Fading(*found))
+        slopes = _cast_slopes(shots)
+        mean, variance = _phase_moments(shots, phases)
+        correlations = list(np.exp(1j * mean - 0.5 * variance))
+        across = [
+            np.maximum(total - phase.along(slopes) ** 2, 0.0)
+            for total, phase in zip(variance, phases, strict=True)
+        ]
+    for pair, phase in enumerate(phases):
+        lines = _line_spread(shots, SEGMENT_PAIRS[pair], phase, slopes)
+        wide = np.flatnonzero(lines.widest > NARROW)
+        if wide.size:
+            of_bins = bin_correlation(shots.window, lines.at(wide))
+            correlations[pair] = correlations[pair].astype(complex)
+            correlations[pair][wide] = of_bins * np.exp(-0.5 * across[pair][wide])
+    return replace(shots, fading=Fading(*correlations))
 
 
-def _turned(shots: Shots, turns: np.ndarray) -> np.ndarray:
-    """Mean turns of beamlets rays have found, (3, n): turns [cycles per beta] (3,) or (3, n).
+class PhaseDifference(NamedTuple):
+    """Phase by which scatterers' echoes differ between two segments, (n,) each."""
 
-    Doppler shifts go evenly across a beam, Gaussian as it is, so that mean and deviation tell all.
-    A sum over few rays would repeat itself where their shifts are whole turns apart.
+    turn: np.ndarray
+    """Cycles per unit of the Doppler ratio beta."""
+    delay_cycles: np.ndarray
+    """Cycles per unit of relative range, with the opposite sign."""
+
+    def along(self, slopes: Slopes) -> np.ndarray:
+        """Phase for a standard deviation of the beam [rad], (n,)."""
+        return 2 * np.pi * (self.turn * slopes.beta - self.delay_cycles * slopes.range)
+
+
+def segment_phases(shots: Shots) -> list[PhaseDifference]:
+    """Phase differences of the second from the first segment of each of SEGMENT_PAIRS.
+
+    By equation (1) of :mod:`sweep.model.speckle_correlation`.
     """
-    power, phase = shots.amplitude**2, 2 * np.pi * turns
+    middle = shots.acquisition_delay + shots.record_duration / 2
+    delay = 2 * shots.range / SPEED_OF_LIGHT
+    echo_frequency = [
+        carrier + slope * shots.chirp_rate * (middle - delay)
+        for carrier, slope in zip(shots.carriers, shots.slopes, strict=True)
+    ]
+    turned = [f * (t + middle) for f, t in zip(echo_frequency, shots.schedule, strict=True)]
+    return [
+        PhaseDifference(
+            np.broadcast_to(turned[second] - turned[first], shots.size),
+            delay * (echo_frequency[second] - echo_frequency[first]),
+        )
+        for first, second in SEGMENT_PAIRS
+    ]
+
+
+def _line_spread(
+    shots: Shots, pair: tuple[int, int], phase: PhaseDifference, slopes: Slopes
+) -> LineSpread:
+    """Spread of lines over the bins of two segments, and the distance of the nearest bins."""
+    bin_width = shots.sample_rate / shots.window.length
+    padding = shots.fft_size / shots.window.length
+    distances, spreads = [], []
+    for segment in (shots.waveform[s] for s in pair):
+        delay = 2 / SPEED_OF_LIGHT * (shots.range - segment.nearer)
+        beat = segment.carrier * segment.beta - segment.chirp_rate * delay * (1 + segment.beta)
+        place = beat / bin_width * padding
+        distances.append(np.broadcast_to((np.rint(place) - place) / padding, shots.size))
+        moved = segment.carrier * slopes.beta - segment.chirp_rate * delay * slopes.range
+        spreads.append(np.broadcast_to(moved / bin_width, shots.size))
+    return LineSpread(
+        (distances[0], distances[1]), (spreads[0], spreads[1]), phase.along(slopes),
+        np.broadcast_to(slopes.echo, shots.size),
+    )  # fmt: skip
+
+
+def _phase_moments(shots: Shots, phases: list[PhaseDifference]) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and variance of the phase differences of beamlets that rays have found, (3, n) each.
+
+    Ranges and Doppler shifts change evenly across a beam, Gaussian as it is, so that these two are
+    enough. A sum of phasors over few rays would repeat itself where their phases are whole turns
+    apart.
+    """
+    mean, covariance = _beamlet_moments(shots)
+    weights = 2 * np.pi * np.array([[phase.turn, -phase.delay_cycles] for phase in phases])
+    variance = np.einsum("pin,ijn,pjn->pn", weights, covariance, weights)
+    return (weights * mean).sum(axis=1), variance
+
+
+def _cast_slopes(shots: Shots) -> Slopes:
+    """Return the changes along the direction in which beamlets' ranges change most, (n,) each."""
+    _, covariance = _beamlet_moments(shots)
+    deviation = np.sqrt(covariance[1, 1])
+    along = covariance[0, 1] / np.maximum(deviation, _SMALLEST)
+    return Slopes(along, deviation, np.zeros(shots.size))
+
+
+def _beamlet_moments(shots: Shots) -> tuple[np.ndarray, np.ndarray]:
+    """Mean (2, n) and covariance (2, 2, n) of beamlets' Doppler ratios and relative ranges."""
+    power = shots.amplitude**2
     share = power / np.maximum(power.sum(axis=1), _SMALLEST)[:, None]
-    mean = (share * shots.doppler).sum(axis=1)
-    square = (share * (shots.doppler - mean[:, None]) ** 2).sum(axis=1)
-    mean, square = mean[shots.row], square[shots.row]
-    phase = phase.reshape(3, -1)
-    return np.asarray(np.exp(1j * phase * mean - 0.5 * phase**2 * square))
+    values = np.array([shots.doppler, shots.offset])
+    mean = (share * values).sum(axis=-1)
+    centred = values - mean[:, :, None]
+    covariance = (share * centred[:, None] * centred[None]).sum(axis=-1)
+    return mean[:, shots.row], covariance[:, :, shots.row]
 
 
 FADING = Effect(

@@ -1,0 +1,146 @@
+"""Correlation of the speckle that the strongest bins of two segments of a shot see.
+
+A scatterer of delay tau and Doppler ratio beta has, in the middle t_c of the record of a segment
+that starts at t_s, the beat phase
+
+    -2 pi F tau + 2 pi F beta (t_s + t_c),    F = f + S (t_c - tau_0)                            (1)
+
+with the carrier f and the signed chirp rate S of the segment, and the delay tau_0 on the beam's
+axis. F is the optical frequency of the echo in the middle of the record. Between two segments the
+phases of scatterers at different places turn against each other by their difference. If all
+scatterers lay in one bin the two amplitudes, circular complex Gaussian numbers both, would have the
+correlation
+
+    mu = E[exp(i (phase_2 - phase_1))]                                                          (2)
+
+over the beam's power. This is exp(-t^2 / 2) if the phase difference is normal with deviation t.
+
+A bin weighs scatterers by the window's transform G about its own frequency. If the footprint spans
+a good part of a bin, or more, the strongest bins of two segments weigh different parts of it. With
+the places nu_i(y) of the lines, y the coordinate along which they spread most,
+
+    mu = int p G(k_1 - nu_1) G(k_2 - nu_2) e^(i t y) dy / sqrt(S_1 S_2),
+    S_i = int p G(k_i - nu_i)^2 dy                                                              (3)
+
+Lines are taken to move evenly along y. Where Doppler shifts change as the square of the angle
+across the beam (150 m/s in a beam of 5 mrad: 3 bins), (2) has that and (3) does not.
+
+The probability that both bins cross a threshold is that of two correlated Rayleigh magnitudes,
+:func:`sweep.model.detection.fading_together`, by |mu|.
+"""
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from sweep.model.window import Window, samples
+
+SEGMENT_PAIRS = ((0, 1), (0, 2), (1, 2))
+"""Up and Doppler, up and down, Doppler and down segment."""
+
+NARROW = 0.01
+"""Spread of a footprint's lines [bins of fs/L] below which its scatterers share one bin."""
+
+REACH = 6.0
+"""Bins of fs/L on either side of a line within which its transform is integrated over."""
+
+_OVERSAMPLING = 64
+_NODES = 48
+_DEVIATIONS_MAX = 5.0
+"""Standard deviations of the beam on either side that are integrated over, at the most."""
+_RESOLVED_PHASE_MAX = 40.0
+"""Phase [rad] at the end of the integral up to which the nodes resolve its turning."""
+
+
+class LineSpread(NamedTuple):
+    """How the lines of footprints spread over two segments' bins, (n,) each."""
+
+    distance: tuple[np.ndarray, np.ndarray]
+    """Of the strongest bin from the line on the beam's axis [bins of fs/L]."""
+    spread: tuple[np.ndarray, np.ndarray]
+    """Shift of a line for a standard deviation of the beam along y [bins of fs/L], signed."""
+    turn: np.ndarray
+    """Phase difference between the segments for a standard deviation along y [rad]."""
+    lean: np.ndarray
+    """Relative change of echo power for a standard deviation along y."""
+
+    @property
+    def widest(self) -> np.ndarray:
+        """Larger of the two spreads [bins of fs/L]."""
+        return np.maximum(np.abs(self.spread[0]), np.abs(self.spread[1]))
+
+    def at(self, points: np.ndarray) -> "LineSpread":
+        """Spreads of some points by their numbers."""
+        (d, e), (a, b) = self.distance, self.spread
+        return LineSpread(
+            (d[points], e[points]), (a[points], b[points]), self.turn[points], self.lean[points]
+        )
+
+
+def bin_correlation(window: Window, lines: LineSpread) -> np.ndarray:
+    """Correlation mu of the strongest bins of two segments by equation (3), (n,) complex.
+
+    Where the phase turns too fast for the integral, mu is that of a window whose transform is a
+    Gaussian of the same half width; it is all but 0 there.
+    """
+    end = np.minimum(_DEVIATIONS_MAX, REACH / np.maximum(lines.widest, 1e-300))
+    node, weight = np.polynomial.legendre.leggauss(_NODES)
+    y = end[:, None] * node
+    power = np.exp(-0.5 * y * y) * np.maximum(1 + lines.lean[:, None] * y, 0.0) * weight
+    first, second = (
+        window_transform(window, distance[:, None] - spread[:, None] * y)
+        for distance, spread in zip(lines.distance, lines.spread, strict=True)
+    )
+    shared = (power * first * second * np.exp(1j * lines.turn[:, None] * y)).sum(axis=1)
+    strengths = (power * first * first).sum(axis=1) * (power * second * second).sum(axis=1)
+    correlation = shared / np.sqrt(np.maximum(strengths, 1e-300))
+    is_resolved = np.abs(lines.turn) * end <= _RESOLVED_PHASE_MAX
+    return np.where(is_resolved, correlation, _gaussian_correlation(window, lines))
+
+
+def _gaussian_correlation(window: Window, lines: LineSpread) -> np.ndarray:
+    """Size of mu for the transform G(x) = exp(-x^2 / (4 v)), (n,); it is 1/2 where the window's is.
+
+    All factors of the integrals (3) are Gaussian then.
+    """
+    v = _half_width(window) ** 2 / (4 * np.log(2))
+    (a, b), (d, e) = lines.spread, lines.distance
+    stiffness = 1 + (a * a + b * b) / (2 * v)
+    pull = (d * a + e * b) / (2 * v)
+    exponent = (pull**2 - lines.turn**2) / (2 * stiffness) - (d * d + e * e) / (4 * v)
+    log_strengths = sum(
+        -np.log1p(s * s / v) / 2 - x * x / (2 * (v + s * s)) for s, x in ((a, d), (b, e))
+    )
+    return np.exp(np.minimum(exponent - np.log(stiffness) / 2 - log_strengths / 2, 0.0))
+
+
+def window_transform(window: Window, distance: np.ndarray) -> np.ndarray:
+    """Transform G of a window about its middle over its sum, at distances [bins of fs/L]; real.
+
+    It is taken as 0 beyond twice REACH.
+
+    >>> from sweep.model.window import window
+    >>> float(np.round(window_transform(window("hann", 1024), np.array([1.0]))[0], 3))
+    0.5
+    """
+    place, value = _transform_table(window)
+    return np.interp(np.abs(distance), place, value, right=0.0)
+
+
+def _half_width(window: Window) -> float:
+    """Distance at which a window's transform has fallen to 1/2 [bins of fs/L]."""
+    place, value = _transform_table(window)
+    last = int(np.argmax(value < 0.5))
+    return float(np.interp(-0.5, -value[: last + 1], place[: last + 1]))
+
+
+@lru_cache(maxsize=16)
+def _transform_table(window: Window) -> tuple[np.ndarray, np.ndarray]:
+    """Distances [bins of fs/L] and the window's transform there."""
+    place = np.arange(int(2 * REACH * _OVERSAMPLING) + 1) / _OVERSAMPLING
+    w = samples(window.name, window.length)
+    time = (np.arange(window.length) - window.length / 2) / window.length
+    # Sums, not products of matrices, whose order depends on the number of threads.
+    value = np.array([(w * np.cos(2 * np.pi * y * time)).sum() for y in place])
+    return place, value / w.sum()
