@@ -223,13 +223,19 @@ def segment_phases(shots: Shots) -> list[PhaseDifference]:
 
     By equation (1) of :mod:`sweep.model.speckle_correlation`.
     """
-    middle = shots.acquisition_delay + shots.record_duration / 2
     delay = 2 * shots.range / SPEED_OF_LIGHT
+    first = 0 if shots.first_sample is None else shots.first_sample
+    late = np.broadcast_to(first, (len(shots.carriers), shots.size)) / shots.sample_rate
+    # The middle of the samples that hold the echo.
+    middles = shots.acquisition_delay + (shots.record_duration + late) / 2
     echo_frequency = [
         carrier + slope * shots.chirp_rate * (middle - delay)
-        for carrier, slope in zip(shots.carriers, shots.slopes, strict=True)
+        for carrier, slope, middle in zip(shots.carriers, shots.slopes, middles, strict=True)
     ]
-    turned = [f * (t + middle) for f, t in zip(echo_frequency, shots.schedule, strict=True)]
+    turned = [
+        frequency * (start + middle)
+        for frequency, start, middle in zip(echo_frequency, shots.schedule, middles, strict=True)
+    ]
     return [
         PhaseDifference(
             np.broadcast_to(turned[second] - turned[first], shots.size),
