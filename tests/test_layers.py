@@ -11,21 +11,24 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 
 MAY_IMPORT = {
     "units": {"units"},
+    "documents": {"documents"},
+    "plain_files": {"plain_files"},
     "extras": {"extras"},
     "kernels": {"kernels"},
     "messages": {"messages"},
-    "storage": {"storage", "messages"},
+    "storage": {"storage", "documents", "messages", "plain_files"},
     "model": {"model", "kernels"},
     "scenes": {"scenes", "messages", "model", "units"},
-    "spec": {"spec", "messages", "scenes", "model", "units"},
+    "spec": {"spec", "documents", "messages", "plain_files", "scenes", "model", "units"},
     "tasks": {
-        "tasks", "extras", "kernels", "messages", "storage", "spec", "scenes", "model", "units",
+        "tasks", "documents", "extras", "kernels", "messages", "plain_files", "storage", "spec",
+        "scenes", "model", "units",
     },
     "analysis": {"analysis", "messages", "storage", "spec", "scenes", "model", "units"},
     "report": {"report", "analysis", "messages", "storage", "spec", "scenes", "model", "units"},
     "cli": {
-        "cli", "extras", "messages", "tasks", "report", "analysis", "storage", "spec", "scenes",
-        "model", "units",
+        "cli", "extras", "messages", "plain_files", "tasks", "report", "analysis", "storage",
+        "spec", "scenes", "model", "units",
     },
     "__init__": {"tasks", "analysis", "spec"},
 }  # fmt: skip

@@ -48,7 +48,7 @@ from sweep.tasks.streams import forgiving_output
 #: Errors of a file or folder that is not to be used: no permission, no room, something in the way.
 UNUSABLE = {
     errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.ENOTDIR, errno.EEXIST,
-    errno.EISDIR, errno.ENAMETOOLONG,
+    errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP,
 }  # fmt: skip
 
 
@@ -100,6 +100,7 @@ class Commands(click.Group):
         except Exception as error:
             from sweep.extras import remedy
             from sweep.model.unsupported import UnsupportedShot
+            from sweep.plain_files import UnfitFileError
             from sweep.scenes.files import SceneError
             from sweep.spec import SpecError
             from sweep.storage.locations import ObjectStoreError, worded
@@ -109,7 +110,7 @@ class Commands(click.Group):
 
             told = (
                 DamagedChunkError, ObjectStoreError, ReplacedError, SceneError, SpecError,
-                StoreError, TaskError, UnsupportedShot,
+                StoreError, TaskError, UnfitFileError, UnsupportedShot,
             )  # fmt: skip
             said = worded(error)
             if line := remedy(said):
@@ -179,9 +180,18 @@ def main() -> None:
     is_flag=True,
     help="Replace an existing store once the new one is complete; on disk only.",
 )
+@click.option(
+    "--resume",
+    "resuming",
+    is_flag=True,
+    help="Continue if the store is there and holds this study; the same command serves a job "
+    "however often it is started.",
+)
 @click.option("--yes", is_flag=True, help="Start a very large study without asking.")
 @computing
-def run(spec: Path, store: Location | None, overwrite: bool, yes: bool, **how: Any) -> None:
+def run(
+    spec: Path, store: Location | None, overwrite: bool, resuming: bool, yes: bool, **how: Any
+) -> None:
     """Compute the study SPEC into a Zarr store.
 
     Studies of more than 1e9 points, 1 TB of results or 30 days of one core ask before they start.
@@ -195,14 +205,19 @@ def run(spec: Path, store: Location | None, overwrite: bool, yes: bool, **how: A
       sweep run experiments/range_angle.yaml --scheduler tcp://10.0.0.5:8786
       sweep run experiments/range_angle.yaml --cluster deploy/slurm.yaml --workers 200
       sweep run experiments/quickstart.yaml --scheduler none --overwrite
+      sweep run experiments/range_angle.yaml --resume --cluster deploy/slurm.yaml
     """  # noqa: D301
     from sweep.spec import load
+    from sweep.storage.locations import is_free
     from sweep.tasks import driver
 
+    if overwrite and resuming:
+        raise click.UsageError("--overwrite begins anew, and --resume goes on: give one of them")
     study, path = load(spec), store or _default_store(spec)
-    ask_before(study, path, yes=yes)
-    warn_before(study, path)
-    outcome = driver.run(study, store=path, overwrite=overwrite, **how)
+    if is_free(path) or not resuming:  # else it was asked as it was begun
+        ask_before(study, path, yes=yes)
+        warn_before(study, path)
+    outcome = driver.run(study, store=path, overwrite=overwrite, resume=resuming, **how)
     conclude(outcome, shown(path))
 
 

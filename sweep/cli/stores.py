@@ -165,6 +165,13 @@ def _tell(report: Report) -> None:
         tell(f"{store}: {block}{damage.object} {damage.what}", err=True)
     if len(report.damages) > MOST_LISTED:
         click.echo(f"and {len(report.damages) - MOST_LISTED:,} more", err=True)
+    if report.foreign:
+        named = ", ".join(report.foreign[:MOST_LISTED])
+        more = f" and {len(report.foreign) - MOST_LISTED:,} more"
+        tell(
+            f"{store}: not sweep's, and left alone: {named}"
+            f"{more if len(report.foreign) > MOST_LISTED else ''}"
+        )
     if report.blocks:
         tell(f"{store}: {report.whole:,} of {report.blocks:,} blocks committed and undamaged")
 

@@ -273,6 +273,8 @@ def conclude(outcome: Outcome, store: Location) -> None:
         f"in {duration(outcome.seconds)}"
     )
     if outcome.complete:
+        if not outcome.blocks_computed:
+            tell(f"{store} was complete already: nothing was left to compute.")
         click.echo(f"{command_line('figures', store)}  draws it.")
         return
     for failure in outcome.failures[:5]:

@@ -11,13 +11,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import itables.options
 import jinja2
 import numpy as np
 import pandas
 import plotly.graph_objects as go
 import plotly.io
-from itables.javascript import get_itable_arguments
 from matplotlib import colormaps
 from matplotlib.colors import to_hex
 from plotly.io.json import to_json_plotly
@@ -26,6 +24,7 @@ from plotly.offline import get_plotlyjs
 from sweep.analysis import canvas, labels
 from sweep.analysis.canvas import MARKED
 from sweep.analysis.charts import LOG, Axis, Chart, Line, Panel, Scale
+from sweep.report.itables_alone import get_itable_arguments, options
 
 LINES = {
     "light": ("#0072B2", "#C44E00", "#005A4B", "#A51E78", "#78784B", "#003CD2", "#000000",
@@ -349,7 +348,7 @@ def rendered(page: Page) -> str:
     )
     environment.globals |= {"packed": _packed, "table_json": _table_json, "download": _download}
     environment.globals |= {"chart_json": _chart_json}
-    tables = Path(itables.options.dt_bundle)
+    tables = Path(options.dt_bundle)
     return environment.get_template("report.html").render(
         page=page,
         plotly=get_plotlyjs(),

@@ -17,8 +17,10 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 import sweep.spec.parts as parts
+from sweep.documents import is_text
 from sweep.model.effects.phase_errors import ERROR_TABLE, NO_TABLE
 from sweep.model.threshold import PROCESSING, WAYS
+from sweep.plain_files import UnfitFileError, open_plain
 from sweep.scenes.files import SceneError, read_columns
 from sweep.spec.figures import Figure, SceneFigure
 from sweep.spec.rules import (
@@ -264,12 +266,14 @@ def without_extensions(content: Mapping[str, Any]) -> dict[str, Any]:
 def _read_text(path: Path) -> str:
     """Text of a file of reasonable size."""
     try:
-        with path.open("rb") as file:
+        with open(open_plain(path), "rb") as file:
             content = file.read(LARGEST_FILE + 1)
     except FileNotFoundError:
         raise _file_error(path, "does not exist", similar_file(path)) from None
     except IsADirectoryError:
         raise _file_error(path, "is a directory", "name a YAML file") from None
+    except UnfitFileError as error:
+        raise _file_error(path, error.strerror or "", "name a YAML file") from None
     except (OSError, ValueError) as error:
         rule = f"cannot be read: {getattr(error, 'strerror', '') or error}"
         raise _file_error(path, rule, _NO_FILE) from None
@@ -302,6 +306,14 @@ class _Loader(yaml.SafeLoader):
     """YAML's safe loader, which refuses deep nesting before Python's stack does."""
 
     depth = 0
+
+    def compose_scalar_node(self, anchor: Any) -> Any:
+        """Scalar of the document, whose escapes make whole characters."""
+        node = super().compose_scalar_node(anchor)  # type: ignore[no-untyped-call]
+        if not is_text(node.value):
+            problem = "an escape there is half of a surrogate pair, and no character"
+            raise yaml.MarkedYAMLError(problem=problem, problem_mark=node.start_mark)
+        return node
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         """One node of the document."""
@@ -418,6 +430,10 @@ def plain(data: Any, location: Location = ()) -> Any:
         raise SpecError([Mistake(dotted(location), "is nested too deeply")])
     if isinstance(data, int) and data.bit_length() > _MOST_DIGITS:
         raise SpecError([Mistake(dotted(location), "is a number of too many digits")])
+    if isinstance(data, Mapping) and not all(is_text(str(key)) for key in data):
+        raise SpecError([Mistake(dotted(location), "has a key that is no text")])
+    if isinstance(data, str) and not is_text(data):
+        raise SpecError([Mistake(dotted(location), "has half of a surrogate pair, and is no text")])
     if isinstance(data, Mapping):
         return {str(key): plain(value, (*location, str(key))) for key, value in data.items()}
     if isinstance(data, list | tuple):

@@ -18,6 +18,7 @@ from pydantic import ConfigDict, Field, PrivateAttr, ValidationError
 import sweep.spec.parts as of
 import sweep.spec.scene as scenes
 import sweep.spec.sections as sections
+from sweep.documents import parse_json
 from sweep.model import VERSION, accuracy, beam, looks, waveform
 from sweep.model.effects import circulator_leak
 from sweep.model.ground import pattern as pattern_of
@@ -137,7 +138,7 @@ class Study(Part):
 
         Files, relative to `base`, are not looked at before they are needed.
         """
-        written = plain(json.loads(text))
+        written = plain(parse_json(text))
         if not isinstance(written, dict):
             raise SpecError([Mistake("", "must be a mapping", shown(written))])
         digests = written.pop(FILES, {})
@@ -671,7 +672,7 @@ def _contradictions(spec: Study, both: Mapping[str, object]) -> Iterator[Finding
 
 def from_stored(text: str, base: Path | str | None = None) -> Spec | SceneSpec:
     """Study from the JSON that its `to_json` gave, as `Study.from_stored`."""
-    return _kind(json.loads(text)).from_stored(text, base)
+    return _kind(parse_json(text)).from_stored(text, base)
 
 
 def _kind(written: Any) -> type[Spec] | type[SceneSpec]:

@@ -6,10 +6,10 @@ Files and folders are made in the folder of what they replace, under a hidden na
 its place. The old one is renamed aside and removed last. The hidden names in the folder of
 ``NAME`` are
 
-    .NAME.next                           a store that is to take the place of NAME, under way
-    .NAME.creating-HOST-PID-ab12cd34     half made by a process
-    .NAME.replaced-HOST-PID-ab12cd34     what stood at NAME until it was replaced
-    .NAME.removing-HOST-PID-ab12cd34     half removed
+    .NAME.next                                 a store that is to take the place of NAME, under way
+    .NAME.creating-HOST-PID.START-ab12cd34     half made by a process
+    .NAME.replaced-HOST-PID.START-ab12cd34     what stood at NAME until it was replaced
+    .NAME.removing-HOST-PID.START-ab12cd34     half removed
 
 and `settle` sees to the last three where a process has died. In an object store, which has no
 renaming, nothing is ever replaced.
@@ -22,6 +22,7 @@ import os
 import re
 import shutil
 import socket
+import sys
 import threading
 import time
 import uuid
@@ -36,6 +37,11 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from sweep.messages import printable
+from sweep.plain_files import (
+    open_below,
+    read_below,
+    refuse_larger,
+)
 
 #: Kinds of addresses; `memory` is for tests, and lives as long as its process.
 SCHEMES = ("s3", "gs", "az", "memory")
@@ -150,12 +156,17 @@ class ObjectPath:
         head = self._head()
         return None if head is None else float(head["last_modified"].timestamp())
 
-    def read_bytes(self) -> bytes:
-        """Return the object whole; once more where the body of the answer is cut."""
+    def read_bytes(self, bytes_max: int | None = None) -> bytes:
+        """Return the object whole; once more where the body of the answer is cut.
+
+        UnfitFileError where it is larger than so many bytes.
+        """
         from obstore.exceptions import BaseError
 
         with in_words(self):
             answer = self.client.get(self.key)
+            if bytes_max is not None:
+                refuse_larger(answer.meta["size"], bytes_max, str(self))
             try:
                 return bytes(answer.bytes())
             except BaseError:
@@ -334,21 +345,37 @@ def _requests() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(REQUESTS, thread_name_prefix="object-store")
 
 
+def read_object(location: Location, name: str, bytes_max: int) -> bytes:
+    """Read a file below a place whole; UnfitFileError where it is none, or larger than that."""
+    if isinstance(location, ObjectPath):
+        return (location / name).read_bytes(bytes_max)
+    return read_below(location, name, bytes_max)
+
+
 def names_below(location: Location) -> Iterator[str]:
-    """Names of all files below a place, relative to it, however many."""
+    """Names of all that is below a place but folders, relative to it, however many; also links."""
     if isinstance(location, ObjectPath):
         yield from (name for name, _ in location.below())
         return
-    for folder, _, names in os.walk(location):
-        inside = os.path.relpath(folder, location)
-        yield from (os.path.normpath(f"{inside}/{name}") for name in names)
+    start = len(str(location)) + 1
+    yield from (entry.path[start:] for entry in entries_below(str(location)))
+
+
+def entries_below(folder: str) -> Iterator[os.DirEntry[str]]:
+    """Everything below a folder but folders; no link is followed."""
+    with os.scandir(folder) as entries:
+        for entry in entries:  # no look at a file: there may be millions
+            if entry.is_dir(follow_symlinks=False):
+                yield from entries_below(entry.path)
+            else:
+                yield entry
 
 
 def files_below(location: Location) -> dict[str, int]:
     """Sizes of all files below a place by their names, relative to it."""
     if isinstance(location, ObjectPath):
         return dict(location.below())
-    return {name: (location / name).stat().st_size for name in names_below(location)}
+    return {name: (location / name).lstat().st_size for name in names_below(location)}
 
 
 def beside(location: Location) -> Path:
@@ -409,16 +436,50 @@ SKEW = 60.0
 
 _LEFT = re.compile(
     r"\.(?P<name>.+)\.(?P<state>creating|packing|replaced|removing)-"
-    r"(?:(?P<host>.+)-)?(?P<pid>\d+)-[0-9a-f]{8}"
+    r"(?:(?P<host>.+)-)?(?P<pid>\d+)(?:\.(?P<start>\d+))?-[0-9a-f]{8}"
 )
-"""Names of what is left by processes; those of earlier versions name no host."""
+"""Names of what is left by processes; those of earlier versions name no host, or no start."""
+
+#: Start of a process that is there, but hidden from other users.
+HIDDEN = -1
+
+
+def process_start(pid: int) -> int:
+    """Start of a process, which tells it from others that had its number; no clock changes it.
+
+    In clock ticks since the machine was started on Linux, in hundredths of a second since the
+    epoch elsewhere. 0 where no such process runs, `HIDDEN` where it can't be seen.
+    """
+    import psutil
+
+    if sys.platform == "linux":
+        try:
+            content = Path(f"/proc/{pid}/stat").read_bytes()
+        except OSError:
+            return HIDDEN if psutil.pid_exists(pid) else 0
+        state, *fields = content.rpartition(b")")[2].split()
+        return 0 if state in (b"Z", b"X") else int(fields[18])
+    try:
+        return int(100 * psutil.Process(pid).create_time())
+    except psutil.AccessDenied:
+        return HIDDEN
+    except psutil.Error:
+        return 0
 
 
 def real(location: Location) -> Location:
-    """Follow symbolic links: the folder is renamed, not the link."""
+    """Follow symbolic links: the folder is renamed, not the link. OSError where they never end."""
     if not isinstance(location, Path):
         return location
-    return location.resolve() if location.is_symlink() else location.absolute()
+    if not location.is_symlink():
+        return location.absolute()
+    try:
+        place = location.resolve()
+    except RuntimeError:  # Python's word for a loop before 3.13
+        place = location
+    if place.is_symlink():
+        raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(location))
+    return place
 
 
 def eyepoints_path(store: Location, geometry_id: str) -> Location:
@@ -435,6 +496,17 @@ def replaced_by(path: Path) -> Path:
     """Return the place that a store is made for: its own, or that of the store it replaces."""
     made = re.fullmatch(rf"\.(.+){re.escape(NEXT)}", path.name)
     return path.with_name(made[1]) if made else path
+
+
+def is_free(location: Location) -> bool:
+    """Tell whether a store can be made at a place: nothing is there, or an empty folder."""
+    if isinstance(location, ObjectPath):
+        return not location.exists()
+    try:
+        with os.scandir(location) as entries:
+            return next(entries, None) is None
+    except OSError as error:  # also a file, or something below one, or in a closed folder
+        return error.errno != errno.ELOOP and not location.exists()
 
 
 @contextmanager
@@ -471,8 +543,22 @@ def take_place(new: Path, path: Path) -> None:
                 with suppress(OSError):
                     os.rename(old, path)
                 raise
-        discard(old)
+        retire(old, path)
         return
+
+
+def retire(old: Path, new: Path) -> None:
+    """Remove what another has taken the place of, but for files of the user's: they move there.
+
+    All of it stays, under its hidden name, where they can't be moved.
+    """
+    from sweep.storage.foreign import carry_over
+
+    try:
+        carry_over(old, new)
+    except OSError:
+        return
+    discard(old)
 
 
 def discard(path: Path) -> None:
@@ -490,10 +576,11 @@ def settle(location: Location) -> None:
     back. Drafts of dead processes are removed. Everything is left alone where the folder can't
     be written.
     """
-    path = real(location)
-    if not isinstance(path, Path):
+    if not isinstance(location, Path):
         return
     with suppress(OSError):
+        path = real(location)
+        assert isinstance(path, Path)
         for name in os.listdir(path.parent):
             if left := _LEFT.fullmatch(name):
                 with suppress(OSError):
@@ -505,10 +592,13 @@ def stamp(location: Location) -> tuple[int, ...] | None:
     if not isinstance(location, Path):
         return None
     try:
-        with open(location / "zarr.json", "rb") as file:  # opened: a file server is asked anew
-            found = os.fstat(file.fileno())
+        opened = open_below(location, "zarr.json")  # opened: a file server is asked anew
     except OSError:
         return None
+    try:
+        found = os.fstat(opened)
+    finally:
+        os.close(opened)
     return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns
 
 
@@ -518,7 +608,7 @@ def _settle(left: Path, made: re.Match[str]) -> None:
         if not path.exists():
             os.rename(successor(path) if successor(path).exists() else left, path)
         if left.exists():
-            discard(left)
+            retire(left, path)
     elif made["state"] == "removing" or not _is_made(left, made):
         _delete(left)
 
@@ -530,6 +620,8 @@ def _is_made(draft: Path, made: re.Match[str]) -> bool:
     begun = draft.stat().st_mtime
     if made["host"] not in (None, socket.gethostname()):
         return time.time() - begun < ABANDONED
+    if made["start"]:
+        return process_start(int(made["pid"])) in (int(made["start"]), HIDDEN)
     try:  # a process that is younger than the draft has got its maker's number
         return psutil.Process(int(made["pid"])).create_time() < begun + SKEW
     except psutil.Error:
@@ -537,7 +629,8 @@ def _is_made(draft: Path, made: re.Match[str]) -> bool:
 
 
 def _hidden(path: Path, state: str) -> Path:
-    maker = f"{socket.gethostname()}-{os.getpid()}-{uuid.uuid4().hex[:8]}"
+    process = f"{os.getpid()}.{process_start(os.getpid())}"
+    maker = f"{socket.gethostname()}-{process}-{uuid.uuid4().hex[:8]}"
     name = made["name"] if (made := _LEFT.fullmatch(path.name)) else path.name
     return path.with_name(f".{name}.{state}-{maker}")
 

@@ -16,18 +16,28 @@ import json
 import math
 import os
 import re
+import stat
 import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
-import zarr
-from zarr.storage import LocalStore
+from zarr.storage import StorePath
 
+from sweep.documents import parse_json
 from sweep.messages import SPEC, STORE, PrintableError, suggestion
+from sweep.plain_files import UnfitFileError, kind_of, open_plain, pieces_below
+from sweep.storage.chunks import (
+    DOCUMENT_BYTES_MAX,
+    FILE_BYTES_MAX,
+    CheckedFiles,
+    CheckedObjects,
+    StoreFiles,
+)
 from sweep.storage.locations import (
     JOURNAL,
     REQUESTS,
@@ -36,9 +46,9 @@ from sweep.storage.locations import (
     ObjectStoreError,
     each,
     put_whole,
+    read_object,
     settle,
     stamp,
-    zarr_store,
 )
 
 #: What a store is made of before there are results, and the digest of each object, in the journal.
@@ -102,12 +112,6 @@ class NotAStoreError(StoreError, ValueError):
     """A path at which there is no store of a study, or none that this program can read."""
 
 
-def open_group(path: Location, mode: Any = "r") -> zarr.Group:
-    """Open the arrays of a store by its checked document; raises as :func:`read_document`."""
-    read_document(path)
-    return zarr.open_group(zarr_store(path), mode=mode, zarr_format=3, use_consolidated=True)
-
-
 def read_attributes(path: Location) -> dict[str, Any]:
     """Attributes of a store; raises as :func:`read_document`."""
     attributes: dict[str, Any] = read_document(path)["attributes"]
@@ -131,10 +135,10 @@ def read_document(path: Location) -> dict[str, Any]:
         needed = ["effects"] if attributes["kind"] == "grid" else of_scanners
         if lost := [name for name in needed if name not in nodes]:
             raise ValueError(f"it lacks {lost[0]}")
-        _check_files(path)
     except (ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
         why = error if type(error) is ValueError else "its metadata are incomplete"
         raise NotAStoreError(f"{path} is not as sweep writes stores: {why}{remedy(path)}") from None
+    _check_files(path)
     return document
 
 
@@ -183,20 +187,23 @@ def _ours(path: Location, attributes: Any) -> dict[str, Any]:
 def _document(path: Location) -> dict[str, Any]:
     """Read the document of a store's root, a group."""
     settle(path)
+    why = ""
     try:
-        if isinstance(path, Path) and not (path / "zarr.json").is_file():
-            raise FileNotFoundError
-        document = _parsed(path / "zarr.json")
+        document = _parsed(path, "zarr.json")
         if "attributes" in document:
             return dict(document)
     except ObjectStoreError:
         raise
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+    except UnfitFileError as error:
+        why = f" ({error.strerror})"
+    except (OSError, ValueError, KeyError, TypeError):
         pass
     if not path.exists():
         raise NotAStoreError(f"there is no store at {path}{_near(path)}")
     if how := remedy(path):
-        raise NotAStoreError(f"{path / 'zarr.json'} is damaged{how}")
+        raise NotAStoreError(f"{path / 'zarr.json'} is damaged{why}{how}")
+    if why:
+        raise NotAStoreError(f"{path / 'zarr.json'} is damaged{why}")
     if isinstance(path, Path) and path.is_file():
         run = suggestion("run", SPEC, store=STORE)
         what = f"a file, and no Zarr store of sweep's: {run} computes a spec into one"
@@ -207,20 +214,28 @@ def _document(path: Location) -> dict[str, Any]:
     )
 
 
-def _parsed(path: Location) -> Any:
-    """Parse a file of JSON; once more from an object store, whose answer may have been cut."""
+def _parsed(path: Location, name: str) -> Any:
+    """Parse a document; once more from an object store, whose answer may have been cut."""
     try:
-        return json.loads(path.read_bytes())
+        return parse_json(read_object(path, name, DOCUMENT_BYTES_MAX))
     except ValueError:
         if isinstance(path, Path):
             raise
-        return json.loads(path.read_bytes())
+        return parse_json(read_object(path, name, DOCUMENT_BYTES_MAX))
 
 
-def has_digest(path: Location, objects: list[str], known: str) -> bool:
-    """Tell whether stored objects have a digest; read once more from an object store if not."""
-    is_same = digest(path, objects) == known
-    return is_same or (isinstance(path, ObjectPath) and digest(path, objects) == known)
+def has_digest(
+    path: Location,
+    objects: list[str],
+    known: str,
+    bytes_max: Callable[[str], int] = lambda name: FILE_BYTES_MAX,
+) -> bool:
+    """Tell whether stored objects have a digest; read once more from an object store if not.
+
+    What is raised, and ``bytes_max``, are as of :func:`digest`.
+    """
+    is_same = digest(path, objects, bytes_max) == known
+    return is_same or (isinstance(path, ObjectPath) and digest(path, objects, bytes_max) == known)
 
 
 def listed_attributes(path: Location) -> dict[str, Any]:
@@ -341,29 +356,42 @@ def _check_dimensions(nodes: Mapping[str, Any]) -> None:
 
 def _check_files(path: Location) -> None:
     """Refuse a journal with links, which lead out, or pipes, which never end."""
+    for name, what in unfit_in_journal(path).items():
+        raise NotAStoreError(f"{path}/{name} {what}: remove it")
+
+
+def unfit_in_journal(path: Location) -> dict[str, str]:
+    """Links, pipes and devices in the journal of a store, and which of these they are, by name."""
     if not isinstance(path, Path) or not (path / JOURNAL).is_dir():
-        return
+        return {}
+    modes = {JOURNAL: (path / JOURNAL).lstat().st_mode}
     with os.scandir(path / JOURNAL) as entries:
-        odd = [e.name for e in entries if e.is_symlink() or not (e.is_file() or e.is_dir())]
-    if odd or (path / JOURNAL).is_symlink():
-        raise ValueError(f"{'/'.join([JOURNAL, *odd[:1]])} is no plain file")
+        for entry in entries:
+            with suppress(FileNotFoundError):  # a lock that is given up meanwhile
+                mode = entry.stat(follow_symlinks=False).st_mode
+                modes[f"{JOURNAL}/{entry.name}"] = mode
+    return {
+        name: f"is {kind_of(mode)}, no plain file"
+        for name, mode in modes.items()
+        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode))
+    }
 
 
 class ReplacedError(PrintableError, ValueError):
     """A store that was extended or replaced since it was opened."""
 
 
-class Unreplaced(LocalStore):
+class Unreplaced(CheckedFiles):
     """A store on disk whose every read fails once another study's store is in its place."""
 
-    def __init__(self, root: Path, held: str) -> None:
-        super().__init__(root, read_only=True)
+    def __init__(self, root: Path, files: StoreFiles, held: str) -> None:
+        super().__init__(root, files)
         self._study_id = held
         self._seen: tuple[int, ...] | None = None
 
-    async def get(self, *key: Any, **options: Any) -> Any:
+    def read(self, key: str, byte_range: Any) -> bytes | None:
         """Return the bytes of a file; the identity of the store is checked afterwards."""
-        found = await super().get(*key, **options)
+        content = super().read(key, byte_range)
         now = stamp(self.root)
         if now is None or now != self._seen:  # repaired, or another's
             if study_id(self.root) != self._study_id:
@@ -372,15 +400,24 @@ class Unreplaced(LocalStore):
                     "open it again"
                 )
             self._seen = now
-        return found
+        return content
 
 
-def readable(location: Location, held: str) -> Any:
-    """Open the store of a study for xarray, to read it lazily."""
-    return Unreplaced(location, held) if isinstance(location, Path) else zarr_store(location)
+def readable(location: Location, held: str = "") -> Any:
+    """Open a store for Zarr or xarray, to read it lazily; raises as :func:`read_document`.
+
+    Reading fails once it is no longer the store of the study ``held``, where one is given.
+    """
+    files = StoreFiles(read_document(location))
+    if isinstance(location, ObjectPath):
+        return StorePath(CheckedObjects(location.client, location.key, files), location.key)
+    return Unreplaced(location, files, held) if held else CheckedFiles(location, files)
 
 
 RECEIPTS = "receipts.jsonl"
+
+#: Bytes of a line of a log at most; the recipe of eyepoints has their spec in one.
+LINE_BYTES_MAX = 64 << 20
 
 #: Seconds for which lines are gathered before they are put as one object.
 WAVE = 1.0
@@ -388,6 +425,9 @@ WAVE = 1.0
 #: Objects of a log beyond which they are put into few, and bytes of one of those.
 MOST_SEGMENTS = 64
 SEGMENT_BYTES = 16 << 20
+
+#: Errors of opening what is no log.
+_NO_LOG = {errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.EINVAL}
 
 _SUM = b',"sum":"'
 _END = b'"}\n'
@@ -415,8 +455,8 @@ def unsealed(line: bytes) -> dict[str, Any] | None:
     if body is None:
         return None
     try:
-        record = json.loads(body + b"}")
-    except (ValueError, RecursionError):  # a stranger's, with a digest of its own
+        record = parse_json(body + b"}", has_paths=True)
+    except ValueError:  # a stranger's, with a digest of its own
         return None
     return record if isinstance(record, dict) else None
 
@@ -442,10 +482,27 @@ def read_lines(path: Location) -> Iterator[dict[str, Any]]:
     return (record for _, record in read_sealed(path) if record is not None)
 
 
-def digest(path: Location, objects: list[str]) -> str:
-    """blake2b-128 of names and bytes of stored objects, in hex."""
-    contents = each(path, lambda name: (path / name).read_bytes(), objects)
-    return digest_of(zip(objects, contents, strict=True))
+def digest(
+    path: Location,
+    objects: Iterable[str],
+    bytes_max: Callable[[str], int] = lambda name: FILE_BYTES_MAX,
+) -> str:
+    """blake2b-128 of names and bytes of stored objects, in hex.
+
+    OSError where one can't be read; UnfitFileError where it is no plain file, or larger than
+    ``bytes_max`` of its name.
+    """
+    if isinstance(path, ObjectPath):
+        objects = list(objects)
+        contents = each(path, lambda name: (path / name).read_bytes(bytes_max(name)), objects)
+        return digest_of(zip(objects, contents, strict=True))
+    sum_ = hashlib.blake2b(digest_size=16)
+    for name in objects:
+        with pieces_below(path, name, bytes_max(name)) as (size, pieces):
+            sum_.update(f"{name}\0{size}\0".encode())
+            for piece in pieces:
+                sum_.update(piece)
+    return sum_.hexdigest()
 
 
 def digest_of(contents: Iterable[tuple[str, bytes]]) -> str:
@@ -583,9 +640,26 @@ def raw_lines(path: Location) -> Iterator[bytes]:
             yield from path.read_bytes().splitlines(keepends=True)
         for _, content in _contents(path, names):
             yield from content.splitlines(keepends=True)
-    elif path.is_file():
-        with open(path, "rb") as log:
-            yield from log
+    else:
+        try:
+            opened = open_plain(path, follow=False)
+        except OSError as error:
+            if error.errno in _NO_LOG:
+                return
+            raise
+        with open(opened, "rb") as log:
+            yield from _lines_of(log)
+
+
+def _lines_of(log: BinaryIO) -> Iterator[bytes]:
+    """Lines of a log; one that is longer than any of ours in parts, without a file's holes."""
+    while line := log.readline(LINE_BYTES_MAX):
+        yield line
+        if len(line) == LINE_BYTES_MAX:
+            try:
+                log.seek(os.lseek(log.fileno(), log.tell(), os.SEEK_DATA))
+            except OSError:  # nothing but a hole is left
+                return
 
 
 @dataclass

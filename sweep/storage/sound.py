@@ -19,10 +19,10 @@ import google_crc32c
 import numpy as np
 import zarr
 from zarr.core.buffer import default_buffer_prototype
-from zarr.storage import LocalStore, StorePath, WrapperStore
+from zarr.storage import StorePath, WrapperStore
 
 from sweep.storage import opening
-from sweep.storage.locations import JOURNAL, PACKED, Location, worded, zarr_store
+from sweep.storage.locations import JOURNAL, PACKED, Location, worded
 from sweep.storage.opening import MANIFEST, read_document, read_lines, read_receipts
 
 #: Name of a chunk: its array, and its position in the grid of chunks.
@@ -257,9 +257,7 @@ def readable(location: Location, held: str) -> Any:
 
 def open_arrays(location: Location) -> zarr.Group:
     """Open the arrays of a store to be read; raises as :func:`.opening.read_document`."""
-    read_document(location)
-    inner = LocalStore(location, read_only=True) if isinstance(location, Path) else None
-    store = _sound(inner or zarr_store(location), location)
+    store = _sound(opening.readable(location), location)
     return zarr.open_group(store, mode="r", zarr_format=3, use_consolidated=True)
 
 

@@ -19,6 +19,7 @@ from sweep.storage.locations import (
     PACKED,
     Location,
     eyepoints_path,
+    is_free,
     located,
     real,
     replaced_by,
@@ -42,14 +43,16 @@ from sweep.tasks.journal import (
     read_recipe,
     receipted,
     refuse_damaged_recipe,
+    wait_for_silence,
     write_recipe,
 )
 from sweep.tasks.memory import refuse_too_large
-from sweep.tasks.progress import BusyError, ClusterError, StoreError, told, working
+from sweep.tasks.progress import BusyError, ClusterError, StoreError, chosen, told, working
 from sweep.tasks.session import Outcome, Pool, RunOptions, Session
 from sweep.tasks.store import (
     create,
     refuse_damaged,
+    refuse_foreign_files,
     refuse_other_study,
     refuse_other_versions,
     refuse_to_replace,
@@ -65,7 +68,12 @@ WAITING = 0.5
 
 
 def run(
-    spec: Declared, *, store: str | Location, overwrite: bool = False, **options: Any
+    spec: Declared,
+    *,
+    store: str | Location,
+    overwrite: bool = False,
+    resume: bool = False,
+    **options: Any,
 ) -> Outcome:
     """Compute a study into a new store.
 
@@ -75,6 +83,9 @@ def run(
         The study, and the path of the store to make: on disk, or `s3://bucket/key.zarr` (gs, az).
     overwrite
         Whether to put the new store in the place of one that is there, once it is complete.
+    resume
+        Whether to go on where the store is there already, and holds this study; complete, it stays
+        as it is. So the same call serves a job each time that it is started.
     **options
         Where and how to compute, by the names of :class:`sweep.tasks.session.RunOptions`:
         ``workers=4``, ``client=...``, ``progress=False`` and so on.
@@ -87,14 +98,20 @@ def run(
     Raises
     ------
     StoreError, ClusterError, CodeError
-        Where a store is in the way or can't be written; where no scheduler or worker is to be had;
-        where the study names a function that may not run (:mod:`sweep.tasks.user_code`).
+        Where a store, or one of another study, is in the way or can't be written; where no
+        scheduler or worker is to be had; where the study names a function that may not run
+        (:mod:`sweep.tasks.user_code`).
     """
     path, how = real(located(store)), RunOptions.of(options)
+    if overwrite and resume:
+        raise ValueError("overwrite begins anew, and resume goes on: give one of them")
     _refuse_no_study(spec)
     _check_code(spec)
     if how.client is None and isinstance(how.place(spec), Local | None):
         refuse_too_large(spec)
+    if resume and (not is_free(path) or under_way(path)):
+        wait_for_silence(under_way(path) or path, chosen(how.progress).say)
+        return _resume(path, spec, how)
     pool = Pool(how, spec)
     if not overwrite:
         _refuse_in_the_way(path, studies.study_of(spec, path))
@@ -125,6 +142,11 @@ def resume(store: str | Location, *, spec: Declared | None = None, **options: An
     named, how = real(located(store)), RunOptions.of(options)
     if spec is not None:
         _refuse_no_study(spec)
+    return _resume(named, spec, how)
+
+
+def _resume(named: Location, spec: Declared | None, how: RunOptions) -> Outcome:
+    """As :func:`resume`, of a place that no link leads to."""
     named = replaced_by(named) if isinstance(named, Path) else named
     path = under_way(named) or named
     attributes, study = _held(path)
@@ -244,7 +266,7 @@ def _refuse_unsound(
 def _refuse_in_the_way(path: Location, study: GridStudy | FlightStudy) -> None:
     """Refuse a place in which there is something, or for which something is under way."""
     new, what_next = under_way(path), f"{suggestion('resume', path)} goes on with it"
-    if path.exists():
+    if not is_free(path):
         attributes, held = _held(path)
         refuse_other_study(path, attributes, held.spec, study.spec)
         done = int(np.count_nonzero(receipted(path, study)))
@@ -271,18 +293,20 @@ def _into(
     settle(path)
     new, facts, durable = path, _facts(asked), pool.options.durable
     with ExitStack() as stack:
-        if replace and path.exists():
+        if replace and not is_free(path):
             refuse_to_replace(path)
-            stack.callback(Lock(path).release)
-        if replace and isinstance(path, Path) and (path.exists() or successor(path).exists()):
+            if anew and path != extends:
+                refuse_foreign_files(path)
+            stack.callback(Lock(path, pool.told.say).release)
+        if replace and isinstance(path, Path) and (not is_free(path) or successor(path).exists()):
             new = successor(path)
             facts[REPLACES] = study_id(path)
         if extends is not None:
             facts[EXTENDS] = str(extends)
-        there = new.exists()
+        there = not is_free(new)
         study = studies.study_of(asked, new, extends)
         if there and anew:
-            Lock(new).release()  # refuses where someone writes to it
+            Lock(new, pool.told.say).release()  # refuses where someone writes to it
         elif there:
             begun, held = _held(new)
             refuse_other_study(new, begun, held.spec, asked)
@@ -376,7 +400,7 @@ def _go_on(
     pool.most = study.n_blocks
     with pool.interrupts, ExitStack() as stack, pool:  # the lock goes when the workers are gone
         prepare()
-        lock = Lock(path)
+        lock = Lock(path, pool.told.say)
         stack.callback(lock.release)
         _tell_changed_code(path, study.spec, pool.told.say)
         session = Session(path, study, pool, lock)
@@ -428,7 +452,7 @@ def _cast(study: FlightStudy, pool: Pool) -> tuple[dict[str, int], str]:
 
 def _is_whole(path: Location, eyepoints: EyepointStudy) -> bool:
     """Tell whether an eyepoint store is there with all of its blocks."""
-    if not path.exists():
+    if is_free(path):
         return False
     attributes = read_attributes(path)
     if attributes["study_id"] != eyepoints.id:
@@ -443,9 +467,9 @@ def _locked(path: Location, eyepoints: EyepointStudy, pool: Pool) -> Lock | None
     waiting = False
     while not pool.interrupts.stopping:
         try:
-            if not path.exists():
+            if is_free(path):
                 create(path, eyepoints, durable=pool.options.durable)
-            return Lock(path)
+            return Lock(path, pool.told.say)
         except BusyError as error:
             if not waiting:
                 pool.told.say(f"waiting for rays that another run casts: {error}")

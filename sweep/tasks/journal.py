@@ -16,37 +16,46 @@ The lock says which driver writes to the store, and whether it still lives.
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import hashlib
 import io
 import json
+import math
 import os
 import socket
 import stat
 import threading
 import time
 import uuid
+import warnings
+import zipfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import suppress
-from dataclasses import asdict, dataclass
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, fields
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import psutil
 
+from sweep.documents import parse_json
 from sweep.messages import SPEC, one_line, suggestion
+from sweep.plain_files import UnfitFileError, open_plain
+from sweep.storage.chunks import FILE_BYTES_MAX
 from sweep.storage.locations import (
+    HIDDEN,
     JOURNAL,
     REQUESTS,
     Location,
     ObjectPath,
     ObjectStoreError,
     Tag,
+    process_start,
     put_whole,
+    read_object,
 )
 from sweep.storage.opening import (
     RECEIPTS,
@@ -273,7 +282,7 @@ def chunks_there(folder: Location, shape: tuple[int, ...]) -> np.ndarray:
         _look(folder, there)
     else:
         with suppress(FileNotFoundError):
-            there[()] = _is_chunk(folder.stat())
+            there[()] = _is_chunk(folder.lstat())
     return there
 
 
@@ -297,7 +306,8 @@ def _keys(folder: ObjectPath, shape: tuple[int, ...]) -> Iterator[tuple[tuple[in
 def _look(folder: Path | str, there: np.ndarray, within: int | None = None) -> None:
     """Note the chunks in a folder and below, (positions,) bool; it is in an open one."""
     try:
-        opened = os.open(folder, os.O_RDONLY | os.O_DIRECTORY, dir_fd=within)
+        # no links: what they lead to is no part of the store
+        opened = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW, dir_fd=within)
     except (FileNotFoundError, NotADirectoryError):
         return
     try:
@@ -309,7 +319,7 @@ def _look(folder: Path | str, there: np.ndarray, within: int | None = None) -> N
                 if there.ndim > 1:
                     _look(name, there[at], opened)
                 else:
-                    there[at] = _is_chunk(entry.stat())
+                    there[at] = _is_chunk(entry.stat(follow_symlinks=False))
     finally:
         os.close(opened)
 
@@ -343,21 +353,44 @@ def write_begun(path: Location, study_id: str, block: int, begun: Begun) -> None
 def read_begun(path: Location, study_id: str, block: int) -> Begun:
     """Return the saved part of a block of a study."""
     try:
-        line, _, content = _begun_file(path, block).read_bytes().partition(b"\n")
-    except (FileNotFoundError, NotADirectoryError):
+        saved = read_object(path, f"{JOURNAL}/{BEGUN}{block}", FILE_BYTES_MAX)
+    except (FileNotFoundError, NotADirectoryError, IsADirectoryError, UnfitFileError):
         return Begun()
+    line, _, content = saved.partition(b"\n")
     head = unsealed(line + b"\n") or {}
     if (head.get("study"), head.get("block")) != (study_id, block):
         return Begun()
     if head["digest"] != _digest(content):
         return Begun()
     found: dict[str, dict[str, np.ndarray]] = {"done": {}, "begun": {}}
-    with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
-        for key, values in arrays.items():
+    try:
+        for key, values in _unpacked(content):
             part, _, name = key.partition("/")
             found[part][name] = values
+    except (ValueError, KeyError, zipfile.BadZipFile):  # a stranger's, with a digest of its own
+        return Begun()
     known = Known(**{part: Found(each.pop("points"), each) for part, each in found.items()})
     return Begun(known, head["points"], head["seconds"])
+
+
+def _unpacked(content: bytes) -> Iterator[tuple[str, np.ndarray]]:
+    """Arrays that `numpy.savez` packed, by name; ValueError where they are of other sizes."""
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        for member in archive.infolist():
+            if member.compress_type != zipfile.ZIP_STORED or member.file_size > len(content):
+                raise ValueError("packed otherwise than numpy.savez packs")
+            packed = io.BytesIO(archive.read(member))
+            version = np.lib.format.read_magic(packed)
+            read_header = {
+                (1, 0): np.lib.format.read_array_header_1_0,
+                (2, 0): np.lib.format.read_array_header_2_0,
+            }[version]
+            shape, _, dtype = read_header(packed)
+            # before numpy makes room for what the header declares
+            if math.prod(shape) * dtype.itemsize != member.file_size - packed.tell():
+                raise ValueError("its header declares another size")
+            packed.seek(0)
+            yield member.filename.removesuffix(".npy"), np.load(packed, allow_pickle=False)
 
 
 def begun_points(path: Location, study_id: str) -> dict[int, float]:
@@ -396,22 +429,37 @@ LOCK = "lock"
 #: Tries at a lock in an object store that others try for, too.
 TRIES = 5
 
-#: Seconds between heartbeats, and how old one may be before a holder on another host is dead.
+#: Seconds between heartbeats, and how old one may be before a holder on another host is doubted.
 HEARTBEAT = 10.0
 EXPIRY = 120.0
 
+#: Seconds for which the heartbeat of such a holder is watched before it is held for dead. Its age
+#: alone may come from a clock that was set; that it does not change can't.
+WATCH = 35.0
+
+#: Bytes of a lock at most.
+LOCK_BYTES_MAX = 1 << 16
+
+#: Errors of file systems that have no flock (Lustre without it, some NFS), or no hard links (FUSE,
+#: SMB, exFAT).
+NO_FLOCK = {errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP}
+NO_LINK = {errno.EPERM, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP}
+
 _left: set[str] = set()
 """Tokens of locks that this process has given up, which a store out of reach may not know."""
+
+_warned: set[str] = set()
+"""Warnings about file systems that this process has given."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Holder:
     """Holder of a lock."""
 
-    host: str
-    pid: int
-    started: float  # of the process [s since the epoch]: a number is used again, a start is not
-    token: str
+    host: str = "unknown"
+    pid: int = 0
+    start: int = 0  # of the process, as `process_start` has it: a number is used again
+    token: str = ""
     machine: str = ""  # hosts of one name may be many, where a store is seen from everywhere
 
     @classmethod
@@ -421,17 +469,15 @@ class Holder:
         return cls(
             host=socket.gethostname(),
             pid=pid,
-            started=_start_of(pid),
+            start=process_start(pid),
             token=uuid.uuid4().hex,
             machine=_machine(),
         )
 
-
-def _start_of(pid: int) -> float:
-    try:
-        return psutil.Process(pid).create_time()
-    except psutil.Error:
-        return 0.0
+    @property
+    def is_here(self) -> bool:
+        """Tell whether its process is one of this machine, if it still runs."""
+        return self.host == socket.gethostname() and self.machine in ("", _machine())
 
 
 @cache
@@ -447,19 +493,35 @@ def _machine() -> str:
 def holder(store_path: Location) -> Holder | None:
     """Holder of the lock of a store, living or dead; None where nobody does."""
     text = _claim(store_path).read()
-    if text is None:
-        return None
+    return None if text is None else _parsed(text)
+
+
+def _parsed(text: str) -> Holder:
+    """Holder that a lock names; one that is damaged, or of another version, as far as it does."""
     try:
-        return Holder(**json.loads(text))
-    except (ValueError, TypeError):
-        return Holder(host="unknown", pid=0, started=0.0, token="")
+        record = parse_json(text)
+    except ValueError:
+        return Holder()
+    types = {field.name: type(field.default) for field in fields(Holder)}
+    facts: dict[str, Any] = {}
+    if isinstance(record, dict):
+        facts = {name: v for name, v in record.items() if type(v) is types.get(name)}
+    return Holder(**facts)
 
 
 def is_live(store_path: Location, who: Holder) -> bool:
     """Tell whether the holder of a lock runs: its process here, its heartbeat elsewhere."""
-    if who.host == socket.gethostname() and who.machine in ("", _machine()):
-        return abs(_start_of(who.pid) - who.started) < 1.0
+    if (runs := _runs_here(who)) is not None:
+        return runs
     return heartbeat_age(store_path) < EXPIRY
+
+
+def _runs_here(who: Holder) -> bool | None:
+    """Tell whether a holder of this machine runs; None of others, and where it can't be seen."""
+    if not (who.is_here and who.start):
+        return None
+    start = process_start(who.pid)
+    return None if start == HIDDEN else start == who.start
 
 
 def heartbeat_age(store_path: Location) -> float:
@@ -496,24 +558,95 @@ class _FileClaim:
 
     def read(self) -> str | None:
         """Text of its holder; None where nobody holds it."""
+        return _text_of(self._path)
+
+    def mark(self) -> object:
+        """Mark of the last heartbeat, another one after each."""
         try:
-            return self._path.read_text()
+            opened = open_plain(self._path, follow=False)  # opened: a file server is asked anew
         except FileNotFoundError:
             return None
+        try:
+            status = os.fstat(opened)
+        finally:
+            os.close(opened)
+        return status.st_ino, status.st_mtime_ns
 
-    def take(self, text: str, judge: Callable[[], None]) -> None:
+    def take(self, text: str, judge: Callable[[], None], say: Callable[[str], None]) -> None:
         """Take it, unless `judge`, asked while no other process judges, raises."""
         self._path.parent.mkdir(exist_ok=True)
-        with open(self._path.with_name("lock.guard"), "a") as guard:
-            fcntl.flock(guard, fcntl.LOCK_EX)  # one process at a time judges and takes
+        with self._guard(say):  # one process at a time judges and takes
+            before = self.read()
             judge()
-            self._path.unlink(missing_ok=True)
+            self._put_aside(before)
             mine = self._path.with_name(f"lock.{uuid.uuid4().hex}")
             put_whole(mine, text.encode())  # an empty lock, after a power cut, would look alive
             try:
-                os.link(mine, self._path)  # fails where somebody was quicker, on NFS too
+                self._put(mine, text, say)
+            except FileExistsError:
+                if self.read() != text:  # a file server may have done it, and lost its answer
+                    raise BusyError(f"another process was quicker to lock {self._path}") from None
             finally:
-                mine.unlink()
+                mine.unlink(missing_ok=True)
+
+    @contextmanager
+    def _guard(self, say: Callable[[str], None]) -> Iterator[None]:
+        """Keep others from judging, where the file system has such locks."""
+        file = self._path.with_name("lock.guard")
+        flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK
+        guard = os.open(file, flags, 0o666)
+        try:
+            if not stat.S_ISREG(os.fstat(guard).st_mode):
+                raise UnfitFileError(errno.EINVAL, "is no plain file", str(file))
+            try:
+                fcntl.flock(guard, fcntl.LOCK_EX)
+            except OSError as error:
+                if error.errno not in NO_FLOCK:
+                    raise
+                _say_once(
+                    say,
+                    f"the file system of {self._path} has no flock ({error.strerror}): start no "
+                    "two runs of one store within the same second",
+                )
+            yield
+        finally:
+            os.close(guard)
+
+    def _put_aside(self, before: str | None) -> None:
+        """Take the lock of a dead holder away, and no other, where nothing keeps others out."""
+        if before is None:
+            return
+        aside = self._path.with_name(f"lock.{uuid.uuid4().hex}")
+        with suppress(FileNotFoundError):
+            os.rename(self._path, aside)
+            if _text_of(aside) != before:  # somebody was quicker
+                try:
+                    os.link(aside, self._path)
+                except OSError:
+                    if not self._path.exists():
+                        os.rename(aside, self._path)
+            aside.unlink()
+
+    def _put(self, mine: Path, text: str, say: Callable[[str], None]) -> None:
+        """Put the lock in its place; FileExistsError where somebody was quicker."""
+        try:
+            os.link(mine, self._path)  # fails where somebody was quicker, on NFS too
+            return
+        except OSError as error:
+            if error.errno not in NO_LINK:
+                raise
+            why = error.strerror
+        _say_once(
+            say,
+            f"the file system of {self._path} has no hard links ({why}): its lock is a file that "
+            "is made if none is there, which not every file server does in one step",
+        )
+        opened = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+        try:
+            os.write(opened, text.encode())
+            os.fsync(opened)
+        finally:
+            os.close(opened)
 
     def beat(self) -> None:
         """Say that the holder lives."""
@@ -522,6 +655,21 @@ class _FileClaim:
     def leave(self) -> None:
         """Give it up."""
         self._path.unlink(missing_ok=True)
+
+
+def _text_of(path: Path) -> str | None:
+    try:
+        opened = open_plain(path, follow=False)
+    except FileNotFoundError:
+        return None
+    with open(opened, "rb") as file:
+        return file.read(LOCK_BYTES_MAX).decode("utf-8", "replace")
+
+
+def _say_once(say: Callable[[str], None], warning: str) -> None:
+    if warning not in _warned:
+        _warned.add(warning)
+        say(f"warning: {warning}")
 
 
 class _ObjectClaim:
@@ -537,7 +685,12 @@ class _ObjectClaim:
         found = self._path.read_tagged()
         return _first_line(found[0]) if found and found[0] else None
 
-    def take(self, text: str, judge: Callable[[], None]) -> None:
+    def mark(self) -> object:
+        """Mark of the last heartbeat, another one after each."""
+        tagged = self._path.read_tagged()
+        return tagged and tagged[0]
+
+    def take(self, text: str, judge: Callable[[], None], say: Callable[[str], None]) -> None:
         """Take it, unless `judge` raises."""
         for _ in range(TRIES):
             found = self._path.read_tagged()
@@ -580,29 +733,75 @@ def _claim(store_path: Location) -> _FileClaim | _ObjectClaim:
     return _ObjectClaim(path) if isinstance(path, ObjectPath) else _FileClaim(path)
 
 
+def wait_for_silence(store_path: Location, say: Callable[[str], None]) -> None:
+    """Wait until the last heartbeat of a holder elsewhere is old, or another one comes.
+
+    So a job that is started again on another node, soon after it was killed, need not be refused.
+    """
+    other, mark = holder(store_path), _claim(store_path).mark()
+    if other is None or other.token in _left or _runs_here(other) is not None:
+        return
+    left = EXPIRY - heartbeat_age(store_path)
+    if 0 < left <= EXPIRY:
+        _is_silent(store_path, other, mark, left, say)
+
+
+def _is_silent(
+    store_path: Location, other: Holder, mark: object, seconds: float, say: Callable[[str], None]
+) -> bool:
+    """Watch a lock for some time by this process's own clock; tell whether it stayed as it was."""
+    say(
+        f"waiting up to {seconds:.0f} s to see whether process {other.pid} on {other.host}, which "
+        f"has locked {store_path}, still lives"
+    )
+    end, claim = time.monotonic() + seconds, _claim(store_path)
+    while (left := end - time.monotonic()) > 0:
+        time.sleep(min(1.0, left, seconds / 10))
+        if (holder(store_path), claim.mark()) != (other, mark):
+            return False
+    return True
+
+
 class Lock:
     """A store's lock, held and kept alive until released.
 
-    BusyError where a living driver holds it, StoreError where the store can't be written.
+    BusyError where a living driver holds it, StoreError where the store can't be written. ``say``
+    is told what a user should know: by default it warns.
     """
 
-    def __init__(self, store_path: Location) -> None:
+    def __init__(self, store_path: Location, say: Callable[[str], None] = warnings.warn) -> None:
         self._store, self._claim = store_path, _claim(store_path)
         self._me = Holder.myself()
         self._released = threading.Event()
         with told(f"{store_path} can't be locked"):
-            self._claim.take(json.dumps(asdict(self._me)), self._refuse_a_living_one)
+            self._silent = self._watch(say)
+            self._claim.take(json.dumps(asdict(self._me)), self._refuse_a_living_one, say)
         self._beating = threading.Thread(target=self._beat, name="lock-heartbeat", daemon=True)
         self._beating.start()
 
+    def _watch(self, say: Callable[[str], None]) -> object:
+        """Watch the heartbeat of a holder elsewhere; return what its lock was, if it is silent."""
+        other, mark = holder(self._store), self._claim.mark()
+        if other is None or other.token in _left or _runs_here(other) is not None:
+            return None
+        is_doubtful = not 0 <= heartbeat_age(self._store) < EXPIRY
+        if is_doubtful and _is_silent(self._store, other, mark, WATCH, say):
+            return other, mark
+        raise self._busy(other)
+
     def _refuse_a_living_one(self) -> None:
         other = holder(self._store)
-        if other and other.token not in _left and is_live(self._store, other):
-            who = f"process {one_line(other.pid)} on {one_line(other.host)}"
-            raise BusyError(
-                f"{self._store} is being written by {who}: "
-                f"wait for it, or stop it; {suggestion('status', self._store)} shows how far it is"
-            )
+        if other is None or other.token in _left or _runs_here(other) is False:
+            return
+        if self._silent is None or self._silent != (other, self._claim.mark()):
+            raise self._busy(other)
+
+    def _busy(self, other: Holder) -> BusyError:
+        who = f"process {one_line(other.pid)} on {one_line(other.host)}"
+        return BusyError(
+            f"{self._store} is being written by {who}: "
+            f"wait for it, or stop it; {suggestion('status', self._store)} shows how far it is"
+        )
 
     def _beat(self) -> None:
         while not self._released.wait(HEARTBEAT):

@@ -13,6 +13,7 @@ from types import FrameType
 from typing import IO, TYPE_CHECKING, Any, cast
 
 from sweep.messages import PrintableError, printable
+from sweep.plain_files import UnfitFileError
 from sweep.storage.opening import StoreError as StoreError
 from sweep.tasks.streams import ForgivingStream, is_terminal
 
@@ -65,6 +66,8 @@ def told(what: str) -> Iterator[None]:
     """Say what can't be done where the disk, or an object store, raises."""
     try:
         yield
+    except UnfitFileError as error:
+        raise StoreError(f"{what}: {error}") from error
     except OSError as error:
         raise StoreError(f"{what}: {error.strerror or error}") from error
 

@@ -14,7 +14,8 @@ from sweep.messages import option
 from sweep.model.detectors import taper
 from sweep.model.effects.catalogue import DEFAULTS, EFFECTS
 from sweep.model.looks import NUMBER, Looks
-from sweep.storage.locations import draft
+from sweep.storage.chunks import DraftFiles
+from sweep.storage.locations import draft, is_free
 from sweep.tasks.grid_study import draw_keys
 from sweep.tasks.progress import StoreError
 
@@ -153,7 +154,7 @@ def write(dataset: xr.Dataset, path: Path, *, overwrite: bool = False) -> None:
     """
     if path.suffix not in SUFFIXES:
         raise StoreError(f"{path} ends in neither {' nor '.join(SUFFIXES)}")
-    if path.exists():
+    if not is_free(path):
         if not overwrite:
             raise StoreError(
                 f"{path} is there already: {option('overwrite')} puts the new one in its place"
@@ -162,7 +163,7 @@ def write(dataset: xr.Dataset, path: Path, *, overwrite: bool = False) -> None:
             raise StoreError(f"{path} holds no spectra of `sweep spectra`: name another file")
     with draft(path.resolve(), replace=overwrite) as made:
         if path.suffix == ".zarr":
-            dataset.to_zarr(made, mode="w", zarr_format=3, consolidated=False)
+            dataset.to_zarr(DraftFiles(made), mode="w", zarr_format=3, consolidated=False)
             return
         arrays = {str(name): value.values for name, value in dataset.variables.items()}
         arrays["segment"] = arrays["segment"].astype("U")  # objects would have to be unpickled

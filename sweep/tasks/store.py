@@ -14,7 +14,7 @@ import os
 import platform
 import shlex
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import cache
 from importlib.metadata import version
@@ -29,8 +29,11 @@ from zarr.codecs import Crc32cCodec, ZstdCodec
 
 from sweep.messages import option, option_name, suggestion
 from sweep.model import VERSION
+from sweep.plain_files import UnfitFileError
 from sweep.spec import SceneSpec, Spec, difference
 from sweep.storage import locations, opening
+from sweep.storage.chunks import DraftFiles, packed_bytes_max
+from sweep.storage.foreign import foreign_names, is_litter
 from sweep.storage.locations import (
     JOURNAL,
     Location,
@@ -38,6 +41,7 @@ from sweep.storage.locations import (
     discard,
     draft,
     each,
+    entries_below,
     files_below,
     in_words,
     located,
@@ -53,12 +57,14 @@ from sweep.storage.opening import (
     ZSTD_LEVEL,
     digest,
     digest_of,
+    has_digest,
     read_lines,
     read_sealed,
     sealed,
     software_versions,
     versions_text,
 )
+from sweep.storage.sound import CHUNK
 from sweep.tasks.journal import LOCK, LOGS, REPLACES, Lock, Receipt, read_recipe, write_recipe
 from sweep.tasks.progress import BusyError, StoreError
 from sweep.tasks.study import CONVENTIONS, ArrayLayout, Content, Study
@@ -69,6 +75,9 @@ LIST = f"{JOURNAL}/{MANIFEST}"
 
 #: Object that says that what lies at a place in an object store is a store half made or removed.
 UNFINISHED = "partial"
+
+#: Files of others that are named where they are in the way.
+MOST_NAMED = 5
 
 #: Chunks are packed, and with a checksum.
 CODECS = [ZstdCodec(level=ZSTD_LEVEL), Crc32cCodec()]
@@ -165,7 +174,7 @@ def build(
     shards: Callable[[ArrayLayout], tuple[int, ...] | None] = lambda layout: None,
 ) -> None:
     """Make a store without results; a file holds one chunk, or as many as `shards` has."""
-    group = zarr.create_group(path, zarr_format=3, attributes=attributes)
+    group = zarr.create_group(DraftFiles(path), zarr_format=3, attributes=attributes)
     for name, own in study.groups().items():
         group.create_group(name, attributes=own)
     for layout in study.arrays():
@@ -288,6 +297,26 @@ def block_objects(study: Study, block: int) -> list[str]:
     return [chunk_object(name, position) for name, position in study.chunks(block).items()]
 
 
+def chunk_bytes_max(study: Study) -> Callable[[str], int]:
+    """Bytes that a chunk of a study can have at most, by its path inside the store."""
+
+    def bytes_max(name: str) -> int:
+        layout = study.layouts[array_of(name)]
+        return packed_bytes_max(layout.bytes_of(layout.chunks))
+
+    return bytes_max
+
+
+def array_of(name: str) -> str:
+    """Path, inside the store, of the array that an object is a chunk of; empty if of none.
+
+    >>> array_of("tile/pd_up/c/0/3"), array_of("weight/c"), array_of("pd_up/zarr.json")
+    ('tile/pd_up', 'weight', '')
+    """
+    found = CHUNK.fullmatch(name)
+    return found[1] if found else ""
+
+
 def chunk_object(name: str, position: tuple[int, ...]) -> str:
     """Path, inside the store, of one chunk of an array."""
     return "/".join([name, "c", *map(str, position)])
@@ -314,18 +343,41 @@ def sync(path: Location) -> None:
 def remove_partials(path: Location) -> None:
     """Remove the remains of writers that were killed within a file."""
     if isinstance(path, Path):
-        for entry in _entries(str(path)):
-            if entry.name.endswith(locations.PARTIAL):
-                with suppress(FileNotFoundError):
-                    os.unlink(entry.path)
+        drafts = (e for e in entries_below(str(path)) if e.name.endswith(locations.PARTIAL))
+        for entry in _without_foreign(path, drafts):
+            with suppress(FileNotFoundError):
+                os.unlink(entry.path)
 
 
 def refuse_links(path: Location) -> None:
-    """Refuse a store through whose links something would be written elsewhere."""
+    """Refuse a store through whose links something would be written elsewhere.
+
+    A link, or a pipe, in the place of a file is no harm: a new file is renamed into its place.
+    """
     if isinstance(path, Path):
-        for entry in _entries(str(path)):
-            if not entry.is_file(follow_symlinks=False):
-                raise StoreError(f"{entry.path} is no plain file: sweep made none such, remove it")
+        links = (
+            entry
+            for entry in entries_below(str(path))
+            if entry.is_symlink() and (entry.is_dir() or not os.path.exists(entry.path))
+        )
+        for entry in _without_foreign(path, links):
+            raise StoreError(
+                f"{entry.path} is a symbolic link, no folder: sweep made none such, remove it"
+            )
+
+
+def _without_foreign(path: Path, entries: Iterable[os.DirEntry[str]]) -> list[os.DirEntry[str]]:
+    """Leave out entries, few of those below a store, that are files of others."""
+    entries = list(entries)
+    if not entries:
+        return []  # so that a large store is walked through once
+    foreign, start = foreign_names(path), len(str(path)) + 1
+    folders = tuple(name for name in foreign if name.endswith("/"))
+    return [
+        entry
+        for entry in entries
+        if entry.path[start:] not in foreign and not entry.path[start:].startswith(folders)
+    ]
 
 
 class Damage(NamedTuple):
@@ -364,11 +416,7 @@ def damages(path: Location) -> list[Damage]:
 
 def altered(path: Location, name: str, known: str) -> str:
     """Damage of an object of the template, whose digest is known."""
-
-    def damage_of(content: bytes) -> str:
-        return "" if digest_of([(name, content)]) == known else "is not as it was made"
-
-    return wrong_with(path / name, damage_of)
+    return wrong_with(lambda: "" if has_digest(path, [name], known) else "is not as it was made")
 
 
 def refuse_damaged(path: Location) -> None:
@@ -382,26 +430,16 @@ def refuse_damaged(path: Location) -> None:
         )
 
 
-def wrong_with(place: Location, damage_of: Callable[[bytes], str]) -> str:
-    """Damage of an object in words, by what it holds; empty where there is none."""
+def wrong_with(damage: Callable[[], str]) -> str:
+    """Damage of an object in words, as a function says that reads it; empty if there is none."""
     try:
-        what = damage_of(place.read_bytes())
-        # Once more from an object store, whose answer may have been cut.
-        return damage_of(place.read_bytes()) if what and isinstance(place, ObjectPath) else what
+        return damage()
     except (FileNotFoundError, NotADirectoryError):
         return "is missing"
+    except UnfitFileError as error:
+        return str(error.strerror)
     except OSError as error:
         return f"can't be read: {error.strerror}"
-
-
-def _entries(folder: str) -> Iterator[os.DirEntry[str]]:
-    """Everything below a folder but folders."""
-    with os.scandir(folder) as entries:
-        for entry in entries:  # no look at a file: there may be millions
-            if entry.is_dir(follow_symlinks=False):
-                yield from _entries(entry.path)
-            else:
-                yield entry
 
 
 def is_seen(path: Location, study: Study, receipt: Receipt, read: bool) -> bool:
@@ -409,10 +447,10 @@ def is_seen(path: Location, study: Study, receipt: Receipt, read: bool) -> bool:
     objects = block_objects(study, receipt.block)
     try:
         if read:
-            return digest(path, objects) == receipt.digest
+            return digest(path, objects, chunk_bytes_max(study)) == receipt.digest
         if isinstance(path, Path):
-            return sum(os.stat(f"{path}/{name}").st_size for name in objects) == receipt.bytes
-    except (FileNotFoundError, NotADirectoryError):
+            return sum(os.lstat(f"{path}/{name}").st_size for name in objects) == receipt.bytes
+    except (FileNotFoundError, NotADirectoryError, IsADirectoryError, UnfitFileError):
         return False
     return (path / objects[-1]).size() > 0
 
@@ -453,6 +491,18 @@ def refuse_to_replace(path: Location) -> None:
             f"renaming: name another place with {option_name('store')}; this one then stays"
         )
     refuse_foreign(path)
+
+
+def refuse_foreign_files(path: Location) -> None:
+    """Refuse to replace a store with files in its folder that are not sweep's."""
+    if not isinstance(path, Path):
+        return
+    if names := [name for name in foreign_names(path) if not is_litter(name)]:
+        listed = ", ".join(names[:MOST_NAMED]) + (", ..." if len(names) > MOST_NAMED else "")
+        raise StoreError(
+            f"{path} has files in it that are not sweep's ({listed}): move them elsewhere, as "
+            "--overwrite replaces the whole folder"
+        )
 
 
 def under_way(path: Location) -> Path | None:

@@ -159,7 +159,8 @@ class Reuse:
         """Results of an older block, each with its chunk's shape; None where damaged or lost."""
         try:
             objects = store.block_objects(self.older, block)
-            if opening.digest(self._path, objects).encode() != self._digests[block]:
+            digest = opening.digest(self._path, objects, store.chunk_bytes_max(self.older))
+            if digest.encode() != self._digests[block]:
                 return None
             return {name: self.chunk(name, block) for name in self.older.chunks(block)}
         except DAMAGED:

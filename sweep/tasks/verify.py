@@ -11,6 +11,7 @@ import tempfile
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,18 +20,22 @@ import zarr
 
 from sweep.messages import suggestion
 from sweep.storage import opening
+from sweep.storage.foreign import foreign_names
 from sweep.storage.locations import (
     JOURNAL,
     PACKED,
     PARTIAL,
     Location,
+    ObjectPath,
     draft,
     eyepoints_path,
     files_below,
     in_words,
+    is_free,
     located,
     names_below,
     put_whole,
+    read_object,
     settle,
     zarr_store,
 )
@@ -61,6 +66,7 @@ class Report:
     whole: int  # blocks that are committed and undamaged
     damages: tuple[Damage, ...]
     restored: tuple[str, ...]  # objects of the template that were put back
+    foreign: tuple[str, ...]  # files that users and other programs have put there
     unmarked: str  # why damaged blocks could not be marked for `resume`; empty where they are
 
     @property
@@ -124,7 +130,7 @@ def _verify(path: Location, study: AnyStudy | None, repair: bool, shown: Progres
     found, restored = store.damages(path), []
     if found and study and repair:
         store.refuse_foreign(path)  # a lock would be the first thing of ours in it
-        with journal.Lock(path):
+        with journal.Lock(path, shown.say):
             found, restored = [], restore(path, study)
     logs = _of_logs(path)
     blocks = list(_of_blocks(path, study, shown)) if study else []
@@ -135,7 +141,8 @@ def _verify(path: Location, study: AnyStudy | None, repair: bool, shown: Progres
         whole=_whole(path, study, blocks) if study else 0,
         damages=(*found, *logs, *blocks, *surplus),
         restored=tuple(restored),
-        unmarked=_mark(path, blocks) if logs or blocks else "",
+        foreign=tuple(_foreign(path)),
+        unmarked=_mark(path, blocks, shown) if logs or blocks else "",
     )
 
 
@@ -147,9 +154,10 @@ def _whole(path: Location, study: Study, damages: list[Damage]) -> int:
 
 def _of_logs(path: Location) -> list[Damage]:
     """Damaged lines of the journal; the last of a log that is being written may be unfinished."""
-    holder = journal.holder(path)
+    unfit = opening.unfit_in_journal(path)
+    holder = None if unfit else journal.holder(path)
     alive = holder is not None and journal.is_live(path, holder)
-    return [
+    return [Damage(name, what, mended_by="hand") for name, what in unfit.items()] + [
         Damage(f"{JOURNAL}/{name} line {number}", "is damaged or cut short")
         for name in (*journal.LOGS, RECIPE)
         for number, (line, record) in enumerate(read_sealed(path / JOURNAL / name), start=1)
@@ -157,17 +165,29 @@ def _of_logs(path: Location) -> list[Damage]:
     ]
 
 
+def _foreign(path: Location) -> list[str]:
+    """Names of what users and other programs have put into a store."""
+    if isinstance(path, Path):
+        return foreign_names(path)
+    listed = store.digests(path)
+    names = (name for name in names_below(path) if not name.startswith(f"{JOURNAL}/"))
+    arrays = {name.removesuffix("/zarr.json") for name in listed}
+    return [n for n in names if n not in listed and store.array_of(n) not in arrays]
+
+
 def _surplus(path: Location, study: AnyStudy | None) -> Iterator[Damage]:
-    """Files of a store that are no part of it; drafts of writers that were killed are not told."""
+    """Chunks of arrays that are no part of a store; drafts of killed writers are not told."""
     listed = store.digests(path)
     grids = {name: owner.shape for name, owner in study.owners().items()} if study else {}
     for name in names_below(path):
         if name in listed or name.startswith(f"{JOURNAL}/") or name.endswith(PARTIAL):
             continue
         chunk = CHUNK.fullmatch(name)
-        array, place = (chunk[1], chunk[2].split("/")[1:]) if chunk else ("", [])
-        if chunk and not study and f"{array}/zarr.json" in listed:
+        if not (chunk and f"{chunk[1]}/zarr.json" in listed):
+            continue  # told as foreign
+        if not study:
             continue  # only who made it could tell which chunks it has
+        array, place = chunk[1], chunk[2].split("/")[1:]
         grid = grids.get(array, (0,))
         if len(place) != len(grid) or any(int(i) >= n for i, n in zip(place, grid, strict=True)):
             yield Damage(name, "is no part of the store", mended_by="hand")
@@ -193,25 +213,32 @@ def _of_blocks(path: Location, study: Study, shown: Progress) -> Iterator[Damage
 
 
 def _of_block(path: Location, study: Study, block: int, known: bytes) -> list[Damage]:
-    objects = store.block_objects(study, block)
+    objects, bytes_max = store.block_objects(study, block), store.chunk_bytes_max(study)
     try:
-        if has_digest(path, objects, known.decode()):
+        if has_digest(path, objects, known.decode(), bytes_max):
             return []
     except OSError:
         pass  # told below, object by object
-    found = [
-        Damage(name, what, block)
-        for name in objects
-        if (what := wrong_with(path / name, chunk_damage))
-    ]
+    found = []
+    for name in objects:
+        if what := wrong_with(partial(_of_chunk, path, name, bytes_max(name))):
+            found.append(Damage(name, what, block))
     count = f"one of its {len(objects)} chunks"
     return found or [Damage(count, "is whole but not the one that was committed", block)]
 
 
-def _mark(path: Location, damages: list[Damage]) -> str:
+def _of_chunk(path: Location, name: str, bytes_max: int) -> str:
+    """Damage of a chunk in words; read once more from an object store, as an answer may be cut."""
+    what = chunk_damage(read_object(path, name, bytes_max))
+    if what and isinstance(path, ObjectPath):
+        return chunk_damage(read_object(path, name, bytes_max))
+    return what
+
+
+def _mark(path: Location, damages: list[Damage], shown: Progress) -> str:
     """Withdraw receipts of damaged blocks; why that can't be, where it can't."""
     try:
-        with journal.Lock(path), told(f"{path} can't be written"):
+        with journal.Lock(path, shown.say), told(f"{path} can't be written"):
             log = journal.Journal(path)
             for block in sorted({damage.block for damage in damages}):
                 named = [f"{d.object} {d.what}" for d in damages if d.block == block]
@@ -302,7 +329,7 @@ def pack(
     if attributes.get(PACKED) or left:
         why = "is packed already" if attributes.get(PACKED) else f"lacks {left:,} blocks: resume it"
         raise StoreError(f"{path} {why}")
-    if output.exists():
+    if not is_free(output):
         raise StoreError(f"{output} is there already: name another place")
     shown = chosen(progress)
     with told(f"{output} can't be made"):

@@ -204,7 +204,7 @@ def test_a_journal_that_leads_out_of_a_store_is_not_read_or_written(theirs, tmp_
     else:
         os.mkfifo(receipts)
     told = CliRunner().invoke(main, ["resume", str(theirs)], catch_exceptions=False)
-    assert told.exit_code == 2 and "receipts.jsonl is no plain file" in told.output
+    assert told.exit_code == 2 and "receipts.jsonl is a " in told.output
     assert outside.read_text() == "mine\n"
 
 

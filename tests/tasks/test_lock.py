@@ -1,21 +1,30 @@
 import errno
+import fcntl
 import json
 import multiprocessing
 import os
+import re
 import socket
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import asdict, replace
+from pathlib import Path
 
+import psutil
 import pytest
-from small import quiet, receipts, small
+from click.testing import CliRunner
+from small import STUDY, Said, quiet, receipts, small
 
-from sweep.storage.locations import JOURNAL, located
+from sweep.cli import main
+from sweep.storage import locations
+from sweep.storage.locations import JOURNAL, located, process_start
 from sweep.tasks import journal
-from sweep.tasks.driver import resume
+from sweep.tasks.driver import resume, run
 from sweep.tasks.journal import Holder, Lock, holder, is_live
-from sweep.tasks.progress import StoreError
+from sweep.tasks.progress import BusyError, StoreError
+from sweep.tasks.verify import pack
 
 
 def put(store, who: Holder, *, age: float = 0.0) -> None:
@@ -51,7 +60,7 @@ def test_the_lock_of_a_dead_process_is_taken_over(tmp_path):
 
 
 def test_a_pid_used_again_by_another_process_does_not_keep_a_lock_alive(tmp_path):
-    put(tmp_path, replace(Holder.myself(), started=Holder.myself().started - 3600))
+    put(tmp_path, replace(Holder.myself(), start=Holder.myself().start - 3600))
     assert not is_live(tmp_path, holder(tmp_path))
     mine = Lock(tmp_path)
     assert mine.is_mine()
@@ -59,8 +68,9 @@ def test_a_pid_used_again_by_another_process_does_not_keep_a_lock_alive(tmp_path
 
 
 @pytest.mark.parametrize(("age", "live"), [(0.0, True), (60.0, True), (600.0, False)])
-def test_on_another_host_the_heartbeat_decides(tmp_path, age, live):
-    put(tmp_path, Holder(host="elsewhere", pid=1, started=1.0, token="t"), age=age)
+def test_on_another_host_the_heartbeat_decides(tmp_path, monkeypatch, age, live):
+    monkeypatch.setattr(journal, "WATCH", 0.1)
+    put(tmp_path, Holder(host="elsewhere", pid=1, start=1, token="t"), age=age)
     if live:
         with pytest.raises(StoreError, match="process 1 on elsewhere"):
             Lock(tmp_path)
@@ -82,18 +92,18 @@ def test_a_held_lock_beats(tmp_path, monkeypatch):
 
 def test_a_lock_taken_by_someone_else_is_not_ours_to_release(tmp_path):
     held = Lock(tmp_path)
-    other = Holder(host="elsewhere", pid=1, started=1.0, token="t")
+    other = Holder(host="elsewhere", pid=1, start=1, token="t")
     put(tmp_path, other)
     assert not held.is_mine()
     held.release()
     assert holder(tmp_path) == other
 
 
-def _try(store, results) -> None:
+def _try(store, results, over) -> None:
     try:
         Lock(store)
         results.put(True)
-        time.sleep(1.0)  # hold it while the others try
+        over.wait(60)  # hold it while the others try
     except StoreError:
         results.put(False)
 
@@ -101,11 +111,12 @@ def _try(store, results) -> None:
 def test_of_many_that_find_a_stale_lock_one_gets_it(tmp_path):
     put(tmp_path, replace(Holder.myself(), pid=2**22 + 1))
     context = multiprocessing.get_context("fork")
-    results = context.SimpleQueue()
-    tries = [context.Process(target=_try, args=(tmp_path, results)) for _ in range(6)]
+    results, over = context.SimpleQueue(), context.Event()
+    tries = [context.Process(target=_try, args=(tmp_path, results, over)) for _ in range(6)]
     for process in tries:
         process.start()
     got = [results.get() for _ in tries]
+    over.set()
     for process in tries:
         process.join()
     assert got.count(True) == 1
@@ -113,7 +124,7 @@ def test_of_many_that_find_a_stale_lock_one_gets_it(tmp_path):
 
 def test_a_driver_whose_lock_was_taken_commits_nothing_more(tmp_path):
     """As one that stood still so long that another host held it for dead."""
-    other = Holder(host="elsewhere", pid=1, started=1.0, token="t")
+    other = Holder(host="elsewhere", pid=1, start=1, token="t")
 
     def evaluate(study, block):
         if block == 4:
@@ -161,3 +172,252 @@ def test_no_two_heartbeats_of_an_object_are_alike():
         assert held.is_mine()
     held.release()
     assert len(set(states)) == 3
+
+
+# Clocks that are set, and file systems that have no locks or links
+
+
+class Clock:
+    """A wall clock that a test sets."""
+
+    def __init__(self):
+        self.ahead = 0.0
+        self._time = time.time
+
+    def time(self):
+        return self._time() + self.ahead
+
+
+@pytest.fixture
+def holding(tmp_path):
+    """A store that another living process of this machine has locked."""
+    code = (
+        "import sys; from pathlib import Path; from sweep.tasks.journal import Lock;"
+        "held = Lock(Path(sys.argv[1])); print('held', flush=True); sys.stdin.read()"
+    )
+    command = [sys.executable, "-c", code, str(tmp_path)]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) as process:
+        assert process.stdout.readline() == "held\n"
+        yield tmp_path, process
+        process.stdin.close()
+
+
+@pytest.mark.parametrize("step", [5.0, -5.0, 3600.0, -3600.0, 1e9])
+def test_a_clock_that_is_set_takes_no_lock_from_a_living_process(holding, monkeypatch, step):
+    """As ntpd does: psutil's start of a process moves with the clock, its ticks do not."""
+    store, process = holding
+    boot_time = psutil.boot_time()
+    monkeypatch.setattr(psutil, "boot_time", lambda: boot_time + step)
+    monkeypatch.setattr("psutil._pslinux.boot_time", lambda: boot_time + step)
+    clock = Clock()
+    clock.ahead = step
+    monkeypatch.setattr(time, "time", clock.time)
+    os.utime(store / JOURNAL / journal.LOCK, (1e9, 1e9))
+    assert is_live(store, holder(store))
+    with pytest.raises(BusyError, match=f"process {process.pid} on"):
+        Lock(store)
+
+
+def test_a_dead_process_that_nobody_has_waited_for_holds_no_lock(tmp_path):
+    code = (
+        "import os, sys; from pathlib import Path; from sweep.tasks.journal import Lock;"
+        "Lock(Path(sys.argv[1])); os.kill(os.getpid(), 9)"
+    )
+    with subprocess.Popen([sys.executable, "-c", code, str(tmp_path)]) as process:
+        deadline = time.monotonic() + 60
+        while process_start(process.pid) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert psutil.pid_exists(process.pid)
+        Lock(tmp_path).release()
+
+
+def elsewhere(store, *, age):
+    """The lock of a process of another host, with a heartbeat of that age by the file's clock."""
+    put(store, Holder(host="elsewhere", pid=1, start=1, token="t"), age=age)
+
+
+@pytest.mark.parametrize("age", [600.0, 1e9, -600.0])
+@pytest.mark.parametrize("kind", ["beating", "silent"])
+def test_a_heartbeat_that_is_seen_to_change_is_alive_whatever_its_clock_says(
+    tmp_path, monkeypatch, kind, age
+):
+    """The clock of the file server may have been set: an age that it gives proves nothing."""
+    monkeypatch.setattr(journal, "WATCH", 1.0)
+    elsewhere(tmp_path, age=age)
+    stop = threading.Event()
+
+    def beat():
+        path, at = tmp_path / JOURNAL / journal.LOCK, time.time() - age
+        while not stop.wait(0.2):
+            at += 0.2
+            os.utime(path, (at, at))
+
+    beating = threading.Thread(target=beat)
+    said = []
+    if kind == "beating":
+        beating.start()
+    try:
+        if kind == "beating":
+            with pytest.raises(BusyError, match="process 1 on elsewhere"):
+                Lock(tmp_path, said.append)
+        else:
+            Lock(tmp_path, said.append).release()
+    finally:
+        stop.set()
+        if kind == "beating":
+            beating.join()
+    assert said and "waiting up to 1 s to see whether process 1 on elsewhere" in said[0]
+
+
+def test_an_object_whose_heartbeats_are_counted_is_alive(monkeypatch):
+    monkeypatch.setattr(journal, "WATCH", 1.0)
+    monkeypatch.setattr(journal, "HEARTBEAT", 0.1)
+    monkeypatch.setattr(journal, "heartbeat_age", lambda path: 1e6)
+    monkeypatch.setattr(Holder, "is_here", False)
+    store = located(f"memory://bucket/{time.time_ns()}/s.zarr")
+    held = Lock(store)
+    with pytest.raises(BusyError):
+        Lock(store, lambda text: None)
+    held._released.set()  # it stands still
+    held._beating.join()
+    Lock(store, lambda text: None).release()
+
+
+def test_a_lock_that_changes_hands_while_it_is_watched_is_not_taken(tmp_path, monkeypatch):
+    monkeypatch.setattr(journal, "WATCH", 0.5)
+    elsewhere(tmp_path, age=600.0)
+    mark = journal._FileClaim.mark
+
+    def overtaken(self):
+        marked = mark(self)
+        put(tmp_path, Holder(host="third", pid=3, start=1, token="u"), age=600.0)
+        return marked
+
+    monkeypatch.setattr(journal._FileClaim, "mark", overtaken)
+    with pytest.raises(BusyError):
+        Lock(tmp_path, lambda text: None)
+    assert holder(tmp_path).host == "third"
+
+
+def test_a_lock_of_another_version_is_judged_by_its_heartbeat(tmp_path, monkeypatch):
+    monkeypatch.setattr(journal, "WATCH", 0.2)
+    path = tmp_path / JOURNAL / journal.LOCK
+    path.parent.mkdir()
+    for text in (
+        json.dumps({"host": socket.gethostname(), "pid": 2**22, "started": 1e9, "token": "t"}),
+        "", "[]", '{"pid": "x"}', "[" * 10**5,
+    ):  # fmt: skip
+        path.write_text(text)
+        with pytest.raises(BusyError):
+            Lock(tmp_path)
+        os.utime(path, (1e9, 1e9))
+        Lock(tmp_path, lambda text: None).release()
+
+
+def fails(number):
+    def refuse(*_, **__):
+        raise OSError(number, os.strerror(number))
+
+    return refuse
+
+
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP])
+def test_a_file_system_without_flock_is_warned_of_once_and_used(tmp_path, monkeypatch, number):
+    """As Lustre without its option, or NFS without lockd."""
+    monkeypatch.setattr(fcntl, "flock", fails(number))
+    monkeypatch.setattr(journal, "_warned", set())
+    said = []
+    held = Lock(tmp_path, said.append)
+    assert said == [said[0]] and said[0].startswith("warning: ") and "has no flock" in said[0]
+    with pytest.raises(BusyError):
+        Lock(tmp_path, said.append)
+    held.release()
+    Lock(tmp_path, said.append).release()
+    assert len(said) == 1
+
+
+@pytest.mark.parametrize("number", [errno.EPERM, errno.ENOSYS, errno.ENOTSUP])
+def test_a_file_system_without_links_is_warned_of_once_and_used(tmp_path, monkeypatch, number):
+    """As FUSE and SMB have none, and exFAT."""
+    monkeypatch.setattr(os, "link", fails(number))
+    monkeypatch.setattr(journal, "_warned", set())
+    said = []
+    held = Lock(tmp_path, said.append)
+    assert held.is_mine() and len(said) == 1 and "has no hard links" in said[0]
+    with pytest.raises(BusyError):
+        Lock(tmp_path, said.append)
+    held.release()
+    put(tmp_path, replace(Holder.myself(), pid=2**22 + 1))
+    Lock(tmp_path, said.append).release()
+    assert len(said) == 1 and sorted(os.listdir(tmp_path / JOURNAL)) == ["lock.guard"]
+
+
+@pytest.mark.parametrize("number", [errno.EIO, errno.EACCES])
+def test_other_faults_of_a_file_system_refuse(tmp_path, monkeypatch, number):
+    monkeypatch.setattr(fcntl, "flock", fails(number))
+    with pytest.raises(StoreError, match="can't be locked"):
+        Lock(tmp_path)
+
+
+@pytest.mark.parametrize("lacking", ["flock", "link", "both"])
+def test_of_many_that_find_a_stale_lock_without_locks_or_links_one_gets_it(
+    tmp_path, monkeypatch, lacking
+):
+    if lacking in ("flock", "both"):
+        monkeypatch.setattr(fcntl, "flock", fails(errno.ENOSYS))
+    if lacking in ("link", "both"):
+        monkeypatch.setattr(os, "link", fails(errno.EPERM))
+    test_of_many_that_find_a_stale_lock_one_gets_it(tmp_path)
+
+
+@pytest.mark.parametrize("links", [True, False])
+def test_a_lock_that_another_takes_between_is_left_to_it(tmp_path, monkeypatch, links):
+    """Without flock, nothing keeps two from judging one dead lock at once."""
+    monkeypatch.setattr(fcntl, "flock", fails(errno.ENOSYS))
+    if not links:
+        monkeypatch.setattr(os, "link", fails(errno.EPERM))
+    put(tmp_path, replace(Holder.myself(), pid=2**22 + 1))
+    judge, quicker = Lock._refuse_a_living_one, []
+
+    def overtaken(self):
+        judge(self)
+        if not quicker:
+            quicker.append(None)
+            quicker.append(Lock(tmp_path, lambda text: None))
+
+    monkeypatch.setattr(Lock, "_refuse_a_living_one", overtaken)
+    with pytest.raises(BusyError):
+        Lock(tmp_path, lambda text: None)
+    assert quicker[1].is_mine()
+    quicker[1].release()
+
+
+def test_a_run_without_flock_or_links_goes_to_its_end(tmp_path, monkeypatch):
+    monkeypatch.setattr(fcntl, "flock", fails(errno.ENOLCK))
+    monkeypatch.setattr(os, "link", fails(errno.EPERM))
+    monkeypatch.setattr(journal, "_warned", set())
+    said = Said()
+    store = tmp_path / "s.zarr"
+    assert run(small(), store=store, progress=said, scheduler="none").complete
+    assert sum("warning: " in line for line in said) == 2
+    range_ = {"linear": ["10 m", "5 km"], "number": 3}
+    axes = {**STUDY["axes"], "target.range": range_}
+    again = run(small(axes=axes), store=store, overwrite=True, progress=said, scheduler="none")
+    assert again.complete and pack(store, tmp_path / "packed.zarr", progress=False)
+    spectra = ["spectra", str(store), "--at", "range=10m", "-o", str(tmp_path / "spectra.zarr")]
+    assert CliRunner().invoke(main, spectra, catch_exceptions=False).exit_code == 0
+
+
+def test_what_a_living_process_makes_is_not_cleared_up_after_the_clock_was_set(tmp_path):
+    made = locations._hidden(tmp_path / "s.zarr", "creating")
+    made.mkdir()
+    os.utime(made, (1e9, 1e9))
+    locations.settle(tmp_path / "other.zarr")
+    assert made.exists()
+    dead = Path(str(made).replace(f"-{os.getpid()}.", f"-{2**22 + 1}."))
+    dead.mkdir()
+    reused = Path(re.sub(rf"-{os.getpid()}\.\d+", f"-{os.getpid()}.7", str(made)))
+    reused.mkdir()
+    locations.settle(tmp_path / "other.zarr")
+    assert made.exists() and not dead.exists() and not reused.exists()

@@ -66,7 +66,7 @@ def look_only(store: Path, monkeypatch) -> None:
     """Have the one store verified quickly, without withdrawing anything."""
     _, study = studies.read(store)
     monkeypatch.setattr("sweep.tasks.verify._study", lambda path, spec: study)
-    monkeypatch.setattr("sweep.tasks.verify._mark", lambda path, blocks: "only looking")
+    monkeypatch.setattr("sweep.tasks.verify._mark", lambda path, blocks, shown: "only looking")
 
 
 def unmarked(store: Path) -> list[str]:
@@ -302,9 +302,9 @@ def test_eyepoints_that_no_longer_say_what_they_are_are_mended_by_the_flight(fli
     assert tree(directory) == tree(flight.parent)
 
 
-def test_files_and_arrays_that_are_no_part_of_a_store_are_named(undisturbed, tmp_path):
+def test_chunks_that_are_no_part_of_a_store_are_named(undisturbed, tmp_path):
     store = copied(undisturbed, tmp_path)
-    surplus = ["pd_down2/zarr.json", "notes", "pd_up/c/0/12/0", "range/c/1"]
+    surplus = ["pd_up/c/0/12/0", "range/c/1"]
     for name in surplus:
         (store / name).parent.mkdir(parents=True, exist_ok=True)
         (store / name).write_text("{}")
@@ -313,8 +313,8 @@ def test_files_and_arrays_that_are_no_part_of_a_store_are_named(undisturbed, tmp
     (report,) = verify(store, progress=False)
     assert sorted(damage.object for damage in report.damages) == sorted(surplus)
     told = CliRunner().invoke(main, ["verify", str(store), "--repair"])
-    assert told.exit_code == 1 and "notes is no part of the store" in told.output
-    assert "sweep resume" not in told.output and (store / "notes").exists()
+    assert told.exit_code == 1 and "range/c/1 is no part of the store" in told.output
+    assert "sweep resume" not in told.output and (store / "range/c/1").exists()
 
 
 def test_a_template_that_cannot_be_made_again_here_is_left_as_it_is(

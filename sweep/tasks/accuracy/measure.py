@@ -18,7 +18,7 @@ import numpy as np
 from sweep.messages import option, option_name
 from sweep.spec import SceneSpec, Spec
 from sweep.storage import opening
-from sweep.storage.locations import Location, real
+from sweep.storage.locations import Location, is_free, real
 from sweep.tasks import store
 from sweep.tasks.accuracy.bench import Bench, FlightBench, GridBench, Seen, Trial, spread, together
 from sweep.tasks.accuracy.rungs import (
@@ -115,13 +115,14 @@ def measure(
 
 
 def _refuse_in_the_way(path: Location, overwrite: bool) -> None:
-    if not path.exists():
+    if is_free(path):
         return
     if opening.read_attributes(path)["kind"] != ACCURACY:
         raise StoreError(f"{path} holds a study's results: name another {option_name('store')}")
     if not overwrite:
         raise StoreError(f"{path} is there already: {option('overwrite')} measures anew")
     store.refuse_to_replace(path)
+    store.refuse_foreign_files(path)
 
 
 def storing(study: Study) -> float:
