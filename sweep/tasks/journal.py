@@ -750,9 +750,10 @@ def _is_silent(
     store_path: Location, other: Holder, mark: object, seconds: float, say: Callable[[str], None]
 ) -> bool:
     """Watch a lock for some time by this process's own clock; tell whether it stayed as it was."""
+    who = f"process {other.pid} on {one_line(other.host)}"
     say(
-        f"waiting up to {seconds:.0f} s to see whether process {other.pid} on {other.host}, which "
-        f"has locked {store_path}, still lives"
+        f"waiting up to {seconds:.0f} s to see whether {who}, "
+        f"which has locked {store_path}, still lives"
     )
     end, claim = time.monotonic() + seconds, _claim(store_path)
     while (left := end - time.monotonic()) > 0:
