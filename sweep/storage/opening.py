@@ -232,7 +232,7 @@ def has_digest(
 ) -> bool:
     """Tell whether stored objects have a digest; read once more from an object store if not.
 
-    What is raised, and ``bytes_max``, are as of :func:`digest`.
+    Errors, and ``bytes_max``, are as of :func:`digest`.
     """
     is_same = digest(path, objects, bytes_max) == known
     return is_same or (isinstance(path, ObjectPath) and digest(path, objects, bytes_max) == known)
@@ -391,7 +391,12 @@ class Unreplaced(CheckedFiles):
 
     def read(self, key: str, byte_range: Any) -> bytes | None:
         """Return the bytes of a file; the identity of the store is checked afterwards."""
-        content = super().read(key, byte_range)
+        try:
+            return super().read(key, byte_range)
+        finally:  # another study's file may also be of another size
+            self._refuse_another()
+
+    def _refuse_another(self) -> None:
         now = stamp(self.root)
         if now is None or now != self._seen:  # repaired, or another's
             if study_id(self.root) != self._study_id:
@@ -400,7 +405,6 @@ class Unreplaced(CheckedFiles):
                     "open it again"
                 )
             self._seen = now
-        return content
 
 
 def readable(location: Location, held: str = "") -> Any:
