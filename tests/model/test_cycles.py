@@ -167,18 +167,22 @@ def test_the_grounds_slope_and_relief_are_passed_on():
     rest = flight((0.0, 0.0, 0.0), attitude=Fixed(tilted.as_quat(scalar_first=True)))
     seen = _seen(FOUR, path=path, bodies=[plate()], motion=[rest])
     points = _points(seen)
-    free, usual, held, rough = (
+    free, usual, held, contradicted = (
         _solved(seen, points, FOUR, ground_slope=slope, relief=relief)
         for slope, relief in (
             (1e7, 0.0), (Navigation().ground_slope, 0.0), (0.0, 0.0), (0.0, 7.0)
         )
     )  # fmt: skip
+    level = _seen(FOUR, path=path, bodies=[plate()])
+    rough = _solved(level, _points(level), FOUR, ground_slope=0.0, relief=7.0)
     np.testing.assert_allclose(free["altitude"], 900.0, rtol=1e-12)
     # As a study has it if it says nothing: off by far less than it states.
     off = np.abs(usual["altitude"] - 900.0) / np.sqrt(usual["altitude_variance"])
     assert off.max() < 1e-3 and (usual["altitude_variance"] < 1e-2).all()
     assert (np.abs(held["altitude"] - 900.0) > 1.0).all()
     np.testing.assert_allclose(rough["altitude_variance"], 7.0**2 / 4, rtol=1e-3)
+    # Ranges of a slope contradict level ground of that relief, and the variance follows them.
+    assert (contradicted["altitude_variance"] > 100 * rough["altitude_variance"]).all()
 
 
 @PATTERNS
@@ -304,10 +308,11 @@ def test_jitter_spreads_velocity_and_altitude_as_stated():
     ranges = 1000.0 / -FOUR[:, 2]
     covariance, variance = _propagated(FOUR, sigma * across, sigma * ranges * tangent)
     stated = got["velocity_covariance"][:, 0]
-    np.testing.assert_allclose(
-        stated, np.tile(covariance, (number, 1, 1)), atol=0.01 * covariance.max()
-    )
-    np.testing.assert_allclose(got["altitude_variance"], variance, rtol=0.01)
+    # Covariances follow residuals that contradict them, by chance in one cycle of a thousand.
+    as_stated = (np.abs(stated - covariance) <= 0.01 * covariance.max()).all(axis=(1, 2))
+    assert as_stated.mean() > 0.996
+    close = np.isclose(got["altitude_variance"], variance, rtol=0.01)
+    assert close.mean() > 0.996
     error = got["velocity"][:, 0] - [60.0, -20.0, 0.0]
     spread = np.sqrt(np.diag(covariance))
     assert (np.abs(error.mean(axis=0)) <= 5 * spread / np.sqrt(number)).all()

@@ -226,5 +226,6 @@ def test_velocities_of_four_beams_close_as_the_floor_has_it(tmp_path, floor, low
     assert low < closure < high
     null = np.linalg.svd(beams[0].T)[2][3]
     expected = np.sqrt((null[:, None] ** 2 * stated**2).sum(axis=1).mean()) / 2
-    assert closure == pytest.approx(expected, rel=0.05)
+    # Corrections for motion are of first order: 2e-6 m/s is left of 50 m/s.
+    assert closure == pytest.approx(expected, rel=0.05, abs=2e-6)
     assert (found["velocity_beams"] == 4).all()

@@ -145,11 +145,9 @@ def test_both_chirps_are_detected_as_often_as_in_drawn_records(case, rule, toler
     assert abs(both - expected) < 4 * error + tolerance
 
 
-def test_carriers_that_differ_share_less_speckle_than_equal_ones():
+def test_carriers_that_differ_share_less_speckle_than_equal_ones(table_4_1):
     """The correlation is exp(-t^2 / 2), t = 4 pi df sigma_R / c, where the footprint is narrow."""
-    from conftest import TABLE_4_1
-
-    p = DEFAULTS | TABLE_4_1 | LANDER | CASES["steep chirp, short record"]
+    p = DEFAULTS | table_4_1() | LANDER | CASES["steep chirp, short record"]
     shots = shots_of(p)
     delay, length = 2 * 150.0 / 299792458.0, 8192 / 200e6
     frequencies_apart = 2 * (4e9 / 100e-6) * (5e-6 + length / 2 - delay - 50e-6)

@@ -44,7 +44,7 @@ from numpy.typing import ArrayLike
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.effect import Effect, Parameter, Realisation, Scene, Size
 from sweep.model.effects.points import Points
-from sweep.model.ground import Plane, Slopes
+from sweep.model.ground import Cast, Plane, Slopes
 from sweep.model.preparation import Shots
 from sweep.model.speckle_correlation import NARROW, SEGMENT_PAIRS, LineSpread, bin_correlation
 
@@ -188,8 +188,9 @@ def fade(shots: Shots, scene: Scene) -> Shots:
         correlations = [scene.ground.mean_phasor(*phase) for phase in phases]
         across = [np.zeros(shots.size)] * len(phases)
     else:
-        slopes = _cast_slopes(shots)
-        mean, variance = _phase_moments(shots, phases)
+        moments = _beamlet_moments(shots, scene.ground)
+        slopes = _cast_slopes(moments)
+        mean, variance = _phase_moments(moments, phases)
         correlations = list(np.exp(1j * mean - 0.5 * variance))
         across = [
             np.maximum(total - phase.along(slopes) ** 2, 0.0)
@@ -265,36 +266,55 @@ def _line_spread(
     )  # fmt: skip
 
 
-def _phase_moments(shots: Shots, phases: list[PhaseDifference]) -> tuple[np.ndarray, np.ndarray]:
+class BeamletMoments(NamedTuple):
+    """Moments of beamlets' Doppler ratios and relative ranges, in this order."""
+
+    mean: np.ndarray
+    """(2, n)."""
+    covariance: np.ndarray
+    """(2, 2, n)."""
+
+
+def _beamlet_moments(shots: Shots, ground: Cast) -> BeamletMoments:
+    """Return the moments of beamlets that rays have found, about the mean of their own surface.
+
+    Surfaces at different ranges, as a roof and the ground below, are echoes of their own, each of
+    which fades as a whole.
+    """
+    power = shots.amplitude**2
+    share = power / np.maximum(power.sum(axis=1), _SMALLEST)[:, None]
+    values = np.array([shots.doppler, shots.offset])
+    mean = (share * values).sum(axis=-1)
+    centred = values - mean[:, :, None]
+    if ground.beside is not None and ground.beside.any():
+        for surface in (ground.beside, ~ground.beside):
+            weight = np.where(surface, share, 0.0)
+            whole = np.maximum(weight.sum(axis=1), _SMALLEST)
+            own_mean = (weight * values).sum(axis=-1) / whole
+            centred = np.where(surface, values - own_mean[:, :, None], centred)
+    covariance = (share * centred[:, None] * centred[None]).sum(axis=-1)
+    return BeamletMoments(mean[:, shots.row], covariance[:, :, shots.row])
+
+
+def _phase_moments(
+    moments: BeamletMoments, phases: list[PhaseDifference]
+) -> tuple[np.ndarray, np.ndarray]:
     """Mean and variance of the phase differences of beamlets that rays have found, (3, n) each.
 
     Ranges and Doppler shifts change evenly across a beam, Gaussian as it is, so that these two are
     enough. A sum of phasors over few rays would repeat itself where their phases are whole turns
     apart.
     """
-    mean, covariance = _beamlet_moments(shots)
     weights = 2 * np.pi * np.array([[phase.turn, -phase.delay_cycles] for phase in phases])
-    variance = np.einsum("pin,ijn,pjn->pn", weights, covariance, weights)
-    return (weights * mean).sum(axis=1), variance
+    variance = np.einsum("pin,ijn,pjn->pn", weights, moments.covariance, weights)
+    return (weights * moments.mean).sum(axis=1), variance
 
 
-def _cast_slopes(shots: Shots) -> Slopes:
+def _cast_slopes(moments: BeamletMoments) -> Slopes:
     """Return the changes along the direction in which beamlets' ranges change most, (n,) each."""
-    _, covariance = _beamlet_moments(shots)
-    deviation = np.sqrt(covariance[1, 1])
-    along = covariance[0, 1] / np.maximum(deviation, _SMALLEST)
-    return Slopes(along, deviation, np.zeros(shots.size))
-
-
-def _beamlet_moments(shots: Shots) -> tuple[np.ndarray, np.ndarray]:
-    """Mean (2, n) and covariance (2, 2, n) of beamlets' Doppler ratios and relative ranges."""
-    power = shots.amplitude**2
-    share = power / np.maximum(power.sum(axis=1), _SMALLEST)[:, None]
-    values = np.array([shots.doppler, shots.offset])
-    mean = (share * values).sum(axis=-1)
-    centred = values - mean[:, :, None]
-    covariance = (share * centred[:, None] * centred[None]).sum(axis=-1)
-    return mean[:, shots.row], covariance[:, :, shots.row]
+    deviation = np.sqrt(moments.covariance[1, 1])
+    along = moments.covariance[0, 1] / np.maximum(deviation, _SMALLEST)
+    return Slopes(along, deviation, np.zeros(deviation.shape))
 
 
 FADING = Effect(
