@@ -193,6 +193,8 @@ def cache_folder() -> CacheFolder:
                     if error.filename
                     else error.strerror or str(error)
                 )
+            except RuntimeError as error:  # no home: neither $HOME nor the uid has one
+                reasons.append(str(error))
         return CacheFolder(None, "; ".join(reasons))
 
 

@@ -170,7 +170,7 @@ def read_quantity(written: object, *, si_unit: str, example: str) -> tuple[Fract
     value, text = _split(written, "must be a number with a unit")
     if not text:
         remedy = f"write e.g. '{example}'"
-        if si_unit == DECIBEL and value > 0:
+        if si_unit == DECIBEL and 1e-300 < value < 1e300:  # others are no floats, or no ratios
             remedy += f"; a ratio of {_show(value)} is {10 * math.log10(value):.4g} dB"
         raise QuantityError("needs a unit", remedy)
     return value, read_unit(text, si_unit=si_unit, example=example)

@@ -5,9 +5,11 @@ import shutil
 import stat
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
+import numba
 import pytest
 
 import sweep
@@ -36,7 +38,7 @@ def scale_twice(x):
 
 CODE = """
 import resource, sys
-import numba
+
 exec(sys.argv[1])
 from sweep.model.caller import scale_twice
 print(scale_twice(1.0), sum(scale_twice.stats.cache_hits.values()))
@@ -288,6 +290,17 @@ def test_all_kernels_of_the_package_are_cached_by_the_fingerprint():
     assert others == {"kernels.py", "tasks/accuracy/bench.py"} and len(users) > 15
     for name in users - {"kernels.py"}:
         assert "from numba" not in (PACKAGE / name).read_text()
+
+
+def test_kernels_are_cached_among_temporary_files_where_the_user_has_no_home(monkeypatch, tmp_path):
+    def fail():
+        raise RuntimeError("could not determine the home directory")
+
+    monkeypatch.setattr(sweep.kernels, "user_cache_dir", fail)
+    monkeypatch.setattr(numba.config, "CACHE_DIR", "")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    folder = sweep.kernels.cache_folder.__wrapped__()
+    assert folder.path is not None and folder.path.parent.parent == tmp_path
 
 
 def test_the_model_is_cached_by_the_fingerprint():

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from sweep.model.effects.catalogue import DEFAULTS
 from sweep.model.outputs import (
     DRAW_OUTPUTS,
     ERROR_OUTPUTS,
@@ -18,6 +19,8 @@ from sweep.model.outputs import (
     STRONGEST_OUTPUTS,
     WITHOUT_ECHO,
 )
+from sweep.model.preparation import categories
+from sweep.model.resolution import BEAMLETS, is_open
 from sweep.model.unsupported import UnsupportedShot
 from sweep.model.waveform import ENDS
 from sweep.spec import Mistake, Spec, SpecError, from_stored, load
@@ -110,7 +113,9 @@ def look_at_results(spec: Spec, study: GridStudy, results: Results, block: int) 
         assert values.shape[: len(extent)] == extent, f"{name} has the shape {values.shape}"
         if name.startswith(PROBABILITIES):
             _probability(name, values)
-        if name in FINITE:
+        if name == "beamlets_error":
+            _beamlets_error(given, values)
+        elif name in FINITE:
             there = values[values != -np.inf] if name in NO_BIN_LEFT else values
             there = values[results["snr_up"] > 0] if name in WITHOUT_ECHO else there
             if name in WITHOUT_ECHO and ENDS[0] in given:  # nothing is told of echoes outside
@@ -129,6 +134,18 @@ def look_at_results(spec: Spec, study: GridStudy, results: Results, block: int) 
 def _probability(name: str, values: np.ndarray) -> None:
     there = values[~np.isnan(values)]
     assert ((there >= 0) & (there <= 1)).all(), f"{name} is no probability: {there}"
+
+
+def _beamlets_error(given: Mapping[str, Any], values: np.ndarray) -> None:
+    """Estimated where the tolerance sets the number of beamlets and their powers add, else nan."""
+    for index, words in categories(DEFAULTS | dict(given)):
+        errors = values.ravel()[index]
+        if int(words[BEAMLETS]) > 0:
+            assert np.isnan(errors).all(), "the error of a given number of beamlets is not checked"
+        elif is_open(words):
+            assert ((errors >= 0) & (errors <= 1)).all(), f"beamlets_error is {errors}"
+        else:  # a lone beamlet, where no footprint is simulated, has no error
+            assert (np.isnan(errors) | (errors == 0)).all(), f"beamlets_error is {errors}"
 
 
 def _signal_and_noise(results: Results, any_two: bool) -> None:

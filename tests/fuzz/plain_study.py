@@ -12,7 +12,10 @@ INSTRUMENT = {
         "noise_equivalent_power": "5 pW/rtHz", "transimpedance": "7 kohm",
         "amplifier_bandwidth": "400 MHz", "amplifier_noise_current": "25 nA",
     },
-    "processing": {"sample_rate": "600 MHz", "fft_size": "2^12", "tnr": 8},
+    "processing": {
+        "sample_rate": "600 MHz", "fft_size": "2^12", "tnr": 8,
+        "acquisition_delay": "13.4 us",  # the echo of 2 km is there from 13.34 us on
+    },
 }  # fmt: skip
 
 

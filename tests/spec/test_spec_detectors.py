@@ -38,7 +38,11 @@ def test_they_may_vary_and_their_coordinates_bear_their_names():
         ({}, {"method": "spectra"}, "set draws.number or draws.limit"),
         ({"detector.training": 33}, SPECTRA, "must be even"),
         ({"detector.rank": 40}, SPECTRA, "at most detector.training, 32"),
-        ({"fft_size": 64}, SPECTRA, "leaves 31 bins between DC and Nyquist"),
+        (
+            {"fft_size": 64, "acquisition_delay": "14 us"},
+            SPECTRA,
+            "leaves 31 bins between DC and Nyquist",
+        ),
         ({"detector": "os_cfar"}, SPECTRA, "must be a mapping"),
     ],
 )

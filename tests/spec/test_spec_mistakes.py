@@ -51,6 +51,8 @@ FIELDS = [
      "mean 'dBm'?"),
     ("instrument.chirp.bandwidth", "30 dBm", "needs a unit like Hz, and 'dBm' is none"),
     ("instrument.receiver.noise_figure", 2, "write e.g. '3 dB'; a ratio of 2 is 3.01 dB"),
+    ("instrument.receiver.noise_figure", "1e400",
+     "needs a unit (you wrote '1e400'); write e.g. '3 dB'"),
     ("instrument.receiver.noise_figure", "-1 dB", "must be at least 0 dB"),
     ("instrument.receiver.temperature", "-300 degC", "must be at least 1 nK"),
     ("instrument.processing.fft_size", 100.5, "must be a whole number"),
