@@ -48,6 +48,7 @@ def test_mistakes_end_in_plain_words_and_exit_code_2(here):
     (here / "wrong.yaml").write_text(STUDY.replace("25 mm", "25"))
     refused(sweep("accuracy", "wrong.yaml"), "telescope")
     (here / "notes").mkdir()
+    (here / "notes" / "note.txt").write_text("a note")  # an empty folder can become a store
     refused(sweep("accuracy", "small.yaml", "--store", "notes"), "is not a Zarr store")
     assert not (here / "results").exists()
 

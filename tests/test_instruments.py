@@ -121,7 +121,9 @@ def test_an_unknown_name_is_told_what_there_is():
     told = refusal("no_such_thing_at_all")
     assert "did you mean" not in told and all(name in told for name in NAMES)
     assert "must be the name of an instrument" in refusal({"like": 3})
-    assert "is no field" in refusal({"like": "rogers_2021", "file": "a.yaml"})
+    both = refusal({"like": "rogers_2021", "file": "a.yaml"})
+    assert "instrument.file: names another instrument, besides instrument.like" in both
+    assert "is no field" in refusal({"like": "rogers_2021", "path": "a.yaml"})
 
 
 def test_the_command_lists_the_library_and_tells_of_each():

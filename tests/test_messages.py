@@ -9,7 +9,7 @@ from dataclasses import asdict, replace
 import pytest
 from click.testing import CliRunner
 from rich.console import Console
-from small import STUDY, quiet, small
+from small import STUDY, quiet, small, small_file
 
 import sweep
 from sweep.cli import main
@@ -87,7 +87,8 @@ def test_versions_and_ids_in_a_store_are_told_in_printable_text(tmp_path):
     assert quiet(small(), store).complete
     document = json.loads((store / "zarr.json").read_text())
     document["attributes"] |= {"study_id": HOSTILE, "title": HOSTILE}
-    document["attributes"]["software"][HOSTILE] = HOSTILE
+    software = document["attributes"]["software"]
+    document["attributes"]["software"] = f"{software}, {HOSTILE} {HOSTILE}"
     (store / "zarr.json").write_text(json.dumps(document))
     told("status", store)
     told("resume", store, exit_code=2)
@@ -181,7 +182,7 @@ def test_errors_of_the_command_suggest_commands_and_errors_in_python_suggest_cal
         quiet(small(seed=4), "a b.zarr")
     with pytest.raises(StoreError, match=r"`sweep\.run\(spec, store=new\)`"):
         sweep.extend("a b.zarr", small(seed=4), progress=False)
-    (tmp_path / "study.yaml").write_text(json.dumps(STUDY))
+    (tmp_path / "study.yaml").write_text(json.dumps(small_file()))
     again = ("run", "study.yaml", "--store", "a b.zarr", "--scheduler", "none")
     assert "a b.zarr'` tells about it, --overwrite begins anew" in told(*again, exit_code=2)
     changed = told("extend", "a b.zarr", "--set", "seed=4", exit_code=2)

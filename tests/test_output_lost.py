@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import yaml
 from click.testing import CliRunner
-from small import STUDY, small
+from small import small, small_file
 
 import sweep
 from sweep.cli import main
@@ -86,7 +86,7 @@ def test_a_reader_that_is_late_misses_words_and_hears_later_ones():
 @pytest.fixture
 def spec(tmp_path):
     file = tmp_path / "study.yaml"
-    file.write_text(yaml.safe_dump(STUDY))
+    file.write_text(yaml.safe_dump(small_file()))
     return file
 
 

@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 import pytest
 import yaml
 from slurm_daemons import command, jobs, missing, slurm
-from small import STUDY, receipts, tree
+from small import STUDY, receipts, small_file, tree
 
 from sweep.storage.opening import read_receipts
 from sweep.tasks.driver import run
@@ -84,7 +84,7 @@ def workers(store) -> set[bytes]:
 
 
 def test_a_study_in_a_job_ends_as_in_a_plain_loop(here, environment, undisturbed):
-    (here / "small.yaml").write_text(yaml.safe_dump(STUDY, sort_keys=False))
+    (here / "small.yaml").write_text(yaml.safe_dump(small_file(), sort_keys=False))
     cluster = yaml.safe_load((here / "slurm.yaml").read_text())
     (here / "slurm.yaml").write_text(yaml.safe_dump(cluster | {"workers": 1}))
     asked = ("--store", "small.zarr", "--cluster", "slurm.yaml")

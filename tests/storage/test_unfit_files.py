@@ -17,7 +17,7 @@ import pytest
 import yaml
 from click.testing import CliRunner
 from numcodecs.zstd import Zstd
-from small import STUDY, quiet, small, tree
+from small import STUDY, quiet, small, small_file, tree
 
 import sweep
 from sweep.cli import main
@@ -389,8 +389,7 @@ def test_saved_parts_of_others_make_no_room_for_what_they_declare(tmp_path):
 def test_a_pipe_for_a_spec_or_what_it_names_is_refused(tmp_path, monkeypatch, how):
     monkeypatch.chdir(tmp_path)
     os.mkfifo("pipe.yaml")
-    target = {n: v for n, v in STUDY["target"].items() if f"target.{n}" not in STUDY["axes"]}
-    study = {**STUDY, "target": target}
+    study = small_file()
     if how == "instrument":
         study["instrument"] = "./pipe.yaml"
     elif how == "instrument file":
@@ -412,8 +411,7 @@ def test_a_pipe_for_a_spec_or_what_it_names_is_refused(tmp_path, monkeypatch, ho
 def test_a_loop_of_links_ends_in_words(made, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("loop.zarr").symlink_to("loop.zarr")
-    target = {n: v for n, v in STUDY["target"].items() if f"target.{n}" not in STUDY["axes"]}
-    Path("study.yaml").write_text(yaml.safe_dump({**STUDY, "target": target}))
+    Path("study.yaml").write_text(yaml.safe_dump(small_file()))
     for command in (
         "status loop.zarr", "verify loop.zarr", "resume loop.zarr", "report loop.zarr",
         "compare loop.zarr loop.zarr", "run study.yaml --store loop.zarr --scheduler none",

@@ -47,6 +47,13 @@ STUDY = {
 }
 
 
+def small_file(**changes) -> dict[str, object]:
+    """The small study as a file has it: a field on an axis is in no section."""
+    study = {**STUDY, **changes}
+    target = {n: v for n, v in study["target"].items() if f"target.{n}" not in study["axes"]}
+    return {**study, "target": target}
+
+
 def small(**changes) -> Spec:
     """The small study, 72 points, with some of its sections replaced."""
     return Spec.from_mapping({**STUDY, **changes}, base=Path("."))

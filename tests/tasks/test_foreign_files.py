@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 from click.testing import CliRunner
-from small import STUDY, Said, copied, failing, quiet, small, tree
+from small import STUDY, Said, copied, failing, quiet, small, small_file, tree
 
 from sweep.cli import main
 from sweep.storage import locations
@@ -248,9 +248,7 @@ def test_run_with_resume_goes_on_with_what_is_to_replace_a_store(undisturbed, tm
 
 def test_run_with_resume_is_one_command_for_all_starts_of_a_job(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    target = {n: v for n, v in STUDY["target"].items() if f"target.{n}" not in STUDY["axes"]}
-    written = {**STUDY, "target": target}
-    Path("small.yaml").write_text(yaml.safe_dump(written))
+    Path("small.yaml").write_text(yaml.safe_dump(small_file()))
     command = ["run", "small.yaml", "--resume", "--scheduler", "none"]
 
     def start(*more):
@@ -262,8 +260,7 @@ def test_run_with_resume_is_one_command_for_all_starts_of_a_job(tmp_path, monkey
     next(file for file in Path("results/small.zarr/pd_up/c").rglob("*") if file.is_file()).unlink()
     mended = start()
     assert mended.exit_code == 0 and "computed 1 of 9 blocks" in mended.output
-    other = {**written, "seed": 9}
-    Path("small.yaml").write_text(yaml.safe_dump(other))
+    Path("small.yaml").write_text(yaml.safe_dump(small_file(seed=9)))
     refused = start()
     assert refused.exit_code == 2 and "seed: 3 -> 9" in refused.output
     both = start("--overwrite")

@@ -5,7 +5,7 @@ import time
 import pytest
 from click.testing import CliRunner
 from numba.core.event import trigger_event
-from small import STUDY, small
+from small import small, small_file
 
 from sweep.cli import main
 from sweep.model.unsupported import UnsupportedShot
@@ -108,7 +108,7 @@ def test_commands_say_that_they_compile(undisturbed, tmp_path, monkeypatch, argu
     import yaml
 
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "small.yaml").write_text(yaml.safe_dump(STUDY))
+    (tmp_path / "small.yaml").write_text(yaml.safe_dump(small_file()))
     (tmp_path / "small.zarr").symlink_to(undisturbed)
     told = Told()
     monkeypatch.setattr(progress.Lines, "say", lambda self, text: told.say(text))

@@ -7,12 +7,24 @@ import pytest
 import yaml
 from click.testing import CliRunner
 from engine import every
-from small import STUDY, copied, evaluated, everything, failing, logged, quiet, small, tree
+from small import (
+    STUDY,
+    copied,
+    evaluated,
+    everything,
+    failing,
+    logged,
+    quiet,
+    small,
+    small_file,
+    tree,
+)
 from small_flights import small_scene
 
 import sweep
 from sweep.analysis.opening import NotAStoreError
 from sweep.cli import main
+from sweep.spec import load
 from sweep.storage.locations import eyepoints_path
 from sweep.tasks import journal, studies
 from sweep.tasks.driver import resume, run
@@ -373,9 +385,10 @@ def test_where_a_flight_s_files_are_is_not_guessed(flight, tmp_path):
         resume(store, progress=False, scheduler="none")
 
 
-def test_the_command_tells_what_is_wrong_and_what_to_do(undisturbed, tmp_path, monkeypatch):
+def test_the_command_tells_what_is_wrong_and_what_to_do(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    copied(undisturbed, tmp_path)
+    Path("small.yaml").write_text(yaml.safe_dump(small_file(), sort_keys=False))
+    run(load("small.yaml"), store="copy.zarr", scheduler="none", progress=False)
     command = CliRunner()
     whole = command.invoke(main, ["verify", "copy.zarr"])
     assert whole.exit_code == 0
@@ -394,7 +407,6 @@ def test_the_command_tells_what_is_wrong_and_what_to_do(undisturbed, tmp_path, m
     assert command.invoke(main, ["resume", "copy.zarr", "--scheduler", "none"]).exit_code == 0
     assert command.invoke(main, ["verify", "copy.zarr"]).exit_code == 0
     assert command.invoke(main, ["verify", "nowhere.zarr"]).exit_code == 2
-    Path("small.yaml").write_text(yaml.safe_dump(STUDY, sort_keys=False))
     assert command.invoke(main, ["verify", "copy.zarr", "--spec", "small.yaml"]).exit_code == 2
     lose_what_it_holds(Path("copy.zarr"), "no JSON")
     asked = command.invoke(main, ["status", "copy.zarr"]).output
