@@ -251,7 +251,7 @@ def test_the_summary_counts_what_the_arrays_hold(undisturbed):
     assert weak.solved == (found["three"].velocity_status.values[0] <= 1).sum()
     strong = rows["three, power 1 W"]
     assert strong.true == ((found["three"].flags.values[1] & 1) > 0).any(axis=-1).sum()
-    # In some of a hundred draws a leaked peak beside the echo's pairs with it, in whole spectra too.
+    # In one draw of a hundred a leaked peak pairs with the echo; whole spectra have it too.
     assert weak.true < strong.true and 0.98 * 222 * 5 < strong.true <= strong.shots == 222 * 5
     assert rows["line, power 1 W"].cycles == 0
 
