@@ -25,13 +25,16 @@ STREET = {
 
 
 def instrument(**chirp):
-    """Table 4.1's, with a chirp that is steep enough for 15 m/s at 30 m."""
+    """Table 4.1's, with a chirp that is steep enough for 15 m/s at 30 m.
+
+    Records begin when echoes of up to 100 m are there, so that these fill them.
+    """
     written = yaml.safe_load((EXPERIMENTS / "instruments" / "table_4_1.yaml").read_text())
     written["chirp"] |= {"duration": "10 us"} | chirp
     written["laser"] |= {"power": "1 W"}
     written["processing"] |= {
         "sample_rate": "512 MHz", "fft_size": 4096, "detection": "any_bin",
-        "noise_bins": "correlated",
+        "noise_bins": "correlated", "acquisition_delay": "0.7 us",
     }  # fmt: skip
     return written
 

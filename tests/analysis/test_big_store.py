@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import big_store
 import pytest
-from zarr.storage import LocalStore
 
 import sweep
 from sweep.analysis import canvas, charts, opening
 from sweep.analysis.figures import draw
+from sweep.storage.chunks import CheckedFiles
 
 FIGURES = [
     {"kind": "surface", "variable": "pd_shot", "x": "range", "y": "grazing_angle"},
@@ -77,13 +77,13 @@ def test_pieces_are_whole_chunks_and_one_point_is_read_from_one(tmp_path, monkey
     stored = array.encoding["chunks"]
     assert all(n >= c for n, c in zip(array.shape, stored, strict=True)) and stored != array.shape
     read = []
-    get = LocalStore.get
+    get = CheckedFiles.get
 
     async def counted(self, key, *rest, **options):
         read.append(key)
         return await get(self, key, *rest, **options)
 
-    monkeypatch.setattr(LocalStore, "get", counted)
+    monkeypatch.setattr(CheckedFiles, "get", counted)
     value = float(array.isel(power=7, range=3, grazing_angle=80))
     assert len(read) == 1
     assert value == float(array.compute().isel(power=7, range=3, grazing_angle=80))

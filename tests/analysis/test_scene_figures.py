@@ -1,5 +1,7 @@
 """Figures of scenes as specs ask for them, made from stores."""
 
+import json
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -25,8 +27,9 @@ def test_a_store_cut_short_is_drawn_as_far_as_it_is_and_says_how_far(
     scene_store, tmp_path, monkeypatch
 ):
     short = cut_short(scene_store, tmp_path)
-    log = short / ".sweep" / "receipts.jsonl"
-    log.write_text("".join(log.read_text().splitlines(keepends=True)[:-8]))
+    committed = (scene_store / ".sweep" / "receipts.jsonl").read_text().splitlines(keepends=True)
+    left = [line for line in committed if json.loads(line)["block"] % 3 != 2]
+    (short / ".sweep" / "receipts.jsonl").write_text("".join(left))
     assert SceneStudy.of(short).note.endswith("16 of 24 blocks computed")
     usual = figures.default_scene_figures
     monkeypatch.setattr(figures, "default_scene_figures", lambda tree: usual(tree)[4:5])

@@ -63,6 +63,7 @@ def dark(architecture: str, tnr: float, effects: tuple[str, ...]) -> dict[str, n
     scene = parameters(
         reflectance=0.0, architecture=architecture, tnr=tnr, fft_size=1024, beamlets=7,
         full_scale=1.0, bits=12.0, line_width=1e4, extinction=1e-4, transverse_velocity=30.0,
+        acquisition_delay=14e-6,  # when an echo from 2 km would be there
     )  # fmt: skip
     return evaluate(scene, effects)
 

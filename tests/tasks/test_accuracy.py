@@ -131,7 +131,9 @@ def test_a_study_with_draws_has_rungs_of_draws_and_other_draws_for_reference():
 def coherent(tmp_path_factory):
     """A small coherent study, measured in a moment."""
     store = tmp_path_factory.mktemp("accuracy") / "small.zarr"
-    spec = small(footprint=COHERENT)
+    instrument = STUDY["instrument"]
+    processing = instrument["processing"] | {"acquisition_delay": "34 us"}  # echoes fill records
+    spec = small(footprint=COHERENT, instrument=instrument | {"processing": processing})
     assert measured(spec, store_path=store, points=10, progress=False)
     return spec, store, xr.open_zarr(store).load()
 

@@ -96,8 +96,9 @@ def test_a_study_without_draws_has_none(tmp_path):
 def test_the_table_after_a_run_tells_where_the_most_beamlets_are_too_few(tmp_path):
     """Over thousands of bins: a beam of 50 mrad that grazes the ground."""
     laser = {"wavelength": "1550 nm", "power": "1 W", "beam_divergence": "50 mrad"}
+    processing = STUDY["instrument"]["processing"] | {"acquisition_delay": "67 us"}
     spec = small(
-        instrument=STUDY["instrument"] | {"laser": laser},
+        instrument=STUDY["instrument"] | {"laser": laser, "processing": processing},
         footprint={"beamlets": "auto", "phases": "incoherent", "speckle": "none"},
         axes={"target.grazing_angle": ["0.5 deg", "89 deg", "90 deg"]},
         target=STUDY["target"] | {"range": "10 km"},

@@ -228,5 +228,5 @@ def test_a_plan_measures_few_points_where_each_takes_long(monkeypatch):
     monkeypatch.setattr(planned, "evaluate_points", evaluated)
     monkeypatch.setattr(planned, "time", clock)
     assert planned.measured(study) == pytest.approx(0.1)
-    assert effects_table(study).rows
-    assert clock.now < 15
+    kept = [row for row in effects_table(study).rows if row.share > 0]
+    assert len(kept) > 5 and clock.now < 5 + 2 * len(kept)

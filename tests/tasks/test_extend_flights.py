@@ -188,7 +188,7 @@ def test_with_a_tighter_tolerance_only_shots_that_call_for_more_are_computed(
     monkeypatch.setattr(flight_study, "TILE_SHOTS", 16)
     axes = {POWER: ["0.03 W", "0.1 W"]}
     coarse, fine = (
-        flight(accuracy={"tolerance": tolerance, **CLOSE}, axes=axes) for tolerance in (0.2, 8e-3)
+        flight(accuracy={"tolerance": tolerance, **CLOSE}, axes=axes) for tolerance in (0.2, 0.02)
     )
     store = quiet(coarse, here.with_name("coarse.zarr")).store
     whole, solved = computed.shots, computed.cycles

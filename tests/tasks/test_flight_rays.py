@@ -25,7 +25,7 @@ from sweep.tasks.summary import rays_table
 
 RAYS = Accuracy.rays
 
-LASER = SCENE["instrument"]["laser"] | {"beam_divergence": "4 mrad"}
+LASER = SCENE["instrument"]["laser"] | {"beam_divergence": "4 mrad", "power": "1 mW"}
 OVER_FACETS = SCENE | {
     "instrument": SCENE["instrument"] | {"laser": LASER},
     "scene": {"origin": "ground", "objects": {"ground": {
