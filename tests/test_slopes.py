@@ -139,6 +139,17 @@ def test_any_two_of_three_that_fade(snr, near):
     assert pd[0] + miss[0] == pytest.approx(1.0, abs=1e-12)
 
 
+@pytest.mark.parametrize("chance", [1e-300, 0.05, 0.4, 0.9])
+@pytest.mark.parametrize("apart", [1e-6, 1e-9, 1e-12])
+def test_any_two_of_three_of_which_two_are_all_but_one(chance, apart):
+    """These two are detected together, and a third adds next to nothing: the series' 0.002."""
+    pd = np.full((3, 1), chance)
+    correlations = np.array([[1 - apart], [0.84], [0.8394]])
+    found, missed = fading_any_two(pd, 1 - pd, np.array([1e6]), correlations)
+    assert found[0] == pytest.approx(chance, rel=2e-3, abs=2e-3)
+    assert found[0] + missed[0] == pytest.approx(1.0, abs=1e-12)
+
+
 @pytest.mark.parametrize("noisy", [False, True])
 @pytest.mark.parametrize("speckle", ["none", "developed"])
 def test_draws_count_the_shots_that_the_closed_form_tells(table_4_1, noisy, speckle):

@@ -449,7 +449,8 @@ def fading_any_two(
 def _bends(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Q_1' and Q_1'' +- Q_1' / a by the signal a, at the threshold b."""
     x = np.maximum(a * b, 1e-12)
-    zero, one = (b * np.exp(-0.5 * np.square(a - b)) * special.ive(n, x) for n in (0, 1))
+    # special.ive is nan from arguments of 1e9 on.
+    zero, one = (b * np.exp(-0.5 * np.square(a - b)) * of(x) for of in (special.i0e, special.i1e))
     second = b * (zero - one / x) - a * one
     over = b * one / x
     return one, second + over, second - over

@@ -129,9 +129,10 @@ def window_transform(window: Window, distance: np.ndarray) -> np.ndarray:
 
 
 def _half_width(window: Window) -> float:
-    """Distance at which a window's transform has fallen to 1/2 [bins of fs/L]."""
+    """Distance at which a window's transform has fallen to 1/2, 2 REACH at most [bins of fs/L]."""
     place, value = _transform_table(window)
-    last = int(np.argmax(value < 0.5))
+    fallen = value < 0.5  # nowhere if all samples but one are 0, as of hann's two
+    last = int(np.argmax(fallen)) if fallen.any() else value.size - 1
     return float(np.interp(-0.5, -value[: last + 1], place[: last + 1]))
 
 

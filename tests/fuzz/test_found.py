@@ -140,6 +140,13 @@ EXTREME = {
         "target.grazing_angle": "6e-5 arcmin", "target.pointing_jitter": "75.1 arcsec",
         "target.reflectance": 1.0, "draws.limit": 40,
     },
+    "a window with all weight on one of its two samples": {
+        "instrument.processing.fft_size": 2, "instrument.processing.tnr": 10,
+        "footprint.speckle": "developed", "target.grazing_angle": "15 deg",
+        "instrument.laser.wavelength": "15 um", "instrument.laser.beam_divergence": "50 urad",
+        "instrument.laser.focus": "4 m", "instrument.receiver.optical_passband": "2.5 um",
+        "instrument.chirp.bandwidth": "100 GHz",
+    },
     "whole spectra of nothing": {
         "draws.method": "spectra", "draws.number": 3, "target.reflectance": 0.0,
     },
