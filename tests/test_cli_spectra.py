@@ -23,7 +23,6 @@ def here(tmp_path, monkeypatch):
         "fft_size": "2^10", "tnr": 3.5, "window": "hann",
         "acquisition_delay": "20.1 us",  # the echo of 3 km is there from 20.01 us on
     }  # fmt: skip
-    del mapping["target"]["range"]
     mapping |= {
         "draws": {"method": "spectra", "number": DRAWS},
         "axes": {"target.range": ["1 km", "3 km"]},
