@@ -49,7 +49,9 @@ def test_the_page_says_that_it_is_reduced_and_asks_nothing_of_a_network(grid_pag
     own = re.sub(r"<script>.*?</script>", "", text, flags=re.S)
     assert not re.findall(r"(?:src|href)=[\"']?(?:https?:)?//(?!itables\.org)", own)
     assert "default-src 'none'" in own
-    assert 1e6 < grid_page.stat().st_size < 2.5e6
+    assert 1e6 < grid_page.stat().st_size < 3e6
+    libraries = r'<script type="application/gzip" id="(?:plotly|tables-library)">.*?</script>'
+    assert len(re.sub(libraries, "", text, flags=re.S)) < 0.5e6
 
 
 def test_the_options_of_a_table_are_in_one_order_from_run_to_run(grid_page):
