@@ -22,8 +22,8 @@ the places nu_i(y) of the lines, y the coordinate along which they spread most,
     mu = int p G(k_1 - nu_1) G(k_2 - nu_2) e^(i t y) dy / sqrt(S_1 S_2),
     S_i = int p G(k_i - nu_i)^2 dy                                                              (3)
 
-Lines are taken to move evenly along y. Where Doppler shifts change as the square of the angle
-across the beam (150 m/s in a beam of 5 mrad: 3 bins), (2) has that and (3) does not.
+Lines are taken to move evenly along y. (3) thus leaves out Doppler shifts that change as the square
+of the angle across the beam (150 m/s in a beam of 5 mrad: 3 bins), which (2) has.
 
 The probability that both bins cross a threshold is that of two correlated Rayleigh magnitudes,
 :func:`sweep.model.detection.fading_together`, by |mu|.
@@ -54,7 +54,7 @@ _RESOLVED_PHASE_MAX = 40.0
 
 
 class LineSpread(NamedTuple):
-    """How the lines of footprints spread over two segments' bins, (n,) each."""
+    """Spread of footprints' lines over two segments' bins, (n,) each."""
 
     distance: tuple[np.ndarray, np.ndarray]
     """Of the strongest bin from the line on the beam's axis [bins of fs/L]."""
@@ -81,8 +81,8 @@ class LineSpread(NamedTuple):
 def bin_correlation(window: Window, lines: LineSpread) -> np.ndarray:
     """Correlation mu of the strongest bins of two segments by equation (3), (n,) complex.
 
-    Where the phase turns too fast for the integral, mu is that of a window whose transform is a
-    Gaussian of the same half width; it is all but 0 there.
+    A phase that turns too fast for the integral gives the mu of a window whose transform is a
+    Gaussian of the same half width; it is all but 0 then.
     """
     end = np.minimum(_DEVIATIONS_MAX, REACH / np.maximum(lines.widest, 1e-300))
     node, weight = np.polynomial.legendre.leggauss(_NODES)
