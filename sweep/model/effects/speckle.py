@@ -257,7 +257,9 @@ def _line_spread(
         delay = 2 / SPEED_OF_LIGHT * (shots.range - segment.nearer)
         beat = segment.carrier * segment.beta - segment.chirp_rate * delay * (1 + segment.beta)
         place = beat / bin_width * padding
-        distances.append(np.broadcast_to((np.rint(place) - place) / padding, shots.size))
+        # Any bins of two echoes may detect them: of these the middles stand for all.
+        nearest = place if shots.detection == "any_bin" else np.rint(place)
+        distances.append(np.broadcast_to((nearest - place) / padding, shots.size))
         moved = segment.carrier * slopes.beta - segment.chirp_rate * delay * slopes.range
         spreads.append(np.broadcast_to(moved / bin_width, shots.size))
     return LineSpread(
