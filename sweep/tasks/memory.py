@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from distributed.system import MEMORY_LIMIT
 
 from sweep.spec.rules import Mistake, SpecError
 
@@ -34,6 +33,9 @@ def point_bytes(spec: Spec | SceneSpec) -> int:
 
 def refuse_too_large(spec: Spec | SceneSpec) -> None:
     """Refuse a study of which one point takes more memory than this machine has."""
+    # Here, as a spec with mistakes is told without the second that this import takes.
+    from distributed.system import MEMORY_LIMIT
+
     needed = point_bytes(spec)
     if needed > MEMORY_LIMIT:
         rule = (

@@ -18,7 +18,7 @@ def runs(spec, path):
 
 @pytest.mark.parametrize("use", [lambda spec, path: plan(spec), runs])
 def test_an_fft_that_no_machine_holds_is_refused(use, tmp_path, monkeypatch):
-    monkeypatch.setattr(memory, "MEMORY_LIMIT", 64 * 10**9)
+    monkeypatch.setattr("distributed.system.MEMORY_LIMIT", 64 * 10**9)
     spec = small(axes=HUGE)
     with pytest.raises(SpecError, match=r"fft_size: makes a point take about 268.4 GB.*64.0 GB"):
         use(spec, tmp_path / "huge.zarr")
