@@ -23,11 +23,8 @@ It acts on the lines' amplitudes alone; the mean echo, and so its shot noise, st
 **Fading**: developed speckle (kappa = 0) without draws, the default for surfaces. A sum of circular
 complex Gaussian amplitudes is one itself, in every bin; its mean power is what beamlets make that
 add as powers. A bin then crosses the threshold with Swerling's first probability, and two segments'
-bins as two correlated ones do, with the correlation
-
-    mu(dt) = sum_b P_b exp(2 pi i f beta_b dt) / sum_b P_b
-
-over the beam's power, which is what Doppler shifts that differ by 1/dt or more destroy. It is in
+bins as two correlated ones do. Their correlation falls with the Doppler shifts and the ranges that
+differ over the beam, by :mod:`sweep.model.speckle_correlation`. It is in
 closed form, as beamlets that are enough for the power of a bin may be too few for it. It acts on
 the detection. In the closed form of a segment's leakage the echo keeps its mean power; where false
 peaks are drawn, and in the probabilities of a flight, its leaked signal fades with it
