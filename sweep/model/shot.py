@@ -210,8 +210,9 @@ def misread(shots: Shots, reported: waveform.Resolution) -> np.ndarray:
     metres = metres + np.abs(shots.offset).max(axis=1)[rows] * shots.range
     own = SPEED_OF_LIGHT / 2 * np.abs(shots.doppler).max(axis=1)[rows]
     metres = metres + 2 * carrier / SPEED_OF_LIGHT * own / per_metre
-    speed = bins * SPEED_OF_LIGHT / (2 * carrier) + shifted + own
-    speed = speed + per_metre * metres * SPEED_OF_LIGHT / (2 * carrier)
+    with np.errstate(divide="ignore"):  # a carrier of 0, of direct detection, tells no velocity
+        per_hertz = SPEED_OF_LIGHT / (2 * carrier)
+    speed = (bins + per_metre * metres) * per_hertz + shifted + own
     off = np.abs(reported.range - shots.range) > metres
     off |= np.abs(reported.radial_velocity - shots.radial_velocity) > speed
     return np.asarray(off)

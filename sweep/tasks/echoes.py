@@ -112,7 +112,8 @@ def _is_misread(p: Mapping[str, Any], range_: np.ndarray, velocity: np.ndarray) 
             bin_width=np.broadcast_to(width, range_.shape), signed=signed, assumed=assumed,
         )  # fmt: skip
     metres = MISREAD_BINS * width / (2 / SPEED_OF_LIGHT * rate)
-    speed = MISREAD_BINS * width * SPEED_OF_LIGHT / carriers[0]
+    with np.errstate(divide="ignore"):  # a carrier of 0, of direct detection, tells no velocity
+        speed = MISREAD_BINS * width * SPEED_OF_LIGHT / carriers[0]
     off = np.abs(read.range - range_) > metres
     return np.asarray(off | (np.abs(read.radial_velocity - velocity) > speed))
 

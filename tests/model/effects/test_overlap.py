@@ -360,3 +360,14 @@ def test_a_slope_and_motion_are_no_misreading(table_4_1):
     ) | {"target.acceleration": 100.0, "target.transverse_velocity": 100.0}  # fmt: skip
     found = shot.evaluate(scene, (*CORE, "range_walk", "acceleration", "segment_motion"))
     assert (found["misread"] == 0).all()
+
+
+def test_a_carrier_of_zero_makes_no_velocity_a_misread_one(table_4_1):
+    """Direct detection may chirp from 0 Hz, where a beat of any size tells no velocity."""
+    scene = table_4_1() | {
+        "instrument.receiver.architecture": "direct", "instrument.chirp.start_frequency": 0.0,
+        "target.radial_velocity": 0.0,
+    }  # fmt: skip
+    with np.errstate(divide="raise"):
+        found = shot.evaluate(scene, CORE)
+    assert found["misread"] == 0
