@@ -305,8 +305,8 @@ def _companions_of(path: Path) -> Any:
             return read_companion(path, key)
 
         def write(self, name: str, data: bytes) -> None:
-            """Refuse to write."""
-            raise NotImplementedError
+            """Refuse to write: the files that a mesh names are read alone."""
+            raise PermissionError(f"{name}: a mesh's files are not written")
 
         def namespaced(self, namespace: str) -> PlainFiles:
             """Return the same resolver, for names below a folder are none of a glTF's."""
