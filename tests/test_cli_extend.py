@@ -40,7 +40,11 @@ def test_it_says_what_there_is_and_ends_with_the_larger_study(store):
         (["--set", f"{POWER}=[1 W"], "--set:2: is no valid YAML"),
         (["--set", f"{POWER}=[1 W, 2 parsecs]"], "parsecs"),
         (["--set", f"{POWER}=[1 W, 2 W]"], "instrument.laser.power: 3 W: lost, and must stay"),
-        (["--set", "target.range.x=5"], "target.range.x: is no field: target.range holds none"),
+        (
+            ["--set", "target.reflectance.x=5"],
+            "target.reflectance.x: is no field: target.reflectance",
+        ),
+        (["--set", "target.range.x=5"], "target.range: takes one value; put several"),
         (["--set", "seed=4"], "seed: 3 -> 4, and must stay as it is"),
     ],
 )

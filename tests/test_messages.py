@@ -9,13 +9,13 @@ from dataclasses import asdict, replace
 import pytest
 from click.testing import CliRunner
 from rich.console import Console
-from small import STUDY, quiet, small, small_file
+from small import quiet, small, small_file
 
 import sweep
 from sweep.cli import main
 from sweep.cli.terminal import print_table
 from sweep.messages import PrintableStream, as_command, one_line, printable, suggestion
-from sweep.spec import Spec, SpecError
+from sweep.spec import SpecError
 from sweep.tasks import progress
 from sweep.tasks.journal import Holder
 from sweep.tasks.progress import BusyError, StoreError, TaskError
@@ -66,7 +66,7 @@ def fails(study, block):
 
 def test_failures_locks_and_titles_of_a_store_are_told_in_printable_text(tmp_path):
     store = tmp_path / "a.zarr"
-    spec = Spec.from_mapping(STUDY | {"title": "A\nstudy"})
+    spec = small(title="A\nstudy")
     outcome = quiet(spec, store, scheduler="none", evaluate=fails)
     assert not outcome.complete and outcome.failures
     text = told("status", store)

@@ -6,7 +6,7 @@ import copy
 import json
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -148,7 +148,12 @@ class Study(Part):
 
     @classmethod
     def from_document(cls, document: Document, base: Path | None) -> Self:
-        """Spec from a document, which is changed; files are left alone without a base."""
+        """Spec from a document, which is changed.
+
+        Without a base it is a store's own document, whose files are left alone, and in which a
+        field and its axis may differ.
+        """
+        by_the_user = {} if base is None else _written_twice(document.value)
         has_instrument = resolve_instrument(document, base or Path())
         written = document.value
         lacks_instrument = "instrument" not in written
@@ -168,6 +173,7 @@ class Study(Part):
         findings += grid_findings(grid)
         findings += [*_size_findings(axes), *_segment_findings(grid), *_strongest_findings(grid)]
         findings += cls.further_findings(written, grid, base, axes_are_whole)
+        findings += _contradictions(by_the_user, axes)
         # What is wrong with an axis or an instrument's file is told there, and there alone.
         findings = [
             finding
@@ -310,16 +316,25 @@ class Study(Part):
     def to_yaml_mapping(self) -> dict[str, Any]:
         """Return the spec as a user would write it whole: no instrument file, no default left out.
 
-        Execution is left out, as it is no part of what a study is.
+        What an axis sets is in no section: what the study holds is the same whether or not its
+        user wrote a value there too. Execution is left out, as it is no part of what a study is.
         """
         return copy.deepcopy(self._written)
 
     def _completed(self, written: dict[str, Any]) -> dict[str, Any]:
-        """Return the spec with its defaults written out and its execution left out."""
+        """Return the spec with its defaults, without its execution and without what axes set."""
+        on_axes = {member.path for axis in self.axes for member in axis.members}
         mapping = {key: value for key, value in written.items() if key != "execution"}
+        mapping = copy.deepcopy(mapping)
         for path, rule, value in leaves(self):
             if path[0] not in _UNSTORED:
                 fill(mapping, list(path), rule.written(value))
+        for path in on_axes:
+            *sections_of_it, name = path.split(".")
+            section = mapping
+            for part in sections_of_it:
+                section = section[part]
+            section.pop(name, None)
         return mapping
 
     def to_json(self) -> str:
@@ -638,15 +653,11 @@ def load(path: str | Path) -> Spec | SceneSpec:
             "`sweep.spec.Spec.from_mapping(...)` makes one of plain data"
         )
     document = read_document(Path(path))
-    both = _written_twice(document.value)
-    spec = _kind(document.value).from_document(document, Path(path).parent)
-    if findings := list(_contradictions(spec, both)):
-        raise SpecError(document.mistakes(findings))
-    return spec
+    return _kind(document.value).from_document(document, Path(path).parent)
 
 
 def _written_twice(written: Any) -> dict[str, object]:
-    """Return the fields that a file has in a section although an axis sets them, as written.
+    """Return the fields that a user has in a section although an axis sets them, as written.
 
     An instrument's own file or the library may have them: an axis is there to change these.
     """
@@ -656,11 +667,16 @@ def _written_twice(written: Any) -> dict[str, object]:
     return {path: copy.deepcopy(value) for path, value in found.items() if value is not None}
 
 
-def _contradictions(spec: Study, both: Mapping[str, object]) -> Iterator[Finding]:
-    """Report fields of a file whose value is none of their axis."""
-    for path, value in both.items():
-        member, rule = spec.member(path), sections.parameter_rules()[path]
-        read = rule.read(value)
+def _contradictions(written: Mapping[str, object], axes: Sequence[Axis]) -> Iterator[Finding]:
+    """Report fields whose value, as written, is none of their axis."""
+    members = {member.path: member for axis in axes for member in axis.members}
+    for path, value in written.items():
+        if (member := members.get(path)) is None:
+            continue
+        try:
+            read = sections.parameter_rules()[path].read(value)
+        except QuantityError:  # told as a mistake of the field's own
+            continue
         values = np.asarray(member.values)
         is_number = values.dtype.kind in "fi" and not isinstance(read, str)
         if np.isclose(values, read, rtol=1e-9, atol=0).any() if is_number else read in values:

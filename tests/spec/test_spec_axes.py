@@ -196,7 +196,7 @@ def test_ten_million_values_take_seconds(values):
 def test_a_threshold_is_set_in_one_way_on_an_axis_or_off():
     axes = {PFA_SHOT: {"log": [1e-9, 1e-3], "number": 3}}
     spec = Spec.from_mapping(written({TNR: ..., PFA_SHOT: 1e-6}, axes=axes))
-    assert spec.parameters()[PFA_SHOT] == 1e-6 and TNR not in spec.parameters()
+    assert spec.parameters()[PFA_SHOT] == 1e-9 and TNR not in spec.parameters()
     assert Spec.from_mapping(spec.to_yaml_mapping()).id == spec.id
     found = GridStudy(spec).evaluate(0)
     # all but the few bins that the target takes
@@ -209,3 +209,18 @@ def test_a_threshold_is_set_in_one_way_on_an_axis_or_off():
         Spec.from_mapping(written({TNR: ...}))
     with pytest.raises(SpecError, match=r"by tnr and by design_pfa_shot; keep one of them"):
         Spec.from_mapping(written({PFA_SHOT: 1e-6}, axes={TNR: [5, 10]}))
+
+
+def test_a_field_and_its_axis_must_agree_and_a_store_keeps_the_axis_alone():
+    """Whether typed in a file or given as a mapping, told with every other mistake."""
+    axes = {"target.range": ["1 km", "3 km"]}
+    mapping = written(axes=axes)
+    both = {**mapping, "target": {**mapping["target"], "range": "2 km"}}
+    with pytest.raises(SpecError, match=r"range: is on the axis range too.*\(you wrote '2 km'\)"):
+        Spec.from_mapping(both)
+    with pytest.raises(SpecError) as refusal:
+        Spec.from_mapping({**both, "seed": -1})
+    assert {mistake.path for mistake in refusal.value.mistakes} == {"target.range", "seed"}
+    agreeing = {**mapping, "target": {**mapping["target"], "range": "3000 m"}}
+    assert Spec.from_mapping(agreeing).to_json() == Spec.from_mapping(mapping).to_json()
+    assert "range" not in Spec.from_mapping(agreeing).to_yaml_mapping()["target"]

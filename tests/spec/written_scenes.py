@@ -3,6 +3,7 @@
 import copy
 from typing import Any
 
+from typed_specs import without_axes
 from written_specs import BASE as GRID
 
 PLANE: dict[str, Any] = {"kind": "plane", "size": "2 km", "reflectance": 0.1}
@@ -79,7 +80,7 @@ def written(changes: dict[str, Any] | None = None, **sections: Any) -> dict[str,
             part.pop(name)
         else:
             part[name] = copy.deepcopy(value)
-    return mapping
+    return without_axes(mapping)
 
 
 def with_object(thing: dict[str, Any], name: str = "thing", **more: Any) -> dict[str, Any]:

@@ -4,6 +4,7 @@ import copy
 from typing import Any
 
 import numpy as np
+from typed_specs import without_axes
 
 BASE: dict[str, Any] = {
     "title": "A study",
@@ -39,7 +40,7 @@ def written(changes: dict[str, Any] | None = None, **sections: Any) -> dict[str,
             part.pop(name)
         else:
             part[name] = value
-    return mapping
+    return without_axes(mapping)
 
 
 def content(member: Any) -> tuple[Any, ...]:

@@ -8,6 +8,8 @@ import time
 from contextlib import contextmanager
 from pathlib import Path
 
+from typed_specs import without_axes
+
 from sweep.spec import Spec
 from sweep.tasks.driver import run
 from sweep.tasks.progress import Progress
@@ -48,15 +50,13 @@ STUDY = {
 
 
 def small_file(**changes) -> dict[str, object]:
-    """The small study as a file has it: a field on an axis is in no section."""
-    study = {**STUDY, **changes}
-    target = {n: v for n, v in study["target"].items() if f"target.{n}" not in study["axes"]}
-    return {**study, "target": target}
+    """The small study as a file has it."""
+    return without_axes({**STUDY, **changes})
 
 
 def small(**changes) -> Spec:
     """The small study, 72 points, with some of its sections replaced."""
-    return Spec.from_mapping({**STUDY, **changes}, base=Path("."))
+    return Spec.from_mapping(small_file(**changes), base=Path("."))
 
 
 class Said(Progress, list):

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from small import STUDY
+from typed_specs import without_axes
 
 from sweep.spec import SceneSpec
 
@@ -47,4 +48,4 @@ SCENE = {
 
 def small_scene(**changes) -> SceneSpec:
     """The small study of a scene with some of its sections replaced."""
-    return SceneSpec.from_mapping({**SCENE, **changes}, base=Path("."))
+    return SceneSpec.from_mapping(without_axes({**SCENE, **changes}), base=Path("."))
