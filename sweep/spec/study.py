@@ -329,11 +329,11 @@ class Study(Part):
         for path, rule, value in leaves(self):
             if path[0] not in _UNSTORED:
                 fill(mapping, list(path), rule.written(value))
-        for path in on_axes:
-            *sections_of_it, name = path.split(".")
+        for dotted_path in on_axes:
+            *parents, name = dotted_path.split(".")
             section = mapping
-            for part in sections_of_it:
-                section = section[part]
+            for parent in parents:
+                section = section[parent]
             section.pop(name, None)
         return mapping
 
