@@ -16,7 +16,7 @@ import click
 from click.shell_completion import CompletionItem
 from rich.filesize import decimal
 
-from sweep.messages import command_line, one_line, printable
+from sweep.messages import INCOMPLETE, MISTAKE, command_line, one_line, printable
 from sweep.storage.locations import Location, located
 from sweep.tasks.streams import is_terminal
 from sweep.units import number_text, percent
@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from sweep.spec import SceneSpec, Spec
     from sweep.tasks.plan import EffectRow, EffectsTable, Plan
     from sweep.tasks.session import Outcome
-
-MISTAKE, INCOMPLETE = 2, 3
 
 MANY_ALARMS = 0.01
 """Probability of a false alarm in a shot beyond which a study is warned of."""
