@@ -37,8 +37,8 @@ SPECS = "specs"
 def marker_of(identities: Iterable[str]) -> str:
     """Return the name of the coordinate that marks points of a study, or of a join of several.
 
-    Where xarray puts two datasets together it may keep the first one's coordinates of a name, but
-    it never drops a name that only one has: two studies leave two markers.
+    Of coordinates of one name xarray may keep the first dataset's. A name that only one dataset
+    has it never drops. Two studies leave two markers.
     """
     identities = list(identities)
     if len(identities) == 1:

@@ -1,11 +1,11 @@
 """Proof that a dataset is one study's, and answers per design from a join of several studies.
 
-A dataset of `sweep.open` has the scalar coordinate `study_id`. xarray keeps it through selections,
-and drops it or spreads it along a dimension where datasets of two studies are put together; but
-not always: by `compat="override"` it keeps the first one's. A second coordinate, the marker, has
-the study in its name, `study_1f2e3d4c5b6a7980`. xarray keeps a coordinate that only one of two
-datasets has, so that a dataset with two markers is of two studies, however it was put together.
-Attributes prove nothing: of two datasets xarray keeps the first one's.
+A dataset of `sweep.open` has the scalar coordinate `study_id`. xarray keeps it through selections.
+From datasets of two studies xarray drops it, or spreads it along a dimension, or keeps the first
+one's (`compat="override"`). A second coordinate, the marker, has the study in its
+name: `study_1f2e3d4c5b6a7980`. xarray keeps a coordinate that only one of two datasets has. A
+dataset with two markers is therefore of two studies. Attributes prove nothing: of two datasets
+xarray keeps the first one's.
 """
 
 from __future__ import annotations
