@@ -14,7 +14,6 @@ import numpy as np
 
 from sweep.messages import option, suggestion
 from sweep.spec import SceneSpec, Spec
-from sweep.spec.clusters import Local
 from sweep.storage.locations import (
     PACKED,
     Location,
@@ -46,7 +45,7 @@ from sweep.tasks.journal import (
     wait_for_silence,
     write_recipe,
 )
-from sweep.tasks.memory import refuse_too_large
+from sweep.tasks.memory import refuse_too_large_blocks, refuse_too_large_scene
 from sweep.tasks.progress import BusyError, ClusterError, StoreError, chosen, told, working
 from sweep.tasks.session import Outcome, Pool, RunOptions, Session
 from sweep.tasks.store import (
@@ -107,14 +106,15 @@ def run(
         raise ValueError("overwrite begins anew, and resume goes on: give one of them")
     _refuse_no_study(spec)
     _check_code(spec)
-    if how.client is None and isinstance(how.place(spec), Local | None):
-        refuse_too_large(spec)
     if resume and (not is_free(path) or under_way(path)):
         wait_for_silence(under_way(path) or path, chosen(how.progress).say)
         return _resume(path, spec, how)
-    pool = Pool(how, spec)
+    pool, study = Pool(how, spec), studies.study_of(spec, path)
     if not overwrite:
-        _refuse_in_the_way(path, studies.study_of(spec, path))
+        _refuse_in_the_way(path, study)
+    refuse_too_large_blocks(study, pool.memory)
+    if isinstance(spec, SceneSpec):
+        refuse_too_large_scene(spec, pool.memory)
     return _into(path, spec, pool, replace=overwrite, anew=True)
 
 

@@ -43,6 +43,7 @@ from sweep.storage.opening import read_receipts
 from sweep.tasks import journal, store
 from sweep.tasks.interrupts import Interrupts
 from sweep.tasks.journal import Failure, Journal, Lock, Look, Receipt, given_up
+from sweep.tasks.memory import refuse_too_large, this_machine, worker_memory
 from sweep.tasks.progress import (
     ClusterError,
     Progress,
@@ -265,6 +266,10 @@ class Pool(ExitStack):
         self.options, self.told = options, chosen(options.progress)
         self.interrupts = Interrupts(self.told)
         self._cluster, self._spec = options.place(spec), spec
+        self.memory = (
+            this_machine() if self.is_plain else worker_memory(options.client, self._cluster)
+        )
+        refuse_too_large(spec, self.memory)
         self.most = 1  # blocks of the study: more workers than that have nothing to do
         self._reached: Reached | None = None
 
@@ -289,6 +294,8 @@ class Pool(ExitStack):
                         say=self.told.say,
                     )
                 )
+                if isinstance(self._cluster, Address):  # whose workers are known from here on
+                    refuse_too_large(self._spec, worker_memory(self._reached.client, None))
             elif client.asynchronous:
                 raise ClusterError("the client is asynchronous: give one of another kind, Client()")
             else:
