@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from sweep.messages import option, suggestion
+from sweep.messages import is_command, option, suggestion
 from sweep.spec import SceneSpec, Spec
 from sweep.storage.locations import (
     PACKED,
@@ -29,6 +29,7 @@ from sweep.storage.locations import (
 from sweep.storage.opening import read_attributes, study_id
 from sweep.tasks import studies
 from sweep.tasks.coverage import refuse_blind
+from sweep.tasks.doubts import warn_of_doubts
 from sweep.tasks.eyepoint_study import EyepointStudy, world_of
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.grid_study import GridStudy
@@ -94,6 +95,12 @@ def run(
     Outcome
         Complete, or why not; `resume` goes on from there.
 
+    Warns
+    -----
+    StudyWarning
+        Of what can be computed, but is hardly meant: a beam that its aperture can't make, a flight
+        that partly sees nothing, echoes after their record, effects switched off that matter.
+
     Raises
     ------
     StoreError, ClusterError, CodeError
@@ -114,7 +121,10 @@ def run(
         _refuse_in_the_way(path, study)
     refuse_too_large_blocks(study, pool.memory)
     if isinstance(spec, SceneSpec):
-        refuse_too_large_scene(spec, pool.memory)
+        with working("building the scene", pool.told):
+            refuse_too_large_scene(spec, pool.memory)
+    if not is_command():  # which has printed them
+        warn_of_doubts(study)
     return _into(path, spec, pool, replace=overwrite, anew=True)
 
 
