@@ -16,6 +16,7 @@ if TYPE_CHECKING:  # as checkers of programs that use it see the names below
     from sweep.analysis.opening import open, open_scene
     from sweep.analysis.reports import reports
     from sweep.spec import load
+    from sweep.tasks.doubts import StudyWarning
     from sweep.tasks.driver import extend, resume, run
     from sweep.tasks.summary import status
     from sweep.tasks.verify import verify
@@ -34,11 +35,12 @@ _HOMES = {
     "reports": "sweep.analysis.reports",
     "status": "sweep.tasks.summary",
     "verify": "sweep.tasks.verify",
+    "StudyWarning": "sweep.tasks.doubts",
 }
 
 __all__ = [
-    "__version__", "export", "extend", "load", "open", "open_scene", "reports", "resume", "run",
-    "status", "verify",
+    "StudyWarning", "__version__", "export", "extend", "load", "open", "open_scene", "reports",
+    "resume", "run", "status", "verify",
 ]  # fmt: skip
 
 

@@ -49,6 +49,9 @@ USE_RENEWAL_SECONDS = 86400.0
 #: Settings of numba that have no part in the code that it compiles.
 SETTINGS_WITHOUT_EFFECT = ("NUMBA_CACHE_DIR", "NUMBA_NUM_THREADS")
 
+#: Options of numba that kernels have unless they say otherwise.
+DEFAULT_OPTIONS = {"nogil": True}
+
 _numba_settings: Any = numba.config
 _MODEL = Path(__file__).parent / "model"
 _FINGERPRINT = re.compile("[0-9a-f]{32}")
@@ -75,7 +78,8 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Compile a function as `numba.njit` does, and cache it by the fingerprint of the model.
 
     A kernel may read constants and call kernels of its own file and of the model, and no others:
-    the cache does not notice changes of other files.
+    the cache does not notice changes of other files. A kernel releases the interpreter's lock, so
+    that signals are seen and workers answer while it runs.
 
     Parameters
     ----------
@@ -93,7 +97,7 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     is_cached = options.pop("cache", False)
 
     def declare(function: Callable[..., Any]) -> Any:
-        kernel = numba.njit(**options)(function)
+        kernel = numba.njit(**(DEFAULT_OPTIONS | options))(function)
         if is_cached and isinstance(kernel, Dispatcher):  # else compilation is disabled
             _enable_cache(kernel)
         return kernel
@@ -233,7 +237,7 @@ def _sources() -> dict[str, tuple[str, int, int]]:
 def _fingerprint() -> str:
     """Digest of all that compiled kernels follow from; empty where sources are not files."""
     digest = hashlib.sha256()
-    parts = [numba.__version__, llvmlite.__version__, np.__version__]
+    parts = [numba.__version__, llvmlite.__version__, np.__version__, repr(DEFAULT_OPTIONS)]
     parts += [
         f"{name}={value}"
         for name, value in sorted(os.environ.items())

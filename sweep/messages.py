@@ -93,6 +93,9 @@ class PrintableStream:
 
 _AS_COMMAND = False
 
+MISTAKE, INCOMPLETE = 2, 3
+"""Exit codes of the command for a mistake of the user's, and a run that ended before its blocks."""
+
 
 class Placeholder(str):
     """Word that stands for what the user has to fill in."""
@@ -111,6 +114,11 @@ def as_command() -> Iterator[None]:
         yield
     finally:
         _AS_COMMAND = before
+
+
+def is_command() -> bool:
+    """Tell whether the `sweep` command runs, whose process ends with it."""
+    return _AS_COMMAND
 
 
 def command_line(name: str, *arguments: object, **options: object) -> str:

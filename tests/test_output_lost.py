@@ -19,6 +19,7 @@ import sweep
 from sweep.cli import main
 from sweep.storage.locations import JOURNAL
 from sweep.tasks import progress, summary
+from sweep.tasks.interrupts import Interrupts
 from sweep.tasks.streams import ForgivingStream, is_terminal
 
 SWEEP = [sys.executable, "-c", "from sweep.cli import main; main()"]
@@ -171,7 +172,7 @@ def test_a_process_that_ignores_hangups_goes_on_ignoring_them():
     """As nohup has it."""
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        with progress.Interrupts() as interrupts:
+        with Interrupts() as interrupts:
             os.kill(os.getpid(), signal.SIGHUP)
             assert not interrupts.stopping
     finally:
@@ -180,7 +181,7 @@ def test_a_process_that_ignores_hangups_goes_on_ignoring_them():
 
 def test_hangups_stop_a_run_and_never_at_once():
     """A shell, and the system, send one each."""
-    with progress.Interrupts() as interrupts:
+    with Interrupts() as interrupts:
         os.kill(os.getpid(), signal.SIGHUP)
         os.kill(os.getpid(), signal.SIGHUP)
         assert interrupts.stopping

@@ -20,7 +20,7 @@ from sweep.analysis.answers import (
     probability,
     provenance,
 )
-from sweep.analysis.answers.physical import STUDY_ID
+from sweep.analysis.answers.physical import STUDY_ID, marker_of
 from sweep.messages import suggestion
 from sweep.model.outputs import RUNNING
 from sweep.spec import SceneSpec, Spec
@@ -81,10 +81,10 @@ def open(
     Returns
     -------
     xarray.Dataset
-        Its coordinate `study_id` is the id of the study, which proves to `ds.sweep` that a part of
-        the dataset is of one study. Its attributes are the store's and: `started`, `finished` (UTC;
-        empty where there is nothing to tell), `points`, `points_committed`, `blocks` and
-        `blocks_committed`.
+        Its coordinate `study_id` is the id of the study. With the marker, a coordinate named by
+        that id, it proves to `ds.sweep` that a part of the dataset is of one study. Its
+        attributes are the store's and: `started`, `finished` (UTC; empty where there is nothing to
+        tell), `points`, `points_committed`, `blocks` and `blocks_committed`.
 
     Raises
     ------
@@ -143,9 +143,13 @@ def _with_plain_words(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def _with_study_id(dataset: xr.Dataset, identity: str) -> xr.Dataset:
-    """Return a dataset with the id of its study as a coordinate, and flat attributes."""
+    """Return a dataset with its study's id and marker as coordinates, and flat attributes."""
     about = {"long_name": "id of the study"}
-    dataset = dataset.assign_coords({STUDY_ID: xr.DataArray(identity, attrs=about)})
+    marks = {"long_name": "marker of the study, which shows where another's points join"}
+    dataset = dataset.assign_coords({
+        STUDY_ID: xr.DataArray(identity, attrs=about),
+        marker_of([identity]): xr.DataArray(True, attrs=marks),
+    })  # fmt: skip
     return dataset.assign_attrs({name: versions_text(v) for name, v in dataset.attrs.items()})
 
 

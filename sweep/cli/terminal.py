@@ -16,7 +16,7 @@ import click
 from click.shell_completion import CompletionItem
 from rich.filesize import decimal
 
-from sweep.messages import command_line, one_line, printable
+from sweep.messages import INCOMPLETE, MISTAKE, command_line, one_line, printable
 from sweep.storage.locations import Location, located
 from sweep.tasks.streams import is_terminal
 from sweep.units import number_text, percent
@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from sweep.spec import SceneSpec, Spec
     from sweep.tasks.plan import EffectRow, EffectsTable, Plan
     from sweep.tasks.session import Outcome
-
-MISTAKE, INCOMPLETE = 2, 3
 
 MANY_ALARMS = 0.01
 """Probability of a false alarm in a shot beyond which a study is warned of."""
@@ -619,21 +617,10 @@ def warn_of(study: Spec | SceneSpec) -> None:
     SceneError for a flight that sees nothing.
     """
     from sweep.analysis.noise_only import alarms_of_study
-    from sweep.spec import SceneSpec
-    from sweep.spec.grid_rules import too_narrow
-    from sweep.tasks.coverage import coverage, refuse_blind
-    from sweep.tasks.eyepoint_study import beneath, world_of
+    from sweep.tasks.doubts import doubts_of_geometry
 
-    if narrow := too_narrow(study.parameters_off_axes(), study.axes):
-        tell(f"warning: {narrow}", err=True)
-    if isinstance(study, SceneSpec):
-        for warning in world_of(study).warnings:
-            tell(f"warning: {warning}", err=True)
-        if path := beneath(study):
-            click.echo(f"warning: {path}", err=True)
-        refuse_blind(study)
-        for warning in coverage(study).warnings():
-            tell(f"warning: {warning}", err=True)
+    for doubt in doubts_of_geometry(study):
+        tell(f"warning: {doubt}", err=True)
     most = max((any_ for any_, _ in alarms_of_study(study)), default=0.0)
     if most > MANY_ALARMS:
         tell(
@@ -672,10 +659,12 @@ def warn_of_echoes(study: Spec | SceneSpec, store: Location) -> None:
 
 def warn_before(study: Spec | SceneSpec, store: Location) -> None:
     """Before a run: what :func:`warn_of` has, echoes that lack, and effects off that matter."""
+    from sweep.tasks.doubts import doubts_of_results
+    from sweep.tasks.studies import study_of
+
     warn_of(study)
-    warn_of_echoes(study, store)
-    if "off" in study.modes().values():
-        warn(effects_of(study, store, costs=False))
+    for doubt in doubts_of_results(study_of(study, store.absolute())):
+        tell(f"warning: {doubt}", err=True)
 
 
 def effects_of(study: Spec | SceneSpec, store: Location, *, costs: bool = True) -> EffectsTable:

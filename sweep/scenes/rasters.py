@@ -28,7 +28,7 @@ MOST_CELLS = 50_000_000
 FILE_CELLS_MAX = 1_000_000_000
 """Heights of a raster's file at most: all of them are read for its digest."""
 
-BYTES_A_CELL = 400
+BYTES_A_CELL = 220
 """Memory that a height takes at most while its triangles and their tree are built, measured."""
 
 _STRIP_CELLS = 1 << 22

@@ -37,6 +37,9 @@ from sweep.units import QuantityError, Unit
 RESERVED = ("batch", "draw", "point", "spec", "study_id")
 """Names of dimensions that a store may have besides its axes."""
 
+_MARKER = re.compile("study_[0-9a-f]{16}")
+"""Names of the coordinate that marks a study's points, in the dataset that its store opens as."""
+
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,60}")
 _LISTED = 64
 """Values of an axis that its identity lists at most."""
@@ -234,7 +237,7 @@ def _read_zip(key: str, written: dict[str, Any], location: Location) -> Axis:
         for other in written
         if other != "zip"
     )
-    if _NAME.fullmatch(key) is None or key in RESERVED:
+    if _NAME.fullmatch(key) is None or key in RESERVED or _MARKER.fullmatch(key):
         findings.append(Finding(location, "is no name for an axis", _REMEDY))
     pieces: dict[Location, object] = {(*location, "zip"): written["zip"]}
     if written["zip"] in ([], {}, None):

@@ -12,9 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from sweep.messages import option, suggestion
+from sweep.messages import is_command, option, suggestion
 from sweep.spec import SceneSpec, Spec
-from sweep.spec.clusters import Local
 from sweep.storage.locations import (
     PACKED,
     Location,
@@ -30,6 +29,7 @@ from sweep.storage.locations import (
 from sweep.storage.opening import read_attributes, study_id
 from sweep.tasks import studies
 from sweep.tasks.coverage import refuse_blind
+from sweep.tasks.doubts import warn_of_doubts
 from sweep.tasks.eyepoint_study import EyepointStudy, world_of
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.grid_study import GridStudy
@@ -46,7 +46,7 @@ from sweep.tasks.journal import (
     wait_for_silence,
     write_recipe,
 )
-from sweep.tasks.memory import refuse_too_large
+from sweep.tasks.memory import refuse_too_large_blocks, refuse_too_large_scene
 from sweep.tasks.progress import BusyError, ClusterError, StoreError, chosen, told, working
 from sweep.tasks.session import Outcome, Pool, RunOptions, Session
 from sweep.tasks.store import (
@@ -95,6 +95,12 @@ def run(
     Outcome
         Complete, or why not; `resume` goes on from there.
 
+    Warns
+    -----
+    StudyWarning
+        Of what can be computed, but is hardly meant: a beam that its aperture can't make, a flight
+        that partly sees nothing, echoes after their record, effects switched off that matter.
+
     Raises
     ------
     StoreError, ClusterError, CodeError
@@ -107,14 +113,18 @@ def run(
         raise ValueError("overwrite begins anew, and resume goes on: give one of them")
     _refuse_no_study(spec)
     _check_code(spec)
-    if how.client is None and isinstance(how.place(spec), Local | None):
-        refuse_too_large(spec)
     if resume and (not is_free(path) or under_way(path)):
         wait_for_silence(under_way(path) or path, chosen(how.progress).say)
         return _resume(path, spec, how)
-    pool = Pool(how, spec)
+    pool, study = Pool(how, spec), studies.study_of(spec, path)
     if not overwrite:
-        _refuse_in_the_way(path, studies.study_of(spec, path))
+        _refuse_in_the_way(path, study)
+    refuse_too_large_blocks(study, pool.memory)
+    if isinstance(spec, SceneSpec):
+        with working("building the scene", pool.told):
+            refuse_too_large_scene(spec, pool.memory)
+    if not is_command():  # which has printed them
+        warn_of_doubts(study)
     return _into(path, spec, pool, replace=overwrite, anew=True)
 
 

@@ -38,6 +38,7 @@ from sweep.tasks.eyepoint_study import (
 )
 from sweep.tasks.grid_study import EFFECTS, ERROR, Selected, coordinates
 from sweep.tasks.study import (
+    BLOCKS_MAX,
     TILE_SHOTS,
     ArrayLayout,
     BlockGrid,
@@ -117,10 +118,19 @@ class ScannerBlocks(Lattice, BlockGrid):
             finer="shot",
             each=self.shots_a_cycle,
         )
-        self.values += [
-            {"draw": np.arange(self.draws)},
-            {"cycle": np.arange(self.total_cycles)},
-        ]
+        if self.n_blocks > BLOCKS_MAX:
+            rule = (
+                f"cuts {self.draws:,} draws of {self.total_cycles:,} cycles of {scanner} into "
+                f"{self.n_blocks:.3g} blocks, and a study has at most {BLOCKS_MAX:.0e}"
+            )
+            size = f"{spec.storage.block_draws}"
+            remedy = "raise it or storage.block_shots, or take fewer draws"
+            raise SpecError([Mistake("storage.block_draws", rule, size, remedy)])
+
+    def values_along(self) -> list[dict[str, np.ndarray]]:
+        """Values along each dimension, by what they are of; there may be very many."""
+        of_draws = {"draw": np.arange(self.draws)}
+        return [*self.values, of_draws, {"cycle": np.arange(self.total_cycles)}]
 
     @property
     def navigates(self) -> bool:
@@ -471,7 +481,7 @@ class FlightStudy(GrowingStudy):
         blocks = self.scanners[part.scanner]
         return blocks.fixed | {
             path: along[index].item()
-            for values, index in zip(blocks.values, part.axes, strict=False)  # nor draw nor cycle
+            for values, index in zip(blocks.values, part.axes, strict=True)
             for path, along in values.items()
         }
 

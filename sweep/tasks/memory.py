@@ -1,15 +1,20 @@
-"""Memory that a point of a study takes, known before any array is made."""
+"""Memory that a study takes and that its workers have, compared before anything is computed."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from sweep.messages import option
+from sweep.spec.clusters import AnyCluster, Bounds, Local
 from sweep.spec.rules import Mistake, SpecError
 
 if TYPE_CHECKING:
+    from distributed import Client
+
     from sweep.spec import SceneSpec, Spec
+    from sweep.tasks.study import Study
 
 FFT_SIZE = "instrument.processing.fft_size"
 
@@ -31,16 +36,92 @@ def point_bytes(spec: Spec | SceneSpec) -> int:
     return largest_fft(spec) * (BYTES_PER_DRAWN_BIN if drawn else BYTES_PER_BIN)
 
 
-def refuse_too_large(spec: Spec | SceneSpec) -> None:
-    """Refuse a study of which one point takes more memory than this machine has."""
+def scene_bytes(spec: SceneSpec) -> int:
+    """Return the bytes of a scene's triangles and trees, which each process has a copy of."""
+    from sweep.tasks.eyepoint_study import world_of
+
+    return world_of(spec).caster.nbytes
+
+
+class WorkerMemory(NamedTuple):
+    """Memory of the process that computes a study's points."""
+
+    limit: float
+    """Bytes that it may take; inf where that is not known."""
+    owner: str
+    """The process, as the subject of a sentence: `this machine`."""
+    workers: int = 1
+    """Workers that share the memory of this machine; 1 where they do not."""
+
+
+def this_machine() -> WorkerMemory:
+    """Return the memory of a plain loop in this process."""
     # Here, as a spec with mistakes is told without the second that this import takes.
     from distributed.system import MEMORY_LIMIT
 
+    return WorkerMemory(MEMORY_LIMIT, "this machine")
+
+
+def worker_memory(client: Client | None, cluster: AnyCluster | None) -> WorkerMemory:
+    """Return the memory of the smallest worker of a client, or of a cluster to be started."""
+    if client is not None:
+        return WorkerMemory(_smallest_worker(client), "a worker of the client")
+    if isinstance(cluster, Local):
+        from sweep.tasks.cluster import cores
+        from sweep.tasks.clusters.machines import memory_of_worker
+
+        bounds = cluster.workers or Bounds(cores(), cores())
+        shared = 1 if cluster.worker.memory else bounds.most
+        return WorkerMemory(memory_of_worker(cluster, bounds), "each worker", shared)
+    memory = getattr(getattr(cluster, "worker", None), "memory", None)
+    return WorkerMemory(memory or np.inf, "each worker of the cluster")
+
+
+def _smallest_worker(client: Client) -> float:
+    """Return the least memory of a client's workers [bytes]; inf if there is none, or no limit."""
+    workers = client.scheduler_info(n_workers=-1).get("workers", {}).values()
+    return min((worker.get("memory_limit") or np.inf for worker in workers), default=np.inf)
+
+
+def refuse_too_large(spec: Spec | SceneSpec, memory: WorkerMemory) -> None:
+    """Refuse a study of which one point takes more memory than a process has."""
     needed = point_bytes(spec)
-    if needed > MEMORY_LIMIT:
-        rule = (
-            f"makes a point take about {needed / 1e9:,.1f} GB of memory, and this machine has "
-            f"{MEMORY_LIMIT / 1e9:,.1f} GB"
-        )
+    if needed > memory.limit:
+        rule = f"makes a point take about {_gigabytes(needed)} of memory, {_shortage(memory)}"
         size = f"{largest_fft(spec):,} points"
-        raise SpecError([Mistake(FFT_SIZE, rule, size, "take fewer points of the FFT")])
+        remedy = f"take fewer points of the FFT{_or_fewer_workers(memory, needed)}"
+        raise SpecError([Mistake(FFT_SIZE, rule, size, remedy)])
+
+
+def refuse_too_large_scene(spec: SceneSpec, memory: WorkerMemory) -> None:
+    """Refuse a scene that takes more memory, in each process that computes, than it has."""
+    needed = point_bytes(spec) + scene_bytes(spec)
+    if needed > memory.limit:
+        rule = (
+            f"takes about {_gigabytes(needed)} of memory in each process that computes, "
+            f"{_shortage(memory)}"
+        )
+        remedy = f"take coarser grounds and meshes{_or_fewer_workers(memory, needed)}"
+        raise SpecError([Mistake("scene.objects", rule, "", remedy)])
+
+
+def refuse_too_large_blocks(study: Study, memory: WorkerMemory) -> None:
+    """Refuse a study of which the results of one block take more memory than a process has."""
+    needed = 2 * study.block_bytes  # its own, and those being encoded
+    if needed > memory.limit:
+        rule = f"makes a block take about {_gigabytes(needed)} of memory, {_shortage(memory)}"
+        raise SpecError([Mistake("storage", rule, "", "lower the number that a block holds")])
+
+
+def _shortage(memory: WorkerMemory) -> str:
+    return f"and {memory.owner} has {_gigabytes(memory.limit)}"
+
+
+def _or_fewer_workers(memory: WorkerMemory, needed: float) -> str:
+    """Remedy for workers that share a machine, if fewer would have enough memory each."""
+    fewer = int(memory.limit * memory.workers / needed)
+    return f", or {option('workers', fewer)}" if 1 <= fewer < memory.workers else ""
+
+
+def _gigabytes(size: float) -> str:
+    return f"{size / 1e9:,.1f} GB"

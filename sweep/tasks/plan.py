@@ -29,7 +29,13 @@ from sweep.tasks.grid_study import (
     select,
     with_few_draws,
 )
-from sweep.tasks.memory import point_bytes, refuse_too_large
+from sweep.tasks.memory import (
+    point_bytes,
+    refuse_too_large,
+    refuse_too_large_blocks,
+    refuse_too_large_scene,
+    this_machine,
+)
 from sweep.tasks.studies import study_of
 from sweep.tasks.study import TILE_SHOTS, Value
 
@@ -95,8 +101,9 @@ def plan(
     spec: Spec | SceneSpec, *, store: Location | None = None, workers: int | None = None
 ) -> Plan:
     """Plan a study to be stored at a place, by its size and a second of measuring points."""
-    refuse_too_large(spec)
+    refuse_too_large(spec, this_machine())
     study = study_of(spec, (store or Path("nowhere.zarr")).absolute())
+    refuse_too_large_blocks(study, this_machine())
     scanners: tuple[ScannerPlan, ...] = ()
     reports: tuple[str, ...] = ()
     shape = {}
@@ -107,6 +114,7 @@ def plan(
         looking = sum(
             grid.points * s.seconds_a_draw for grid, s in zip(study.grids, scanners, strict=True)
         )
+        refuse_too_large_scene(study.spec, this_machine())
         each, reports = (rays + looking) / study.points, eyepoints[0].world.reports
     else:
         each = measured(study)
@@ -247,6 +255,7 @@ def timed(
 def _scanner(study: FlightStudy, eyepoints: EyepointStudy) -> ScannerPlan:
     blocks = study.scanners[eyepoints.scanner]
     part = blocks.part(0)
+    part = part._replace(draws=part.draws[:MOST_DRAWS])
 
     def look(tiles: int) -> Round:
         begun = time.process_time()

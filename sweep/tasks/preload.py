@@ -10,7 +10,7 @@ from typing import Any
 
 from distributed.comm import get_address_host
 
-from sweep.tasks.progress import HANGUP
+from sweep.tasks.interrupts import HANGUP
 from sweep.tasks.streams import ForgivingStream
 
 

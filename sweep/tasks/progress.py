@@ -1,15 +1,13 @@
-"""Words to who runs a study, and Ctrl-C from them: errors; a bar in a terminal, or plain lines."""
+"""Words to whoever runs a study: errors; a bar in a terminal, or plain lines."""
 
 from __future__ import annotations
 
 import logging
-import signal
 import sys
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from types import FrameType
 from typing import IO, TYPE_CHECKING, Any, cast
 
 from sweep.messages import PrintableError, printable
@@ -31,12 +29,6 @@ BROAD = 100
 
 #: Seconds before anything is shown of what is mostly over by then.
 LATE = 2.0
-
-#: Signals that end a run once its running blocks are done; the second one ends it at once.
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
-
-#: Signal of a terminal that is closed, which comes several times; there is none on some systems.
-HANGUP = getattr(signal, "SIGHUP", None)
 
 _log = logging.getLogger("sweep")
 
@@ -280,35 +272,6 @@ class Bar(_Counting):
     def end(self) -> None:
         """Leave the bar as it is."""
         self._bar.stop()
-
-
-class Interrupts:
-    """Ctrl-C once: finish what runs and stop; twice: stop at once; in the main thread only.
-
-    A closed terminal counts as one Ctrl-C, however often it is told; not where the process was
-    started to ignore it, as by nohup.
-    """
-
-    def __init__(self) -> None:
-        self.stopping = False
-        self._before: dict[signal.Signals, Any] = {}
-
-    def __enter__(self) -> Interrupts:
-        if threading.current_thread() is threading.main_thread():
-            numbers = list(SIGNALS)
-            if HANGUP is not None and signal.getsignal(HANGUP) is not signal.SIG_IGN:
-                numbers.append(HANGUP)
-            self._before = {number: signal.signal(number, self._handle) for number in numbers}
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, signal.SIG_DFL if handler is None else handler)
-
-    def _handle(self, number: int, frame: FrameType | None) -> None:
-        if self.stopping and number != HANGUP:
-            raise KeyboardInterrupt
-        self.stopping = True
 
 
 def amount(points: float) -> str:

@@ -41,10 +41,11 @@ from sweep.spec.sections import Execution
 from sweep.storage.locations import NO_INODES, Location, ObjectStoreError, reason
 from sweep.storage.opening import read_receipts
 from sweep.tasks import journal, store
+from sweep.tasks.interrupts import Interrupts
 from sweep.tasks.journal import Failure, Journal, Lock, Look, Receipt, given_up
+from sweep.tasks.memory import refuse_too_large, this_machine, worker_memory
 from sweep.tasks.progress import (
     ClusterError,
-    Interrupts,
     Progress,
     SchedulerLost,
     StoreError,
@@ -262,9 +263,13 @@ class Pool(ExitStack):
 
     def __init__(self, options: RunOptions, spec: Spec | SceneSpec) -> None:
         super().__init__()
-        self.options, self.interrupts = options, Interrupts()
-        self.told = chosen(options.progress)
+        self.options, self.told = options, chosen(options.progress)
+        self.interrupts = Interrupts(self.told)
         self._cluster, self._spec = options.place(spec), spec
+        self.memory = (
+            this_machine() if self.is_plain else worker_memory(options.client, self._cluster)
+        )
+        refuse_too_large(spec, self.memory)
         self.most = 1  # blocks of the study: more workers than that have nothing to do
         self._reached: Reached | None = None
 
@@ -289,6 +294,8 @@ class Pool(ExitStack):
                         say=self.told.say,
                     )
                 )
+                if isinstance(self._cluster, Address):  # whose workers are known from here on
+                    refuse_too_large(self._spec, worker_memory(self._reached.client, None))
             elif client.asynchronous:
                 raise ClusterError("the client is asynchronous: give one of another kind, Client()")
             else:
@@ -493,6 +500,7 @@ class Session:
                     unit=self._study.unit,
                 )
                 stack.callback(self._told.end)
+                self._interrupts.is_computing = True
                 return self._take(answers, blocks)
             except SchedulerLost as error:
                 return f"the scheduler is gone ({error})"
@@ -504,6 +512,8 @@ class Session:
                 if _is_there(self._path):
                     raise
                 return unwritable(self._path, FileNotFoundError())
+            finally:
+                self._interrupts.is_computing = False
 
     def _compile(self) -> None:
         if self._pool.options.evaluate:  # in place of the model
@@ -515,7 +525,7 @@ class Session:
         gc.set_threshold(*threshold)
 
     def _take(self, answers: Iterator[Answer], blocks: BlockQueue) -> str:
-        told, absence = False, Absence()
+        absence = Absence()
         for answer in answers:
             if not self._lock.is_mine():
                 if not _is_there(self._path):
@@ -525,9 +535,8 @@ class Session:
                 self._told.say(missing)
                 self._pool.revive()
             self._commit(answer, blocks)
-            if self._interrupts.stopping and not told:
-                self._told.say("stopping when what runs is written; again to stop at once")
-                told = True
+            if self._interrupts.stopping:
+                self._interrupts.announce()
             if not self._committed["blocks"] and len(self._failures) >= HOPELESS:
                 return f"the first {HOPELESS} blocks all failed"
         before = self._points()

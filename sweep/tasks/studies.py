@@ -393,22 +393,23 @@ class Matching:
 
 def _parts(other: Lattice, grid: Lattice) -> Iterator[tuple[int | None, dict[str, np.ndarray]]]:
     """Parameters that are looked up together: those of each axis, and all that are fixed."""
-    yield from enumerate(other.values)
-    on_axes = {path for values in other.values for path in values}
+    yield from enumerate(other.values_along())
+    on_axes = {path for values in other.values_along() for path in values}
     fixed = {path: np.array([v]) for path, v in other.fixed.items() if path not in on_axes}
-    for values in grid.values:
+    for values in grid.values_along():
         yield None, {path: fixed.pop(path) for path in values if path in fixed}
     yield None, fixed
 
 
 def _places(grid: Lattice, axis: int | None, values: dict[str, np.ndarray]) -> Places:
     """Places of a grid's values among others of the same parameters, which go together."""
-    along = [k for k, own in enumerate(grid.values) if not own.keys().isdisjoint(values)]
+    along = [k for k, own in enumerate(grid.values_along()) if not own.keys().isdisjoint(values)]
     shape = tuple(size if k in along else 1 for k, size in enumerate(grid.shape))
     index = [i.ravel() for i in np.indices([grid.shape[k] for k in along])]
+    of_dimensions = grid.values_along()
     wanted: dict[str, Value] = {path: grid.fixed[path] for path in values if path in grid.fixed}
     for k, i in zip(along, index, strict=True):
-        wanted |= {path: a[i] for path, a in grid.values[k].items() if path in values}
+        wanted |= {path: a[i] for path, a in of_dimensions[k].items() if path in values}
     number = len(next(iter(values.values()))) if values else 1
     rows = canonical_rows(values, number)
     found = _looked_up(rows, canonical_rows(wanted, math.prod(shape)))

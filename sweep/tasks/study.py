@@ -26,6 +26,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
+from sweep.spec.rules import Mistake, SpecError
+
 if TYPE_CHECKING:
     from sweep.model.outputs import Output
     from sweep.spec import SceneSpec, Spec
@@ -309,6 +311,10 @@ def most_points(spec: Spec, points: int) -> int:
     return max(1, min(asked, int(BLOCK_SECONDS / seconds_a_point(spec))))
 
 
+#: Blocks of a study at most: a run remembers some 30 bytes of each, and makes files of it.
+BLOCKS_MAX = 2 * 10**7
+
+
 class Lattice:
     """Parameters along the axes of a study: those that are fixed, and those of each axis."""
 
@@ -316,7 +322,11 @@ class Lattice:
         self.fixed: dict[str, float | int | str] = dict(spec.parameters())
         self.shape = tuple(int(axis.size) for axis in spec.axes)
         self.values = [{m.path: np.asarray(m.values) for m in axis.members} for axis in spec.axes]
-        """Values along each dimension by the parameters that they set."""
+        """Values along each axis by the parameters that they set."""
+
+    def values_along(self) -> list[dict[str, np.ndarray]]:
+        """Values along each dimension, by what they are of."""
+        return self.values
 
 
 class Grid(Lattice, BlockGrid):
@@ -332,6 +342,13 @@ class Grid(Lattice, BlockGrid):
         most = most_points(spec, math.prod(self.shape))
         dims = tuple(axis.name for axis in spec.axes)
         BlockGrid.__init__(self, dims, self.shape, block_shape(self.shape, self.geometric, most))
+        if self.n_blocks > BLOCKS_MAX:
+            rule = (
+                f"makes {self.points:.3g} points in {self.n_blocks:.3g} blocks, and a study has "
+                f"at most {BLOCKS_MAX:.0e}"
+            )
+            remedy = "take fewer values or fewer draws, or raise storage.block_points"
+            raise SpecError([Mistake("axes", rule, "", remedy)])
 
     def parameters(self, block: int) -> dict[str, Value]:
         """Parameters of a block's points by path: scalars, or arrays (n,) in C order over it."""

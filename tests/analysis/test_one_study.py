@@ -52,6 +52,12 @@ def by_new_defaults(datasets, dim):
         return xr.concat(datasets, dim)
 
 
+def with_variable(one, other, name):
+    changed = one.copy()
+    changed[name] = other[name]
+    return changed
+
+
 NEAR, FAR = {"range": slice(0, 2)}, {"range": slice(2, None)}
 TOGETHER = {
     "concat": lambda one, other: xr.concat([one, other], "design"),
@@ -64,6 +70,35 @@ TOGETHER = {
     "where": lambda one, other: one.where(one.pd_shot > 2, other),
     "difference": lambda one, other: one - other,
     "xarray's new defaults": lambda one, other: by_new_defaults([one, other], "design"),
+    "halves by new defaults": lambda one, other: by_new_defaults(
+        [one.isel(NEAR), other.isel(FAR)], "range"
+    ),
+    "one of a concat by new defaults": lambda one, other: by_new_defaults(
+        [one, other], "design"
+    ).isel(design=1),
+    "one of a concat, without its name": lambda one, other: by_new_defaults(
+        [one, other], "design"
+    ).isel(design=1, drop=True),
+    "halves, the first one's coordinates": lambda one, other: xr.concat(
+        [one.isel(NEAR), other.isel(FAR)], "range", coords="minimal", compat="override"
+    ),
+    "halves by combine_nested": lambda one, other: xr.combine_nested(
+        [one.isel(NEAR), other.isel(FAR)], "range", coords="minimal", compat="override"
+    ),
+    "halves by combine_by_coords": lambda one, other: xr.combine_by_coords(
+        [one.isel(NEAR), other.isel(FAR)], coords="minimal", compat="override"
+    ),
+    "merge, the first one's coordinates": lambda one, other: xr.merge(
+        [one[["pd_shot", "effects"]], other[["snr_up"]]], compat="override"
+    ),
+    "a variable assigned": lambda one, other: one.assign(snr_up=other.snr_up),
+    "all variables assigned": lambda one, other: one.assign(dict(other.data_vars)),
+    "a variable set": lambda one, other: with_variable(one, other, "effects"),
+    "without the id": lambda one, other: one.assign(snr_up=other.snr_up).drop_vars("study_id"),
+    "without attributes": lambda one, other: (one - other).drop_attrs(),
+    "coordinates of the first": lambda one, other: xr.Dataset(
+        {"snr_up": other.snr_up, **one.drop_vars("snr_up")}, coords=one.coords, attrs=one.attrs
+    ),
 }
 
 
@@ -102,6 +137,7 @@ def test_parts_of_one_study_put_together_answer_as_the_whole(small):
         lambda ds: ds.pad(range=1),
         lambda ds: ds.expand_dims("again"),
         lambda ds: ds.drop_vars("study_id"),
+        lambda ds: ds.drop_vars(f"study_{ds.study_id.item()[:16]}"),
         lambda ds: ds.drop_attrs(),
         lambda ds: ds.assign_attrs(spec=""),
     ],
@@ -187,6 +223,9 @@ def test_one_design_of_a_join_is_that_study(stores, large):
         lambda: large.sweep.compare(joined),
         lambda: joined.mean("aperture_case").sweep.maximum_range(),
         lambda: joined.isel(aperture_case=0, drop=True).sweep.maximum_range(),
+        lambda: chosen.assign(snr_up=large.snr_up).sweep.maximum_range(),
+        lambda: xr.merge([chosen, large], compat="override").sweep.maximum_range(),
+        lambda: by_new_defaults([large, chosen], "again").isel(again=1).sweep.maximum_range(),
     ):
         with pytest.raises(ValueError, match=r"stud(y|ies)"):
             refused()

@@ -1,5 +1,7 @@
 """Numbers in a spec that would fill memory are refused in words, before any array is made."""
 
+from pathlib import Path
+
 import pytest
 from small import small
 from small_flights import small_scene
@@ -23,6 +25,97 @@ def test_an_fft_that_no_machine_holds_is_refused(use, tmp_path, monkeypatch):
     with pytest.raises(SpecError, match=r"fft_size: makes a point take about 268.4 GB.*64.0 GB"):
         use(spec, tmp_path / "huge.zarr")
     assert not (tmp_path / "huge.zarr").exists()
+
+
+class ClientOf:
+    """A client whose workers have so many bytes."""
+
+    asynchronous = False
+
+    def __init__(self, *limits):
+        self.limits = limits
+
+    def scheduler_info(self, n_workers=5):
+        return {"workers": {str(k): {"memory_limit": v} for k, v in enumerate(self.limits)}}
+
+
+def batch(memory):
+    return {
+        "kind": "slurm", "workers": 4, "worker": {"threads": 1, "memory": memory},
+        "job": {"workers": 2, "walltime": "10 min"}, "scheduler": {"host": "node1"},
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"client": ClientOf(64 * 10**9, 2 * 10**9)}, "a worker of the client has 2.0 GB"),
+        ({"cluster": batch("2 GB")}, "each worker of the cluster has 2.0 GB"),
+        ({"cluster": {"kind": "local", "workers": 2, "worker": {"memory": "3 GB"}}},
+         "each worker has 3.0 GB"),
+        ({"workers": 16}, r"each worker has 3.6 GB.*fewer points of the FFT, or workers=13$"),
+    ],
+)  # fmt: skip
+def test_an_fft_is_held_against_the_memory_of_the_workers(options, told, tmp_path, monkeypatch):
+    monkeypatch.setattr("distributed.system.MEMORY_LIMIT", 64 * 10**9)
+    spec = small(axes={"instrument.processing.fft_size": [2**16, 2**24]})  # 4.2 GB
+    with pytest.raises(SpecError, match=rf"fft_size: makes a point take about 4.2 GB.*{told}"):
+        driver.run(spec, store=tmp_path / "huge.zarr", progress=False, **options)
+    assert not (tmp_path / "huge.zarr").exists()
+
+
+@pytest.mark.parametrize("limits", [(), (0,), (None, 10**12)])
+def test_workers_without_a_limit_take_any_study(limits):
+    memory.refuse_too_large(small(axes=HUGE), memory.worker_memory(ClientOf(*limits), None))
+
+
+def test_a_scene_is_held_against_the_memory_of_each_worker(tmp_path, monkeypatch):
+    spec = small_scene()
+    needed = memory.point_bytes(spec) + memory.scene_bytes(spec)
+    assert memory.scene_bytes(spec) > 1000
+    monkeypatch.setattr("distributed.system.MEMORY_LIMIT", needed - 1)
+    for use in (lambda: plan(spec), lambda: runs(spec, tmp_path / "s.zarr")):
+        with pytest.raises(SpecError, match=r"scene\.objects: takes about .* in each process"):
+            use()
+    assert not (tmp_path / "s.zarr").exists()
+
+
+def test_a_block_that_no_memory_holds_is_refused(tmp_path, monkeypatch):
+    spec = small_scene(draws={"number": 10**7}, storage={"block_draws": 10**6})
+    monkeypatch.setattr("distributed.system.MEMORY_LIMIT", 10**8)
+    monkeypatch.setattr(memory, "point_bytes", lambda spec: 0)
+    for use in (lambda: plan(spec), lambda: runs(spec, tmp_path / "s.zarr")):
+        with pytest.raises(SpecError, match=r"storage: makes a block take .* GB"):
+            use()
+    assert not (tmp_path / "s.zarr").exists()
+
+
+def few_shots(**changes):
+    """One cycle of three shots."""
+    scanners = {"three": {"kind": "cone", "beams": 3, "half_angle": "22.5 deg", "rate": "0.1 Hz"}}
+    return small_scene(scanners=scanners, axes={}, **changes)
+
+
+def test_very_many_draws_of_few_shots_allocate_nothing_and_are_refused_by_their_blocks():
+    import tracemalloc
+
+    study_of(few_shots(), Path("nowhere.zarr"))
+    tracemalloc.start()
+    study_of(few_shots(draws={"number": 10**9}, storage={}), Path("nowhere.zarr"))
+    with pytest.raises(SpecError, match=r"storage.block_draws: cuts 1,000,000,000 draws of .*; ra"):
+        study_of(few_shots(draws={"number": 10**9}, storage={"block_draws": 3}), Path("no.zarr"))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 20e6
+
+
+def test_a_grid_of_too_many_blocks_is_refused():
+    axes = {
+        "target.range": {"linear": ["10 m", "5 km"], "number": 10**5},
+        "target.grazing_angle": {"linear": ["10 deg", "90 deg"], "number": 10**4},
+    }
+    with pytest.raises(SpecError, match=r"axes: makes 1e\+09 points in .* blocks"):
+        study_of(small(axes=axes, storage={"block_points": 1}), Path("nowhere.zarr"))
 
 
 def test_the_memory_of_a_plan_counts_a_point():

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from typing import Any
 
@@ -22,13 +24,37 @@ CLOSE = 1e-9
 STUDY_ID = "study_id"
 """Coordinate with the id of the study that points are of; an attribute of the same name, too."""
 
+HOW_TO_JOIN = (
+    "join stores with sweep.open([STORE, STORE], dim='design'), whose answers are per design"
+)
+
+_MARKER = re.compile("study_[0-9a-f]{16}")
+
 SPECS = "specs"
 """Attribute of a join of studies: JSON with the spec and the variables of each by its id."""
+
+
+def marker_of(identities: Iterable[str]) -> str:
+    """Return the name of the coordinate that marks points of a study, or of a join of several.
+
+    Of coordinates of one name xarray may keep the first dataset's. A name that only one dataset
+    has it never drops. Two studies leave two markers.
+    """
+    identities = list(identities)
+    if len(identities) == 1:
+        return f"study_{identities[0][:16]}"
+    return f"study_{hashlib.sha256(' '.join(sorted(identities)).encode()).hexdigest()[:16]}"
+
+
+def markers(dataset: xr.Dataset | xr.DataTree) -> list[str]:
+    """Return the markers that a dataset has, by :func:`marker_of`."""
+    return [name for name in map(str, dataset.coords) if _MARKER.fullmatch(name)]
 
 
 def study_of(dataset: xr.Dataset | xr.DataTree) -> Spec | SceneSpec:
     """Return the study that a dataset, or a flight's tree, comes from."""
     text = dataset.attrs.get("spec")
+    _check_marker(dataset)
     if STUDY_ID in dataset.coords:
         identity = dataset.coords[STUDY_ID]
         if identity.dims:
@@ -47,6 +73,26 @@ def study_of(dataset: xr.Dataset | xr.DataTree) -> Spec | SceneSpec:
             "xarray.set_options(keep_attrs=True)"
         )
     return _from_stored(text)
+
+
+def _check_marker(dataset: xr.Dataset | xr.DataTree) -> None:
+    """Refuse a dataset that was put together of those of several studies."""
+    present = markers(dataset)
+    if len(present) > 1:
+        studies = ", ".join(name.removeprefix("study_")[:8] for name in present)
+        raise ValueError(
+            f"the dataset is put together of the studies {studies} and has the spec of the first "
+            f"alone: {HOW_TO_JOIN}"
+        )
+    if STUDY_ID in dataset.coords and not dataset.coords[STUDY_ID].dims:
+        identity = str(dataset.coords[STUDY_ID].item())
+        joined = json.loads(dataset.attrs[SPECS]) if SPECS in dataset.attrs else [identity]
+        if present != [marker_of(joined)]:
+            raise ValueError(
+                f"the dataset lacks the coordinate '{marker_of(joined)}', which proves that no "
+                f"other study's variables are in it: take one that sweep.open gave, or "
+                f"{HOW_TO_JOIN}"
+            )
 
 
 @lru_cache(maxsize=8)

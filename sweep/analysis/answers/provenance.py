@@ -1,8 +1,11 @@
 """Proof that a dataset is one study's, and answers per design from a join of several studies.
 
-A dataset of `sweep.open` has the scalar coordinate `study_id`. xarray keeps it through selections,
-and drops it or spreads it along a dimension where datasets of two studies are put together.
-Attributes prove nothing: of two datasets xarray keeps the first one's.
+A dataset of `sweep.open` has the scalar coordinate `study_id`. xarray keeps it through selections.
+From datasets of two studies xarray drops it, or spreads it along a dimension, or keeps the first
+one's (`compat="override"`). A second coordinate, the marker, has the study in its
+name: `study_1f2e3d4c5b6a7980`. xarray keeps a coordinate that only one of two datasets has. A
+dataset with two markers is therefore of two studies. Attributes prove nothing: of two datasets
+xarray keeps the first one's.
 """
 
 from __future__ import annotations
@@ -15,7 +18,16 @@ import numpy as np
 import xarray as xr
 
 from sweep.analysis import labels
-from sweep.analysis.answers.physical import SPECS, STUDY_ID, parameter_coordinate, si, study_of
+from sweep.analysis.answers.physical import (
+    HOW_TO_JOIN,
+    SPECS,
+    STUDY_ID,
+    marker_of,
+    markers,
+    parameter_coordinate,
+    si,
+    study_of,
+)
 from sweep.spec import SceneSpec, Spec
 from sweep.spec.axes import Member, values_in
 from sweep.spec.rules import Numeric
@@ -23,10 +35,6 @@ from sweep.spec.sections import parameter_rules
 
 CLOSE = 1e-9
 """Relative difference up to which a value is one of an axis."""
-
-_HOW_TO_JOIN = (
-    "join stores with sweep.open([STORE, STORE], dim='design'), whose answers are per design"
-)
 
 
 def answer_per_study(
@@ -54,7 +62,7 @@ def answer_per_study(
     ValueError
         The dataset does not prove that it is one study's.
     """
-    of_sweep = {STUDY_ID, SPECS, "spec", "model_version"}
+    of_sweep = {STUDY_ID, SPECS, "spec", "model_version", *markers(dataset)}
     if not every_axis and not of_sweep & {*dataset.coords, *dataset.attrs}:
         return answer(dataset)  # arrays of no study, of which nothing but the arrays is used
     dim = _join_dimension(dataset)
@@ -117,7 +125,7 @@ def _join_dimension(dataset: xr.Dataset, *, refuse: bool = False) -> str:
         raise ValueError(
             f"the dataset lacks the coordinate '{STUDY_ID}', which proves that it is one study's: "
             "it is no dataset of sweep.open, or is made of several studies. Take one that "
-            f"sweep.open gave, or {_HOW_TO_JOIN}"
+            f"sweep.open gave, or {HOW_TO_JOIN}"
         )
     identity = dataset[STUDY_ID]
     if not identity.dims:
@@ -126,7 +134,7 @@ def _join_dimension(dataset: xr.Dataset, *, refuse: bool = False) -> str:
     if not refuse and identity.ndim == 1 and SPECS in dataset.attrs and dim in dataset.coords:
         return dim
     studies = ", ".join(str(value)[:8] for value in dict.fromkeys(identity.values.ravel().tolist()))
-    remedy = f"it has the spec of the first alone; {_HOW_TO_JOIN}"
+    remedy = f"it has the spec of the first alone; {HOW_TO_JOIN}"
     if SPECS in dataset.attrs:
         remedy = f"select one of them, ds.isel({dim}=0)"
     raise ValueError(
@@ -201,7 +209,7 @@ def _check_dimensions(dataset: xr.Dataset, spec: Spec | SceneSpec) -> None:
     if foreign and isinstance(spec, Spec):
         raise ValueError(
             f"'{foreign[0]}' is no axis of the study: the dataset is stacked from several, or "
-            f"expanded. Select one value along it, or {_HOW_TO_JOIN}"
+            f"expanded. Select one value along it, or {HOW_TO_JOIN}"
         )
 
 
@@ -246,8 +254,10 @@ def joined(datasets: Mapping[str, xr.Dataset], dim: str) -> xr.Dataset:
     parts = [_aligned(datasets[name], specs[name], reference) for name in datasets]
     order = list(dict.fromkeys(str(d) for part in parts for d in part.dims))
     parts = [part.transpose(*[d for d in order if d in part.dims]) for part in parts]
-    result = join_along([part.drop_vars(STUDY_ID) for part in parts], dim, list(datasets))
-    result = result.assign_coords({STUDY_ID: (dim, [part[STUDY_ID].item() for part in parts])})
+    identities = [part[STUDY_ID].item() for part in parts]
+    parts = [part.drop_vars([STUDY_ID, *markers(part)]) for part in parts]
+    result = join_along(parts, dim, list(datasets))
+    result = result.assign_coords({STUDY_ID: (dim, identities), marker_of(identities): True})
     result.attrs = _attributes_of_join(datasets)
     return result
 

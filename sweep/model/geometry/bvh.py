@@ -71,59 +71,102 @@ def build(vertices: np.ndarray, faces: np.ndarray) -> Tree:
 
     Vertices (n, 3) float64 [m] are finite and best centred; faces (m, 3) int, m >= 1.
     """
-    slack = _SLACK * float(max(vertices.max(), -vertices.min()))
-    boxes = np.full((len(faces) + 1, 6), _FAR)  # the last for no triangle
-    centres = np.empty((len(faces), 3))
+    leaves = _in_leaves(_centres(vertices, faces))
+    bounds, children = _nodes(vertices, faces, leaves)
+    order = leaves[leaves < len(faces)]
+    del leaves
+    new_faces, by_use = _in_order_of_use(faces, order, len(vertices))
+    return Tree(bounds, children, new_faces, order, vertices[by_use])
+
+
+def _centres(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return twice the middles of triangles' boxes, (m, 3) float32: they only order the tree."""
+    centres = np.empty((len(faces), 3), np.float32)
     for begin in range(0, len(faces), _AT_ONCE):  # the corners of all at once take much memory
-        part = slice(begin, min(begin + _AT_ONCE, len(faces)))
+        part = slice(begin, begin + _AT_ONCE)
         corners = vertices[faces[part]]
-        low, high = corners.min(axis=1), corners.max(axis=1)
-        boxes[part, :3] = np.nextafter((low - slack).astype(np.float32), -_FAR)
-        boxes[part, 3:] = -np.nextafter((high + slack).astype(np.float32), _FAR)
-        centres[part] = low + high
-    leaves = _in_leaves(centres)
-    del centres
-    boxes = boxes[leaves].reshape(-1, LEAF, 6).min(axis=1)
-    is_triangle = leaves < len(faces)
-    count = is_triangle.reshape(-1, LEAF).sum(axis=1)
-    bounds, children = _nodes(boxes, -1 - (8 * (np.cumsum(count) - count) + count))
-    order = leaves[is_triangle].astype(np.int32)
-    used = faces[order].ravel()
-    first = np.full(len(vertices), used.size)
-    first[used[::-1]] = np.arange(used.size)[::-1]
-    by_use = np.argsort(first)  # a leaf's triangles lie together in memory
-    new = np.empty(len(vertices), np.int32)
-    new[by_use] = np.arange(len(vertices))
-    return Tree(bounds, children, new[used].reshape(-1, 3), order, vertices[by_use])
+        centres[part] = corners.min(axis=1) + corners.max(axis=1)
+    return centres
 
 
-def _nodes(boxes: np.ndarray, links: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds and children of all nodes, from boxes (low, -high) of leaves and links to these."""
-    bounds: list[np.ndarray] = []
-    children: list[np.ndarray] = []
+def _leaf_boxes(vertices: np.ndarray, faces: np.ndarray, leaves: np.ndarray) -> np.ndarray:
+    """Return the boxes (low, -high) of leaves, (n, 6) float32."""
+    slack = _SLACK * float(max(vertices.max(), -vertices.min()))
+    boxes = np.empty((leaves.size // LEAF, 6), np.float32)
+    for begin in range(0, leaves.size, _AT_ONCE):
+        triangles = leaves[begin : begin + _AT_ONCE]
+        is_triangle = triangles < len(faces)
+        corners = vertices[faces[np.where(is_triangle, triangles, 0)]]
+        of_triangles = np.empty((len(triangles), 6), np.float32)
+        low, high = corners.min(axis=1) - slack, corners.max(axis=1) + slack
+        of_triangles[:, :3] = np.nextafter(low.astype(np.float32), -_FAR)
+        of_triangles[:, 3:] = -np.nextafter(high.astype(np.float32), _FAR)
+        of_triangles[~is_triangle] = _FAR
+        part = slice(begin // LEAF, (begin + _AT_ONCE) // LEAF)
+        boxes[part] = of_triangles.reshape(-1, LEAF, 6).min(axis=1)
+    return boxes
+
+
+def _nodes(
+    vertices: np.ndarray, faces: np.ndarray, leaves: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds and children of all nodes, level by level above the leaves, the root last."""
+    boxes = _leaf_boxes(vertices, faces, leaves)
+    count = (leaves < len(faces)).reshape(-1, LEAF).sum(axis=1, dtype=np.int32)
+    links = -1 - (8 * (np.cumsum(count, dtype=np.int32) - count) + count)
+    numbers = [-(-len(boxes) // WIDTH)]
+    while numbers[-1] > 1:
+        numbers.append(-(-numbers[-1] // WIDTH))
+    bounds = np.empty((sum(numbers), 6, WIDTH), np.float32)
+    children = np.empty((sum(numbers), WIDTH), np.int32)
     before = 0
-    while before == 0 or len(boxes) > 1:
-        number = -(-len(boxes) // WIDTH)
-        lacking = number * WIDTH - len(boxes)
-        wide = np.append(boxes, np.full((lacking, 6), _FAR), axis=0).reshape(number, WIDTH, 6)
-        links = np.append(links, np.full(lacking, -1))  # leaves without triangles
-        bounds.append(np.concatenate([wide[..., :3], -wide[..., 3:]], axis=-1).swapaxes(1, 2))
-        children.append(links.reshape(number, WIDTH))
-        boxes, links = wide.min(axis=1), before + np.arange(number)
+    for number in numbers:
+        if lacking := number * WIDTH - len(boxes):  # leaves without triangles
+            boxes = np.append(boxes, np.full((lacking, 6), _FAR), axis=0)
+            links = np.append(links, np.full(lacking, -1, np.int32))
+        wide = boxes.reshape(number, WIDTH, 6)
+        level = slice(before, before + number)
+        bounds[level] = wide.swapaxes(1, 2)
+        np.negative(bounds[level, 3:], out=bounds[level, 3:])
+        children[level] = links.reshape(number, WIDTH)
+        boxes, links = wide.min(axis=1), np.arange(before, before + number, dtype=np.int32)
         before += number
-    return np.concatenate(bounds), np.concatenate(children).astype(np.int32)
+    return bounds, children
 
 
 def _in_leaves(centre: np.ndarray) -> np.ndarray:
-    """Triangles in the order of full leaves, as many as a power of two; m for none."""
+    """Triangles in the order of full leaves, as many as a power of two, int32; m for none."""
     m, size = len(centre), LEAF
     while size < m:
         size *= 2
-    which = np.arange(size) * m // size
-    order = np.arange(size)
+    which = (np.arange(size) * m // size).astype(np.int32)
+    order = np.arange(size, dtype=np.int32)
     _halve(centre[which], order)
-    which[1:][np.diff(which) == 0] = m  # a place too many, beside the triangle before
+    which[1:][which[1:] == which[:-1]] = m  # a place too many, beside the triangle before
     return np.asarray(which[order])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _in_order_of_use(faces, order, n_vertices):
+    """Faces in an order, with vertices renumbered as they are first used; old numbers of these.
+
+    A leaf's triangles then lie together in memory.
+    """
+    new_faces = np.empty((order.size, 3), np.int32)
+    new, by_use = np.full(n_vertices, -1, np.int32), np.empty(n_vertices, np.int32)
+    n_used = 0
+    for i in range(order.size):
+        for k in range(3):
+            vertex = faces[order[i], k]
+            if new[vertex] < 0:
+                new[vertex], by_use[n_used] = n_used, vertex
+                n_used += 1
+            new_faces[i, k] = new[vertex]
+    for vertex in range(n_vertices):
+        if new[vertex] < 0:
+            by_use[n_used] = vertex
+            n_used += 1
+    return new_faces, by_use
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -57,13 +57,18 @@ def merge(meshes: Sequence[Mesh]) -> Mesh:
     """All triangles of several meshes of one frame as one mesh, in the order given."""
     corners = [m.origin + f(m.vertices, axis=0) for m in meshes for f in (np.min, np.max)]
     origin = round_centre(np.array(corners))
-    starts = np.cumsum([0, *(len(m.vertices) for m in meshes)])
-    return Mesh(
-        vertices=np.concatenate([m.vertices + (m.origin - origin) for m in meshes]),
-        faces=np.concatenate([m.faces + s for m, s in zip(meshes, starts, strict=False)]),
-        surface=np.concatenate([m.surface for m in meshes]),
-        origin=origin,
-    )
+    if len(meshes) == 1 and np.array_equal(meshes[0].origin, origin):
+        return meshes[0]
+    vertices = np.empty((sum(len(m.vertices) for m in meshes), 3))
+    faces = np.empty((sum(len(m.faces) for m in meshes), 3), np.int32)
+    n_vertices = n_faces = 0
+    for m in meshes:  # copies of all, one after the other, would take twice the memory
+        part = slice(n_faces, n_faces + len(m.faces))
+        np.add(m.faces, n_vertices, out=faces[part])
+        part = slice(n_vertices, n_vertices + len(m.vertices))
+        np.add(m.vertices, m.origin - origin, out=vertices[part])
+        n_vertices, n_faces = n_vertices + len(m.vertices), n_faces + len(m.faces)
+    return Mesh(vertices, faces, np.concatenate([m.surface for m in meshes]), origin)
 
 
 def require_shapes(vertices: np.ndarray, faces: np.ndarray, surface: np.ndarray) -> None:

@@ -60,6 +60,12 @@ class Caster:
         self.meshes = (bodies,) if isinstance(bodies, Mesh) else tuple(bodies)
         self._trees = [build(mesh.vertices, mesh.faces) for mesh in self.meshes]
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the bodies' triangles and trees."""
+        of_meshes = sum(m.vertices.nbytes + m.faces.nbytes + m.surface.nbytes for m in self.meshes)
+        return of_meshes + sum(array.nbytes for tree in self._trees for array in tree)
+
     def bundle(
         self,
         origins: ArrayLike,

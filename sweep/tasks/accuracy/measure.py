@@ -31,7 +31,8 @@ from sweep.tasks.accuracy.rungs import (
     ladder,
     with_fixed,
 )
-from sweep.tasks.progress import Interrupts, Progress, StoreError, TaskError, chosen, working
+from sweep.tasks.interrupts import Interrupts
+from sweep.tasks.progress import Progress, StoreError, TaskError, chosen, working
 from sweep.tasks.studies import ACCURACY, study_of
 from sweep.tasks.study import ArrayLayout, Study, described
 
@@ -95,7 +96,7 @@ def measure(
     store_path = real(store_path)
     _refuse_in_the_way(store_path, overwrite)
     told = chosen(progress)
-    with Interrupts() as interrupts:
+    with Interrupts(told) as interrupts:
         with working("choosing points", told):
             bench = (
                 FlightBench(spec, points)

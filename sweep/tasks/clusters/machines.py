@@ -153,7 +153,7 @@ def start_here(cluster: Local, bounds: Bounds, *, processes: bool) -> Any:
         "n_workers": bounds.least,
         "threads_per_worker": cluster.worker.threads,
         "processes": processes,
-        "memory_limit": _memory(cluster, bounds) if processes else 0,
+        "memory_limit": memory_of_worker(cluster, bounds) if processes else 0,
         "preload": [PRELOAD],
         "security": security_of(cluster),
     }
@@ -192,7 +192,7 @@ def dashboard_link(started: Any) -> str:
     return str(format_dashboard_link(LOOPBACK, started.scheduler_info["services"]["dashboard"]))
 
 
-def _memory(cluster: Local, bounds: Bounds) -> int:
+def memory_of_worker(cluster: Local, bounds: Bounds) -> int:
     """Bytes that a worker may take before Dask restarts it: by default its share of 90 %."""
     from distributed.system import MEMORY_LIMIT
 

@@ -1,9 +1,14 @@
 """The hierarchy against testing every triangle, and its walks against each other."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
+from sweep.model.geometry import bvh
 from sweep.model.geometry.bvh import LEAF, build, nearest
+from sweep.scenes.rasters import BYTES_A_CELL
+from sweep.scenes.terrain import Terrain
 
 
 def soup(rng, n, kind):
@@ -161,3 +166,22 @@ def test_triangles_that_no_plane_can_part_are_still_divided():
         towards = unit(corners[1234].mean(axis=0) - origin)
         distance, _ = walk_alone(tree, origin[None], towards[None])
         assert 0.0 < distance[0] < np.inf
+
+
+@pytest.mark.parametrize("n", [300, 363])
+def test_a_tree_is_built_in_little_memory(n, monkeypatch):
+    """Grids of 4.9e7 heights took 18 GB: 360 bytes a height, where the tree itself has 90 to 120.
+
+    363^2 heights have twice as many triangles, just above a power of two: the emptiest leaves.
+    """
+    monkeypatch.setattr(bvh, "_AT_ONCE", 4096)
+    terrain = Terrain(np.random.default_rng(3).random((n, n)), (1.0, 1.0), np.zeros(3))
+    mesh, _ = terrain.facets().mesh()
+    build(mesh.vertices, mesh.faces)
+    tracemalloc.start()
+    tree = build(mesh.vertices, mesh.faces)
+    peak = tracemalloc.get_traced_memory()[1] / n**2
+    tracemalloc.stop()
+    of_mesh = sum(array.nbytes for array in (mesh.vertices, mesh.faces, mesh.surface)) / n**2
+    assert peak + of_mesh < BYTES_A_CELL
+    assert sum(array.nbytes for array in tree) / n**2 < 125

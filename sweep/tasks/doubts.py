@@ -1,0 +1,63 @@
+"""Warnings of a study before it runs: what can be computed, but is hardly meant.
+
+The command prints them. In Python they are warnings of the category `StudyWarning`.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import warnings
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from sweep.spec import SceneSpec
+from sweep.spec.grid_rules import too_narrow
+from sweep.tasks.coverage import coverage, refuse_blind
+from sweep.tasks.echoes import warnings_of
+from sweep.tasks.eyepoint_study import beneath, world_of
+
+if TYPE_CHECKING:
+    from sweep.spec import Spec
+    from sweep.tasks.flight_study import FlightStudy
+    from sweep.tasks.grid_study import GridStudy
+
+_PACKAGE = os.path.dirname(os.path.dirname(os.path.abspath(__file__))) + os.sep
+
+
+class StudyWarning(UserWarning):
+    """A study that can be computed, but is hardly meant as it is written."""
+
+
+def doubts_of_geometry(spec: Spec | SceneSpec) -> Iterator[str]:
+    """Yield what is doubtful of a study's beam, scene and path.
+
+    SceneError for a flight that sees nothing.
+    """
+    if narrow := too_narrow(spec.parameters_off_axes(), spec.axes):
+        yield narrow
+    if isinstance(spec, SceneSpec):
+        yield from world_of(spec).warnings
+        if path := beneath(spec):
+            yield path
+        refuse_blind(spec)
+        yield from coverage(spec).warnings()
+
+
+def doubts_of_results(study: GridStudy | FlightStudy) -> Iterator[str]:
+    """Yield which echoes arrive too late or are misread, and which effects off matter."""
+    yield from warnings_of(study)
+    if "off" in study.spec.modes().values():
+        from sweep.tasks.plan import effects_table
+
+        yield from effects_table(study, costs=False).warnings()
+
+
+def warn_of_doubts(study: GridStudy | FlightStudy) -> None:
+    """Issue a `StudyWarning` for each doubt, at the line of the caller's program."""
+    level, frame = 1, sys._getframe()
+    while frame.f_back is not None and frame.f_code.co_filename.startswith(_PACKAGE):
+        level, frame = level + 1, frame.f_back
+    for doubts in (doubts_of_geometry(study.spec), doubts_of_results(study)):
+        for doubt in doubts:
+            warnings.warn(doubt, StudyWarning, stacklevel=level)
