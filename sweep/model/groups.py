@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sweep.kernels import njit
-from sweep.model.detection import echo_of, found_pair
+from sweep.model.detection import echo_of, found_pair, speckle_of
 from sweep.model.preparation import Shots
 from sweep.model.segments import Runs, runs_of
 
@@ -56,7 +56,7 @@ def groups(shots: Shots, *, most: int = 4, every_bin: bool = False) -> Groups:
         count, magnitudes = (runs.bins, runs.magnitudes) if shots.band is None else _echoes(runs)
         _find_groups(
             runs.part, (runs.low, count, runs.peak, runs.start), magnitudes, levels,
-            (mirror, shots.echo_rule), bins, neighbours, pd,
+            (mirror, shots.echo_rule, shots.speckle_table), bins, neighbours, pd,
         )  # fmt: skip
         if shots.looks.several:
             seen, middle = bins[BIN][runs.part], neighbours[runs.part][..., 1]
@@ -87,9 +87,10 @@ def _echoes(runs: Runs) -> tuple[np.ndarray, np.ndarray]:
 def _find_groups(part, runs, magnitudes, levels, how, bins, neighbours, pd):
     """Find the groups of every run, into arrays of the shapes of :class:`Groups`.
 
-    ``how``: N/2, or 0 of complex records, and :attr:`sweep.model.preparation.Shots.echo_rule`.
+    ``how``: N/2, or 0 of complex records, :attr:`sweep.model.preparation.Shots.echo_rule`, and
+    :attr:`~sweep.model.preparation.Shots.speckle_table`.
     """
-    (low, count, peak, start), (half, rule) = runs, how
+    (low, count, peak, start), (half, rule, speckle) = runs, how
     for j in range(part.size):
         i = part[j]
         level, deviation = levels[0, i], levels[1, i]
@@ -101,12 +102,12 @@ def _find_groups(part, runs, magnitudes, levels, how, bins, neighbours, pd):
             for g in range(found):
                 k = bins[BIN, i, s, g]
                 first, last = echo_of(
-                    magnitude, bins[FIRST, i, s, g], bins[LAST, i, s, g], level, rule[1]
+                    magnitude, bins[FIRST, i, s, g], bins[LAST, i, s, g], level, rule.beside
                 )
                 echo = np.ones(last - first + 1, np.bool_)
                 pd[i, s, g] = found_pair(
                     magnitude[first : last + 1], echo, k - first, low[s, j] + first, rule,
-                    (deviation, level),
+                    (deviation, level), speckle_of(speckle, s, i),
                 )[0]  # fmt: skip
                 for side in range(3):
                     neighbours[i, s, g, side] = _beside(magnitude, low[s, j], k + side - 1, half)
