@@ -280,6 +280,54 @@ def any_pair(magnitude, echo, low, ends, deviation, level, pairs):
 
 
 @njit(cache=True, error_model="numpy")
+def any_neighbour(chances, count, pairs):
+    """Probability that any of ``count`` adjacent bins crosses, by their own probabilities.
+
+    Bins are a Markov chain as in :func:`any_pair`; those that hardly ever cross count as
+    independent.
+    """
+    found, missed, before, t_before = 0.0, 1.0, -1.0, 0.0
+    for i in range(count):
+        crosses = min(max(chances[i], 0.0), 1.0)
+        stays = 1.0 - crosses
+        if not stays > 0.0:
+            return 1.0
+        if crosses < 1e-4:
+            found, missed, before = found + missed * crosses, missed * stays, -1.0
+            continue
+        t, chance, rest = -_deviate(stays) if stays < crosses else _deviate(crosses), crosses, stays
+        if before > 0.0:
+            joint = 0.0
+            for k in range(pairs.shape[1]):
+                square = t * t + t_before * t_before - 2.0 * t * t_before * pairs[0, k]
+                joint += pairs[1, k] * math.exp(-square * pairs[2, k])
+            joint = min(joint / before, crosses)
+            chance, rest = crosses - joint, stays + joint
+        found += missed * chance
+        missed *= rest
+        before, t_before = stays, t
+    return found
+
+
+@njit(cache=True, error_model="numpy")
+def free_images(magnitude, exempt, low, size, gain):
+    """Let bins raise a false alarm in which images of unequal I and Q stand; return the exempt.
+
+    An image of ``gain`` times the line's |X| stands in the bin of the opposite frequency. Bins are
+    its own where it makes half of |X| and more. ``low`` is the number of the first bin, ``size`` N.
+    """
+    exempted = 0
+    for k in range(magnitude.size):
+        opposite = (-2 * low - k) % size
+        if exempt[k] and opposite < magnitude.size:
+            line = magnitude[opposite]
+            if line > magnitude[k] and gain * line >= 0.5 * magnitude[k]:
+                exempt[k] = False
+        exempted += exempt[k]
+    return exempted
+
+
+@njit(cache=True, error_model="numpy")
 def any_faded(magnitude, echo, low, rule, levels, speckle):
     """Probabilities that any, and that no, bin of an echo in developed speckle crosses.
 

@@ -55,7 +55,7 @@ def groups(shots: Shots, *, most: int = 4, every_bin: bool = False) -> Groups:
     for runs in runs_of(shots, every_bin=every_bin):
         count, magnitudes = (runs.bins, runs.magnitudes) if shots.band is None else _echoes(runs)
         _find_groups(
-            runs.part, (runs.low, count, runs.peak, runs.start), magnitudes, levels,
+            runs.part, (runs.low, count, runs.peak, runs.start), (magnitudes, runs.exempt), levels,
             (mirror, shots.echo_rule, shots.speckle_table), bins, neighbours, pd,
         )  # fmt: skip
         if shots.looks.several:
@@ -84,13 +84,16 @@ def _echoes(runs: Runs) -> tuple[np.ndarray, np.ndarray]:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _find_groups(part, runs, magnitudes, levels, how, bins, neighbours, pd):
+def _find_groups(part, runs, of_bins, levels, how, bins, neighbours, pd):
     """Find the groups of every run, into arrays of the shapes of :class:`Groups`.
 
+    ``of_bins`` are |X| [V] of all runs, and whether bins are of echoes: other groups are leaked
+    signal.
     ``how``: N/2, or 0 of complex records, :attr:`sweep.model.preparation.Shots.echo_rule`, and
     :attr:`~sweep.model.preparation.Shots.speckle_table`.
     """
     (low, count, peak, start), (half, rule, speckle) = runs, how
+    magnitudes, exempts = of_bins
     for j in range(part.size):
         i = part[j]
         level, deviation = levels[0, i], levels[1, i]
@@ -98,7 +101,8 @@ def _find_groups(part, runs, magnitudes, levels, how, bins, neighbours, pd):
             if count[s, j] == 0:
                 continue
             magnitude = magnitudes[start[s, j] : start[s, j] + count[s, j]]
-            found = _list_groups(magnitude, peak[s, j], level, bins[:, i, s])
+            exempt = exempts[start[s, j] : start[s, j] + (count[s, j] if half == 0 else 0)]
+            found = _list_groups(magnitude, exempt, peak[s, j], level, bins[:, i, s])
             for g in range(found):
                 k = bins[BIN, i, s, g]
                 first, last = echo_of(
@@ -125,8 +129,11 @@ def _beside(magnitude, low, k, half):
 
 
 @njit(cache=True, error_model="numpy")
-def _list_groups(magnitude, peak, level, bins):
-    """Strongest groups of a run into bins (3, most), as indices; returns how many there are."""
+def _list_groups(magnitude, exempt, peak, level, bins):
+    """List the strongest groups of a run in bins (3, most), as indices; return their number.
+
+    Groups of bins that are not ``exempt`` are leaked signal; of no size all may be echoes.
+    """
     if not magnitude[peak] >= level:
         bins[:, 0] = peak
         return 1
@@ -139,6 +146,8 @@ def _list_groups(magnitude, peak, level, bins):
         while k < magnitude.size and magnitude[k] >= level:
             best = k if magnitude[k] > magnitude[best] else best
             k += 1
+        if exempt.size > 0 and not exempt[best] and best != peak:
+            continue
         g = found
         while g > 0 and magnitude[bins[BIN, g - 1]] < magnitude[best]:
             g -= 1

@@ -593,10 +593,10 @@ class Shots:
             half = self.fft_size // 2
             if self.real_ends:
                 noise = noise_quadratures(self.window, self.fft_size)
-        if self.detection == "peak_bin":
-            return DetectionRule(self.real_ends, 0, np.empty((3, 0)), fades, half, noise, NO_MODES)
-        lobe = main_lobe(self.window) * self.fft_size / self.window.length
         pairs = alarms.pair_nodes(self.correlation)
+        if self.detection == "peak_bin":
+            return DetectionRule(self.real_ends, 0, pairs, fades, half, noise, NO_MODES)
+        lobe = main_lobe(self.window) * self.fft_size / self.window.length
         modes = NO_MODES if self.fading is None else mode_table(self.window, self.fft_size)
         return DetectionRule(self.real_ends, math.ceil(lobe), pairs, fades, half, noise, modes)
 

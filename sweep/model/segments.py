@@ -15,7 +15,7 @@ import numpy as np
 from sweep.kernels import njit
 from sweep.model import line_shape
 from sweep.model.crossings import MOST_TERMS, crossing_series
-from sweep.model.detection import found_pair, speckle_of
+from sweep.model.detection import any_neighbour, found_pair, free_images, speckle_of
 from sweep.model.effects.circulator_leak import beside_leak
 from sweep.model.effects.line_width import gaussian_shifts
 from sweep.model.ground import different_rows
@@ -45,6 +45,7 @@ from sweep.model.search import cut
 from sweep.model.spectrum import (
     A_IM,
     A_RE,
+    CHANCE,
     COMPLEX,
     FOLDED,
     IMAGED,
@@ -636,6 +637,8 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
                     origin, lines, (level, levels[i]), shift[:, : (1 - sizes[4]) * shift.shape[1]],
                     table[s], form[s], sizes, tangent, room, exempt,
                 )  # fmt: skip
+            if p[16] > 0.0:
+                exempted = free_images(room[OUT, :count], exempt[:count], low, sizes[0], p[16])
             if keep:
                 if at + count > magnitudes.size:
                     return i
@@ -647,6 +650,8 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
             )  # fmt: skip
             if leaks[s] == BIN_BY_BIN:
                 leakage = of_bins(count, noise, p[12], room, exempt, series)
+                if p[16] > 0.0 and rule.pairs.size > 0:
+                    leakage = any_neighbour(room[CHANCE], count, rule.pairs)
             low += sizes[0] * (sizes[7] == COMPLEX)  # never below 0
             numbers[0, s, i], numbers[1, s, i], numbers[2, s, i] = low, count, peak
             numbers[3, s, i] = exempted
