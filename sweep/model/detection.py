@@ -6,7 +6,9 @@ from typing import NamedTuple
 import numpy as np
 
 from sweep.kernels import njit
+from sweep.model.hoyt import ANGLES, COSINES, bin_share, hoyt_pair
 from sweep.model.marcum import marcum_q1, marcum_q1_pair
+from sweep.model.speckle_modes import ModeTable, interpolated, lean_of, modes_of
 
 RAYLEIGH_DEVIATION = math.sqrt(2 - math.pi / 2)
 """Standard deviation of |X| in a noise-only bin, in units of sigma (per quadrature)."""
@@ -34,6 +36,65 @@ def quiet_below(*, chance: np.ndarray, level: np.ndarray, bins: int) -> np.ndarr
     with np.errstate(divide="ignore", over="ignore", under="ignore", invalid="ignore"):
         each = np.where(y > 0, y / np.expm1(y), 1.0)
         return np.minimum(np.sqrt(2 * chance / (bins * math.exp(1 / 8) * each)), 1 / level)
+
+
+class DetectionRule(NamedTuple):
+    """Rule by which the bins of an echo detect it, one for all points."""
+
+    ends: int
+    """N where the noise of bins 0 and N/2 is real, else 0."""
+    beside: int
+    """Half of a main lobe [bins] where any bin of an echo detects; 0 where its largest alone."""
+    pairs: np.ndarray
+    """Rule for pairs of bins, :func:`sweep.model.alarms.pair_nodes`."""
+    fades: float
+    """Correlation of neighbours' noise where echoes are developed speckle, else -1."""
+    half: int
+    """N/2 of a real record whose echoes fade, else 0."""
+    noise_quadratures: np.ndarray
+    """(bins,): pseudo-variance of the noise over its power, by bins from DC or Nyquist."""
+    modes: ModeTable
+    """Modes of echoes that any bin detects."""
+
+
+class BinSpeckle(NamedTuple):
+    """Speckle in the bins of a point's segment."""
+
+    spread: float
+    """Deviation of the footprint's lines [bins of fs/N]."""
+    quadratures: np.ndarray
+    """(bins,): pseudo-variance of the signal over its power, by bins from DC or Nyquist; nothing
+    of an echo that lies elsewhere."""
+
+
+STEADY = BinSpeckle(0.0, np.empty(0))
+"""Of echoes that do not fade, or whose quadratures are alike."""
+
+
+class SpeckleTable(NamedTuple):
+    """Speckle in the bins of all points' segments."""
+
+    spread: np.ndarray
+    """(segments, n): :attr:`BinSpeckle.spread`."""
+    row: np.ndarray
+    """(segments, n) int64: row of ``quadratures``; 0 of echoes far from DC and Nyquist."""
+    quadratures: np.ndarray
+    """(rows, bins)"""
+    factors: np.ndarray
+    """(rows, angles): :attr:`sweep.model.quadratures.SignalQuadratures.factors`."""
+
+    def at(self, segment: int, points: np.ndarray) -> "SpeckleTable":
+        """Speckle of one segment of some points."""
+        spread, row = (values[[segment]][:, points] for values in (self.spread, self.row))
+        return SpeckleTable(spread, row, self.quadratures, self.factors)
+
+
+@njit(cache=True, error_model="numpy")
+def speckle_of(table, segment, i):
+    """:class:`BinSpeckle` of a point's segment, from a :class:`SpeckleTable`."""
+    row = table.row[segment, i]
+    bins = table.quadratures.shape[1] if row > 0 else 0
+    return BinSpeckle(table.spread[segment, i], table.quadratures[row, :bins])
 
 
 class Fading(NamedTuple):
@@ -157,22 +218,27 @@ def crossing_pair(a, b, real):
 
 
 @njit(cache=True, error_model="numpy")
-def found_pair(magnitude, echo, peak, low, rule, levels):
+def found_pair(magnitude, echo, peak, low, rule, levels, speckle):
     """Probabilities that an echo is detected, and that it is missed.
 
     By any of its bins (:func:`any_pair`), or by the peak of a run alone where half of a main lobe
-    is 0. ``rule`` is :attr:`sweep.model.preparation.Shots.echo_rule`; ``levels`` are the noise per
-    quadrature and the threshold.
+    is 0. ``rule`` is a :class:`DetectionRule`, ``speckle`` the :class:`BinSpeckle` of the segment;
+    ``levels`` are the noise per quadrature and the threshold.
     """
-    (ends, beside, pairs, fades), (deviation, level) = rule, levels
-    if fades >= 0.0:
-        if beside > 0:
-            return any_faded(magnitude, echo, beside, (deviation, level), fades)
-        y = level * level / (2.0 * deviation * deviation + magnitude[peak] * magnitude[peak])
-        return math.exp(-y), -math.expm1(-y)
-    if beside > 0:
-        return any_pair(magnitude, echo, low, ends, deviation, level, pairs)
-    real = is_end(low + peak, ends)
+    deviation, level = levels
+    if rule.fades >= 0.0:
+        if rule.beside > 0:
+            return any_faded(magnitude, echo, low, rule, levels, speckle)
+        signal, noise = magnitude[peak] * magnitude[peak], 2.0 * deviation * deviation
+        share = 0.0
+        if speckle.quadratures.size > 0:
+            share = signal * bin_share(low + peak, rule.half, speckle.quadratures)
+            share += noise * bin_share(low + peak, rule.half, rule.noise_quadratures)
+            share /= signal + noise
+        return hoyt_pair(signal + noise, share, level)
+    if rule.beside > 0:
+        return any_pair(magnitude, echo, low, rule.ends, deviation, level, rule.pairs)
+    real = is_end(low + peak, rule.ends)
     return crossing_pair(magnitude[peak] / deviation, level / deviation, real)
 
 
@@ -214,64 +280,215 @@ def any_pair(magnitude, echo, low, ends, deviation, level, pairs):
 
 
 @njit(cache=True, error_model="numpy")
-def any_faded(magnitude, echo, beside, levels, correlation):
-    """Probabilities that any, and that no, bin of an echo in developed speckle crosses.
+def any_neighbour(chances, count, pairs):
+    """Probability that any of ``count`` adjacent bins crosses, by their own probabilities.
 
-    Signal and noise of a bin are circular complex Gaussian. It crosses with Swerling's first
-    probability, exp(-Th^2 / (2 sigma^2 (1 + SNR))), and neighbours as two correlated Rayleigh
-    magnitudes; bins are a Markov chain of first order. ``correlation`` is that of neighbours'
-    noise. Their signals have 1 where one line makes them, and that of noise where many far apart
-    do. Between, for Gaussian windows and echoes of variance v [bins^2], ln m = ln rho (1 - v_1/v)
-    with v_1 = 1 / (-8 ln rho) of one line. The variance is that of bins of half the largest
-    magnitude with half of a main lobe (``beside``) on either side: sidelobes of one line, which may
-    cross too, fade with it. It is within 0.02 of drawn echoes of any width; for rectangular
-    windows, of lone lines within 0.005, of wider echoes up to 0.1 too low.
+    Bins are a Markov chain as in :func:`any_pair`; those that hardly ever cross count as
+    independent.
     """
-    deviation, level = levels
-    whole, mean, square, largest = 0.0, 0.0, 0.0, 0.0
-    for i in range(magnitude.size):
-        largest = max(largest, magnitude[i] if echo[i] else 0.0)
-    first, last = 0, magnitude.size - 1
-    while first < last and not (echo[first] and magnitude[first] >= 0.5 * largest):
-        first += 1
-    while last > first and not (echo[last] and magnitude[last] >= 0.5 * largest):
-        last -= 1
-    first, last = max(first - beside, 0), min(last + beside, magnitude.size - 1)
-    for i in range(first, last + 1):
-        if echo[i]:
-            power = magnitude[i] * magnitude[i]
-            whole, mean = whole + power, mean + power * i
-    mean /= max(whole, 1e-300)
-    for i in range(first, last + 1):
-        if echo[i]:
-            square += magnitude[i] * magnitude[i] * (i - mean) * (i - mean)
-    rho = max(correlation, 0.05)
-    line = max(-1.1 / (8.0 * math.log(rho)), 0.25 if correlation > 0.1 else 0.5)
-    together = rho ** max(1.0 - line * whole / max(square, 1e-300), 0.0)
-    noise = 2.0 * deviation * deviation
-    found, missed, before, least_before, share_before = 0.0, 1.0, -1.0, 0.0, 0.0
-    for i in range(magnitude.size):
-        if not echo[i]:
-            before = -1.0
+    found, missed, before, t_before = 0.0, 1.0, -1.0, 0.0
+    for i in range(count):
+        crosses = min(max(chances[i], 0.0), 1.0)
+        stays = 1.0 - crosses
+        if not stays > 0.0:
+            return 1.0
+        if crosses < 1e-4:
+            found, missed, before = found + missed * crosses, missed * stays, -1.0
             continue
-        power = magnitude[i] * magnitude[i] + noise
-        least, share = level * level / power, 1.0 - noise / power
-        crosses, stays = math.exp(-least), -math.expm1(-least)
-        chance, rest = crosses, stays
+        t, chance, rest = -_deviate(stays) if stays < crosses else _deviate(crosses), crosses, stays
         if before > 0.0:
-            alike = together * math.sqrt(share * share_before)
-            alike += correlation * math.sqrt((1.0 - share) * (1.0 - share_before))
-            r = min(alike * alike, 1.0 - 1e-9)
-            scale = math.sqrt(2.0 / (1.0 - r))
-            x, y, root = scale * math.sqrt(least), scale * math.sqrt(least_before), math.sqrt(r)
-            # Both cross: e^-A (1 - Q_1(y, root x)) + e^-B Q_1(root y, x); this bin alone does not.
-            joint = crosses * marcum_q1_pair(y, root * x)[1]
-            joint += math.exp(-least_before) * marcum_q1_pair(root * y, x)[0]
-            chance = min(max((crosses - joint) / before, 0.0), 1.0)
-            rest = 1.0 - chance
+            joint = 0.0
+            for k in range(pairs.shape[1]):
+                square = t * t + t_before * t_before - 2.0 * t * t_before * pairs[0, k]
+                joint += pairs[1, k] * math.exp(-square * pairs[2, k])
+            joint = min(joint / before, crosses)
+            chance, rest = crosses - joint, stays + joint
         found += missed * chance
         missed *= rest
-        before, least_before, share_before = stays, least, share
+        before, t_before = stays, t
+    return found
+
+
+@njit(cache=True, error_model="numpy")
+def free_images(magnitude, exempt, low, size, gain):
+    """Let bins raise a false alarm in which images of unequal I and Q stand; return the exempt.
+
+    An image of ``gain`` times the line's |X| stands in the bin of the opposite frequency. Bins are
+    its own where it makes half of |X| and more. ``low`` is the number of the first bin, ``size`` N.
+    """
+    exempted = 0
+    for k in range(magnitude.size):
+        opposite = (-2 * low - k) % size
+        if exempt[k] and opposite < magnitude.size:
+            line = magnitude[opposite]
+            if line > magnitude[k] and gain * line >= 0.5 * magnitude[k]:
+                exempt[k] = False
+        exempted += exempt[k]
+    return exempted
+
+
+@njit(cache=True, error_model="numpy")
+def any_faded(magnitude, echo, low, rule, levels, speckle):
+    """Probabilities that any, and that no, bin of an echo in developed speckle crosses.
+
+    Signal and noise of a bin are complex Gaussian. The strongest mode of the echo's lines
+    (:mod:`sweep.model.speckle_modes`) is one number z for all bins, of exponential |z|^2: the
+    probability is the mean over it of that given z. There bins have a steady signal u_k z, and the
+    echo's other modes are noise to them, with a variance and a correlation of their own. Of a line
+    all power is in the mode, and the sidelobes of one that cross too fade with it. Near DC and
+    Nyquist the mode's power goes with the phase of z as (1 + q_k cos t), q_k the pseudo-variance of
+    bin k over its power, t uniform (:mod:`sweep.model.quadratures`).
+
+    Stretches of bins of half the largest magnitude are echoes by themselves; weaker stretches
+    belong to the one below. It is within 0.016 of drawn echoes of any width and window.
+    """
+    largest = 0.0
+    for i in range(magnitude.size):
+        largest = max(largest, magnitude[i] if echo[i] else 0.0)
+    found, missed, begin, i, parts = 0.0, 1.0, 0, 0, 0
+    while i < magnitude.size:
+        start, strong = i, False
+        while i < magnitude.size and echo[i]:
+            strong |= magnitude[i] >= 0.5 * largest
+            i += 1
+        if strong:
+            if parts > 0:
+                one = _stretch_faded(magnitude, echo, (begin, start), low, rule, levels, speckle)
+                found, missed, begin = found + missed * one[0], missed * one[1], start
+            parts += 1
+        i += 1
+    end = magnitude.size
+    one = _stretch_faded(magnitude, echo, (begin, end), low, rule, levels, speckle)
+    return found + missed * one[0], missed * one[1]
+
+
+_ORDER = 10
+_REACH = 4.5
+_Z_MAX = 6.0
+_RARE = 1e-6
+_NODE, _WEIGHT = np.polynomial.legendre.leggauss(_ORDER)
+_PAIR_NODE, _PAIR_WEIGHT = np.polynomial.legendre.leggauss(4)
+
+
+@njit(cache=True, error_model="numpy")
+def _stretch_faded(magnitude, echo, bounds, low, rule, levels, speckle):
+    """:func:`any_faded` of the bins from ``bounds[0]`` to before ``bounds[1]``, one echo."""
+    begin, end = bounds
+    nearest = begin
+    for i in range(begin, end):
+        if echo[i] and not (echo[nearest] and magnitude[i] <= magnitude[nearest]):
+            nearest = i
+    below = magnitude[nearest - 1] if nearest > 0 else 0.0
+    above = magnitude[nearest + 1] if nearest + 1 < magnitude.size else 0.0
+    if rule.half > 0 and (low + nearest == 0 or low + nearest == rule.half):
+        below = above = max(below, above)  # bins mirror there
+    lean = lean_of(below, magnitude[nearest], above)
+    at, modes = modes_of(rule.modes, speckle.spread, lean), rule.modes
+    noise = 2.0 * levels[0] * levels[0]
+    # Over the noise per quadrature that the other modes make with the receiver's: the strongest
+    # mode, the threshold; and the correlation of this noise with that of the bin below.
+    steady, bins = np.empty((5, end - begin)), end - begin
+    share_before = 0.0
+    for k in range(bins):
+        i = begin + k
+        power = magnitude[i] * magnitude[i]
+        share = interpolated(modes.share, at, i - nearest)
+        other = (1.0 - share) * power + noise
+        scale = math.sqrt(2.0 / other)
+        steady[0, k], steady[1, k] = scale * math.sqrt(share * power), scale * levels[1]
+        steady[2, k] = 0.0
+        if k > 0 and echo[i] and echo[i - 1]:
+            alike = interpolated(modes.coherence, at, i - nearest)
+            own = (abs(alike) - math.sqrt(share * share_before)) * magnitude[i] * magnitude[i - 1]
+            own += noise * math.copysign(rule.fades, alike)
+            steady[2, k] = min(max(0.5 * own * scale * steady[3, k - 1], -0.999), 0.999)
+        steady[3, k], steady[4, k], share_before = scale, share, share
+    if speckle.quadratures.size == 0:
+        return _mean_over_mode(steady, echo[begin:end], low + begin, rule.ends)
+    found, missed = 0.0, 0.0
+    turned = steady.copy()
+    for angle in range(ANGLES):
+        cosine = COSINES[angle]
+        for k in range(bins):
+            bin_ = low + begin + k
+            factor = max(1.0 + bin_share(bin_, rule.half, speckle.quadratures) * cosine, 0.0)
+            turned[0, k] = steady[0, k] * math.sqrt(factor)
+            if bin_ != 0 and bin_ != rule.half:  # else the others are real noise
+                others = factor * (1.0 - steady[4, k]) * magnitude[begin + k] ** 2
+                scale = math.sqrt(2.0 / (others + noise)) / steady[3, k]
+                turned[0, k] *= scale
+                turned[1, k] = steady[1, k] * scale
+        one = _mean_over_mode(turned, echo[begin:end], low + begin, rule.ends)
+        found, missed = found + one[0] / ANGLES, missed + one[1] / ANGLES
+    return found, missed
+
+
+@njit(cache=True, error_model="numpy")
+def _mean_over_mode(steady, echo, low, ends):
+    """Probabilities that any, and that no, bin crosses, over a signal that fades in all alike.
+
+    ``steady`` (3, bins): the signal's root mean square over the noise, the threshold over the
+    noise, and the correlation of the noise with that of the bin below.
+    """
+    first, last = _Z_MAX, _Z_MAX
+    for k in range(echo.size):
+        if echo[k] and steady[0, k] > 0.0:
+            first = min(first, max(steady[1, k] - _REACH, 0.0) / steady[0, k])
+            last = min(last, (steady[1, k] + _REACH) / steady[0, k])
+    found, missed = math.exp(-last * last), 0.0
+    if first > 0.0:
+        weight = -math.expm1(-first * first)
+        one = _any_steady(steady, 0.6 * first, echo, low, ends)
+        found, missed = found + weight * one[0], weight * one[1]
+    half = 0.5 * (last - first)
+    for j in range(_ORDER if half > 0.0 else 0):
+        z = first + half * (_NODE[j] + 1.0)
+        weight = half * _WEIGHT[j] * 2.0 * z * math.exp(-z * z)
+        one = _any_steady(steady, z, echo, low, ends)
+        found, missed = found + weight * one[0], missed + weight * one[1]
+    whole = found + missed  # 1 but for the quadrature
+    return found / whole, missed / whole
+
+
+@njit(cache=True, error_model="numpy")
+def _any_steady(steady, z, echo, low, ends):
+    """Probabilities that any, and that no, bin crosses, at a factor z on the signal.
+
+    As :func:`any_pair`, with noise of its own in each pair of bins. Of the correlation r of two
+    bins' noise their powers have
+
+        (r^2 + r a b) / sqrt((1 + a^2) (1 + b^2)),
+
+    a and b their signals over the noise: r^2 of noise alone, r of strong signals.
+    """
+    found, missed, before, t_before, a_before = 0.0, 1.0, -1.0, 0.0, 0.0
+    for k in range(echo.size):
+        if not echo[k]:
+            before = -1.0
+            continue
+        a = steady[0, k] * z
+        crosses, stays = crossing_pair(a, steady[1, k], is_end(low + k, ends))
+        if not stays > 0.0:
+            return 1.0, 0.0
+        if crosses < _RARE:  # so is that both of a pair cross
+            found, missed, before = found + missed * crosses, missed * stays, -1.0
+            continue
+        t = _deviate(crosses) if crosses < stays else -_deviate(stays)
+        chance, rest = crosses, stays
+        r = steady[2, k]
+        if before > 0.0 and r != 0.0:
+            r = (r * r + r * a * a_before) / math.sqrt((1.0 + a * a) * (1.0 + a_before * a_before))
+            joint, half = 0.0, 0.5 * math.asin(r)
+            for j in range(_PAIR_NODE.size):
+                sine = math.sin(half * (_PAIR_NODE[j] + 1.0))
+                square = t * t + t_before * t_before - 2.0 * t * t_before * sine
+                joint += _PAIR_WEIGHT[j] * math.exp(-square / (2.0 * (1.0 - sine * sine)))
+            joint *= half / (2.0 * math.pi)
+            joint = max(min(joint / before, crosses), -stays)
+            chance, rest = crosses - joint, stays + joint
+        found += missed * chance
+        missed *= rest
+        before, t_before, a_before = stays, t, a
     return (found if found < 0.5 else 1.0 - missed), missed
 
 
@@ -326,11 +543,12 @@ def _exempt(first, last, count, exempt):
 
 
 @njit(cache=True, error_model="numpy")
-def detect_rows(magnitude, first, bins, rule, deviation, level, out):
+def detect_rows(magnitude, first, bins, rule, deviation, level, speckle, out):
     """Detect in runs of spectra without noise, (m, count), into ``out`` (6, m).
 
     Its rows are those of :data:`sweep.model.segments.SEGMENT_FIELDS`; no leakage. ``bins`` are the
     last bin of the spectrum and the bin width [Hz]; bins outside 0..N/2 are passed over.
+    ``speckle`` is a :class:`SpeckleTable`, (1, m).
     """
     half, width = bins
     exempt = np.empty(magnitude.shape[1], np.bool_)
@@ -338,10 +556,11 @@ def detect_rows(magnitude, first, bins, rule, deviation, level, out):
         low = max(-first[i], 0)
         high = min(half + 1 - first[i], magnitude.shape[1])
         run = magnitude[i, low:high]
-        peak, exempted = mark(run, run.size, level[i], exempt, rule[1])
+        peak, exempted = mark(run, run.size, level[i], exempt, rule.beside)
         found, missed = found_pair(
-            run, exempt[: run.size], peak, first[i] + low, rule, (deviation[i], level[i])
-        )
+            run, exempt[: run.size], peak, first[i] + low, rule, (deviation[i], level[i]),
+            speckle_of(speckle, 0, i),
+        )  # fmt: skip
         out[0, i], out[1, i], out[2, i] = found, missed, run[peak]
         out[3, i] = (first[i] + low + peak) * width
         out[4, i], out[5, i] = exempted, 0.0

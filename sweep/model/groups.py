@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sweep.kernels import njit
-from sweep.model.detection import echo_of, found_pair
+from sweep.model.detection import echo_of, found_pair, speckle_of
 from sweep.model.preparation import Shots
 from sweep.model.segments import Runs, runs_of
 
@@ -55,8 +55,8 @@ def groups(shots: Shots, *, most: int = 4, every_bin: bool = False) -> Groups:
     for runs in runs_of(shots, every_bin=every_bin):
         count, magnitudes = (runs.bins, runs.magnitudes) if shots.band is None else _echoes(runs)
         _find_groups(
-            runs.part, (runs.low, count, runs.peak, runs.start), magnitudes, levels,
-            (mirror, shots.echo_rule), bins, neighbours, pd,
+            runs.part, (runs.low, count, runs.peak, runs.start), (magnitudes, runs.exempt), levels,
+            (mirror, shots.echo_rule, shots.speckle_table), bins, neighbours, pd,
         )  # fmt: skip
         if shots.looks.several:
             seen, middle = bins[BIN][runs.part], neighbours[runs.part][..., 1]
@@ -84,12 +84,16 @@ def _echoes(runs: Runs) -> tuple[np.ndarray, np.ndarray]:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _find_groups(part, runs, magnitudes, levels, how, bins, neighbours, pd):
+def _find_groups(part, runs, of_bins, levels, how, bins, neighbours, pd):
     """Find the groups of every run, into arrays of the shapes of :class:`Groups`.
 
-    ``how``: N/2, or 0 of complex records, and :attr:`sweep.model.preparation.Shots.echo_rule`.
+    ``of_bins`` are |X| [V] of all runs, and whether bins are of echoes: other groups are leaked
+    signal.
+    ``how``: N/2, or 0 of complex records, :attr:`sweep.model.preparation.Shots.echo_rule`, and
+    :attr:`~sweep.model.preparation.Shots.speckle_table`.
     """
-    (low, count, peak, start), (half, rule) = runs, how
+    (low, count, peak, start), (half, rule, speckle) = runs, how
+    magnitudes, exempts = of_bins
     for j in range(part.size):
         i = part[j]
         level, deviation = levels[0, i], levels[1, i]
@@ -97,16 +101,17 @@ def _find_groups(part, runs, magnitudes, levels, how, bins, neighbours, pd):
             if count[s, j] == 0:
                 continue
             magnitude = magnitudes[start[s, j] : start[s, j] + count[s, j]]
-            found = _list_groups(magnitude, peak[s, j], level, bins[:, i, s])
+            exempt = exempts[start[s, j] : start[s, j] + (count[s, j] if half == 0 else 0)]
+            found = _list_groups(magnitude, exempt, peak[s, j], level, bins[:, i, s])
             for g in range(found):
                 k = bins[BIN, i, s, g]
                 first, last = echo_of(
-                    magnitude, bins[FIRST, i, s, g], bins[LAST, i, s, g], level, rule[1]
+                    magnitude, bins[FIRST, i, s, g], bins[LAST, i, s, g], level, rule.beside
                 )
                 echo = np.ones(last - first + 1, np.bool_)
                 pd[i, s, g] = found_pair(
                     magnitude[first : last + 1], echo, k - first, low[s, j] + first, rule,
-                    (deviation, level),
+                    (deviation, level), speckle_of(speckle, s, i),
                 )[0]  # fmt: skip
                 for side in range(3):
                     neighbours[i, s, g, side] = _beside(magnitude, low[s, j], k + side - 1, half)
@@ -124,8 +129,11 @@ def _beside(magnitude, low, k, half):
 
 
 @njit(cache=True, error_model="numpy")
-def _list_groups(magnitude, peak, level, bins):
-    """Strongest groups of a run into bins (3, most), as indices; returns how many there are."""
+def _list_groups(magnitude, exempt, peak, level, bins):
+    """List the strongest groups of a run in bins (3, most), as indices; return their number.
+
+    Groups of bins that are not ``exempt`` are leaked signal; of no size all may be echoes.
+    """
     if not magnitude[peak] >= level:
         bins[:, 0] = peak
         return 1
@@ -138,6 +146,8 @@ def _list_groups(magnitude, peak, level, bins):
         while k < magnitude.size and magnitude[k] >= level:
             best = k if magnitude[k] > magnitude[best] else best
             k += 1
+        if exempt.size > 0 and not exempt[best] and best != peak:
+            continue
         g = found
         while g > 0 and magnitude[bins[BIN, g - 1]] < magnitude[best]:
             g -= 1

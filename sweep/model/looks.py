@@ -122,7 +122,7 @@ class Looks(NamedTuple):
                 near, far = 0.5 * (level - signal), 0.5 * (level + signal)
                 found = np.where(real, 0.5 * (special.erfc(near) + special.erfc(far)), found)
                 missed = np.where(real, 0.5 * (special.erfc(-near) - special.erfc(far)), missed)
-            return self._votes(found, missed) if self.several else (found, missed)
+            return self.votes_of(found, missed) if self.several else (found, missed)
         from scipy import stats  # which takes a second, and one look has no need of
 
         a, b = (math.sqrt(self.number) * np.asarray(v, float) for v in (signal, level))
@@ -143,13 +143,13 @@ class Looks(NamedTuple):
         y = np.square(level) / (2 + np.square(signal))
         if not self.several or (self.combine == BINARY and self.independent):
             found, missed = np.exp(-y), -np.expm1(-y)
-            return self._votes(found, missed) if self.several else (found, missed)
+            return self.votes_of(found, missed) if self.several else (found, missed)
         if self.independent:
             return special.gammaincc(self.number, self.number * y), special.gammainc(
                 self.number, self.number * y
             )
         if self.combine == BINARY:
-            speckle, weight = self._speckle(level, signal)
+            speckle, weight = self.speckle_nodes(level, signal)
             each = self.steady(signal[..., None] * speckle, level[..., None])
             found, missed = (np.minimum((v * weight).sum(axis=-1), 1.0) for v in each)
             return found, missed
@@ -188,7 +188,7 @@ class Looks(NamedTuple):
         a, b = (np.where(there, v, 0.0) for v in (one, other))
         p, q = self.faded(a, level)[0], self.faded(b, level)[0]
         if not self.independent:
-            speckle, weight = self._speckle(level, a, b)
+            speckle, weight = self.speckle_nodes(level, a, b)
             each = [self.steady(v[..., None] * speckle, level[..., None])[0] for v in (a, b)]
             whole = (each[0] * each[1] * weight).sum(axis=-1)
             with np.errstate(divide="ignore", invalid="ignore"):
@@ -331,12 +331,14 @@ class Looks(NamedTuple):
             quiet = np.sqrt(chance / (bins * math.exp(1 / 8) * least.reshape(np.shape(level))))
         return np.asarray(np.minimum(quiet, 1 / (self.number * level)))
 
-    def _votes(self, crosses: np.ndarray, stays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def votes_of(self, crosses: np.ndarray, stays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Probabilities that enough records cross, and that they do not."""
         enough, rest = self.votes, self.number - self.votes + 1
         return special.betainc(enough, rest, crosses), special.betainc(rest, enough, stays)
 
-    def _speckle(self, level: np.ndarray, *signals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def speckle_nodes(
+        self, level: np.ndarray, *signals: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Magnitudes of speckle (..., k), of mean power 1, and weights; close about thresholds."""
         square, most = np.square(level), np.full(level.shape, 7.0)
         ends = [0 * most, most]

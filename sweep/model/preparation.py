@@ -28,7 +28,7 @@ from sweep.model.waveform import Segment
 from sweep.model.window import Window, canonical_name, window
 
 if TYPE_CHECKING:
-    from sweep.model.detection import Fading
+    from sweep.model.detection import DetectionRule, Fading, SpeckleTable
 
 Parameters = Mapping[str, float | int | str | np.ndarray]
 
@@ -190,6 +190,8 @@ class Shots:
     """Amplitude at the negative frequency that I and Q leave of a line's, 0..1, (n,)."""
     fading: "Fading | None" = None
     """Of echoes in developed speckle."""
+    line_spread: np.ndarray | float = 0.0
+    """(segments, n): deviation of the lines of an echo in developed speckle [bins of fs/N]."""
     leak_amplitude: np.ndarray | None = None
     """Amplitude of the leaked light's beat [V], (n,) or scalar; None without one."""
     leak_delay: np.ndarray | float = 0.0
@@ -290,12 +292,16 @@ class Shots:
         little over an echo and is taken on the beam's axis. The noise that the ADC adds is white
         before.
         """
-        beats = (
+        return in_rows([self.whitened(beat) for beat in self.beats], (self.size,))
+
+    @property
+    def beats(self) -> tuple[np.ndarray, ...]:
+        """Beat frequency [Hz] of the line on the beam's axis, by segment, signed."""
+        return tuple(
             s.carrier * s.beta
             - s.chirp_rate * ((2 / SPEED_OF_LIGHT) * (self.range - s.nearer) * (1 + s.beta))
             for s in self.waveform
         )
-        return in_rows([self.whitened(beat) for beat in beats], (self.size,))
 
     def whitened(self, beat: np.ndarray, at: np.ndarray | None = None) -> np.ndarray:
         """Gain of a line at a beat [Hz], (n,), in a spectrum whose noise is white.
@@ -367,6 +373,7 @@ class Shots:
     ) -> np.ndarray:
         """Probability that up and down segment are detected, by their own and |X| [V]; (..., n)."""
         from sweep.model import detection
+        from sweep.model.quadratures import mean_over_angles
 
         if self.fading is None:
             return up * down
@@ -374,8 +381,26 @@ class Shots:
         if self.looks.several:
             one, other = (magnitude / self.line_deviation for magnitude in magnitudes)
             both = self.looks.faded_together(one, other, level, alike)
+            if self.speckle_table.row[[0, 2]].any():  # of the same share of what can be in common
+                p, q = (self.looks.faded(signal, level)[0] for signal in (one, other))
+                with np.errstate(divide="ignore", invalid="ignore"):
+                    part = (both - p * q) / (np.minimum(p, q) - p * q)
+                part = np.clip(np.nan_to_num(part), 0.0, 1.0)
+                at_ends = self.speckle_table.row[[0, 2]].any(axis=0)
+                both = np.where(
+                    at_ends, up * down + part * (np.minimum(up, down) - up * down), both
+                )
         else:
             both = detection.fading_together(up, down, level, alike)
+            speckle, rows = self.speckle_table, self.speckle_table.row[[0, 2]]
+            near = np.flatnonzero(rows.any(axis=0))
+            if near.size:
+                level, alike = (np.broadcast_to(v, self.size)[near] for v in (level, alike))
+                (both[..., near],) = mean_over_angles(
+                    speckle.factors[rows[:, near]],
+                    (up[..., near], down[..., near]),
+                    lambda up, down: (detection.fading_together(up, down, level, alike),),
+                )
         return both if self.band is None else np.where((up == 0) | (down == 0), 0.0, both)
 
     @property
@@ -394,11 +419,30 @@ class Shots:
         deviation, level = (np.broadcast_to(v, self.size)[points] for v in levels)
         signal = np.where(there, magnitude, 0.0) / deviation
         if self.fading is not None:
-            both = self.looks.faded(signal, level / deviation)
+            both = self._faded(signal, level / deviation, bins, points)
         else:
             ends = np.isin(bins, (0, self.real_ends // 2)) & (self.real_ends > 0)
             both = self.looks.steady(signal, level / deviation, ends)
         found, missed = (np.where(there, chance, np.nan) for chance in both)
+        return found, missed
+
+    def _faded(
+        self, signal: np.ndarray, level: np.ndarray, bins: np.ndarray, points: np.ndarray | slice
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Compute :meth:`detected` in developed speckle, by signal and threshold over the noise."""
+        from sweep.model.quadratures import faded_looks
+
+        found, missed = self.looks.faded(signal, level)
+        rule, speckle = self.echo_rule, self.speckle_table
+        row, half = np.broadcast_to(speckle.row[:, points], signal.shape), self.fft_size // 2
+        k = np.minimum(bins, half - bins)
+        near = (row > 0) & (k >= 0) & (k < speckle.quadratures.shape[1])
+        if near.any():
+            share = speckle.quadratures[row[near], k[near]]
+            noise = rule.noise_quadratures[k[near]] if rule.ends else np.zeros(share.size)
+            levels = np.broadcast_to(level, signal.shape)[near]
+            found, missed = found.copy(), missed.copy()
+            found[near], missed[near] = faded_looks(self.looks, signal[near], levels, share, noise)
         return found, missed
 
     def _deviation(self, variance: np.ndarray) -> np.ndarray:
@@ -537,18 +581,39 @@ class Shots:
         return alarms.neighbour_correlation(self.window, self.fft_size)
 
     @property
-    def echo_rule(self) -> tuple[int, int, np.ndarray, float]:
-        """Of detection: :attr:`real_ends`; half of a main lobe [bins]; rule for pairs of bins.
+    def echo_rule(self) -> "DetectionRule":
+        """Return the rule of detection of one record's bins."""
+        from sweep.model.detection import DetectionRule
+        from sweep.model.quadratures import noise_quadratures
+        from sweep.model.speckle_modes import NO_MODES, mode_table
 
-        0 and nothing where the largest bin alone detects. At the end the correlation of neighbours'
-        noise where echoes fade, else -1.
-        """
         fades = -1.0 if self.fading is None else self.correlation
-        if self.detection == "peak_bin":
-            return self.real_ends, 0, np.empty((3, 0)), fades
-        lobe = main_lobe(self.window) * self.fft_size / self.window.length
+        noise, half = np.empty(0), 0
+        if self.fading is not None and not self.complex_record:
+            half = self.fft_size // 2
+            if self.real_ends:
+                noise = noise_quadratures(self.window, self.fft_size)
         pairs = alarms.pair_nodes(self.correlation)
-        return self.real_ends, math.ceil(lobe), pairs, fades
+        if self.detection == "peak_bin":
+            return DetectionRule(self.real_ends, 0, pairs, fades, half, noise, NO_MODES)
+        lobe = main_lobe(self.window) * self.fft_size / self.window.length
+        modes = NO_MODES if self.fading is None else mode_table(self.window, self.fft_size)
+        return DetectionRule(self.real_ends, math.ceil(lobe), pairs, fades, half, noise, modes)
+
+    @cached_property
+    def speckle_table(self) -> "SpeckleTable":
+        """Speckle in the bins of each segment."""
+        from sweep.model.detection import SpeckleTable
+        from sweep.model.quadratures import signal_quadratures
+
+        shape = (len(self.waveform), self.size)
+        spread = np.ascontiguousarray(np.broadcast_to(self.line_spread, shape), float)
+        # Without images bins near DC and Nyquist hold half of the echo, and no real number.
+        if self.fading is None or self.complex_record or not self.image:
+            return SpeckleTable(
+                spread, np.zeros(shape, np.int64), np.zeros((1, 0)), np.ones((1, 1))
+            )
+        return SpeckleTable(spread, *signal_quadratures(self))
 
     def searched_bins(
         self, exempted: np.ndarray, points: np.ndarray | slice = slice(None)

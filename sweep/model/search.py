@@ -7,7 +7,7 @@ import numpy as np
 
 from sweep.kernels import njit
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.detection import echo_of, found_pair
+from sweep.model.detection import echo_of, found_pair, speckle_of
 from sweep.model.marcum import excess_crossing
 
 
@@ -32,7 +32,11 @@ def cut(shots: Any, runs: Any) -> Any:
     levels = np.array([np.broadcast_to(column, shots.size)[part] for column in each])
     leaks = np.array([shots.leakage and each.leaks for each in shots.waveform])
     where = band, period, lines, inside
-    _cut(numbers, where, levels, (shots.echo_rule, leaks), runs.magnitudes, runs.exempt, chances)
+    speckle = part, shots.speckle_table
+    _cut(
+        numbers, where, levels, (shots.echo_rule, leaks), speckle, runs.magnitudes, runs.exempt,
+        chances,
+    )  # fmt: skip
     low, count, peak, exempted, start = numbers
     return runs._replace(
         low=low, bins=count, peak=peak, exempted=exempted, start=start, pd=chances[0],
@@ -40,25 +44,43 @@ def cut(shots: Any, runs: Any) -> Any:
     )  # fmt: skip
 
 
-def beamlet_lines(shots: Any) -> np.ndarray:
-    """Places of each beamlet's line in the three spectra [bins, 0..N/2], (n, 3, beamlets).
+def beamlet_lines(shots: Any, points: np.ndarray | slice = slice(None)) -> np.ndarray:
+    """Places of each beamlet's line in the three spectra [bins, 0..N/2], (m, 3, beamlets).
 
     In spectra of complex records -N/2 .. N/2. Lines that drift within the record, by range walk and
     acceleration, lie where they are at its middle.
     """
-    per_metre = columns(shots, shots.chirp_rate) * (2 / SPEED_OF_LIGHT)  # as a beat [Hz]
-    distance = per_metre * columns(shots, shots.range), 1 + shots.offset[shots.row]
-    own = shots.doppler[shots.row]
-    lines = np.empty((shots.size, 3, own.shape[1]))
+
+    def column(values: np.ndarray | float) -> np.ndarray:
+        return columns(shots, values)[points]
+
+    per_metre = column(shots.chirp_rate) * (2 / SPEED_OF_LIGHT)  # as a beat [Hz]
+    distance = per_metre * column(shots.range), 1 + shots.offset[shots.row[points]]
+    own = shots.doppler[shots.row[points]]
+    lines = np.empty((own.shape[0], 3, own.shape[1]))
     for s, each in enumerate(shots.waveform):
-        beta = columns(shots, each.beta) + own
-        drifted = SPEED_OF_LIGHT / 2 * own * columns(shots, each.start)
-        far = distance[0] * distance[1] - per_metre * (columns(shots, each.nearer) + drifted)
-        beat = columns(shots, each.carrier) * beta - each.slope * far * (1 + beta)
-        beat += columns(shots, shots.drifts[s])
-        turns = beat / columns(shots, shots.sample_rate)
-        lines[:, s] = (turns - np.floor(turns + 0.5)) * shots.fft_size
-    return lines if shots.complex_record else abs(lines)
+        beta = column(each.beta) + own
+        drifted = SPEED_OF_LIGHT / 2 * own * column(each.start)
+        far = distance[0] * distance[1] - per_metre * (column(each.nearer) + drifted)
+        beat = column(each.carrier) * beta - each.slope * far * (1 + beta)
+        beat += column(shots.drifts[s])
+        lines[:, s] = _folded(shots, beat / column(shots.sample_rate))
+    return lines
+
+
+def centre_lines(shots: Any) -> np.ndarray:
+    """Places of the lines on the beam's axis, as of :func:`beamlet_lines`, (segments, n)."""
+    turns = [
+        (beat + drift) / shots.sample_rate
+        for beat, drift in zip(shots.beats, shots.drifts, strict=True)
+    ]
+    return np.array([np.broadcast_to(_folded(shots, turn), shots.size) for turn in turns])
+
+
+def _folded(shots: Any, turns: np.ndarray) -> np.ndarray:
+    """Places [bins] in a spectrum at which lines of a frequency over the sample rate are seen."""
+    places = (turns - np.floor(turns + 0.5)) * shots.fft_size
+    return np.asarray(places if shots.complex_record else abs(places))
 
 
 def columns(shots: Any, values: np.ndarray | float, dims: int = 1) -> np.ndarray:
@@ -76,14 +98,15 @@ def _is_in(bin_, band, period):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _cut(numbers, where, levels, how, magnitudes, exempts, chances):
+def _cut(numbers, where, levels, how, speckle, magnitudes, exempts, chances):
     """Cut runs to the band, in place.
 
     ``numbers`` (5, segments, m) are low, count, peak, exempted and start of runs; ``where`` the
     band (3, 2, m), N of complex records or 0, places of lines (m, 3, beamlets), and whether a run's
     largest bin is searched; ``levels`` (4, m) noise under lines, threshold, noise of other bins,
     and floor of leakage over that; ``how`` the rule of detection and segments whose leakage is
-    looked at; ``chances`` (3, segments, m) pd, miss and leakage.
+    looked at; ``speckle`` points (m,) and the speckle of all; ``chances`` (3, segments, m) pd, miss
+    and leakage.
     """
     (band, period, lines, inside), (rule, leaks) = where, how
     low, count, peak, exempted, start = numbers
@@ -103,7 +126,7 @@ def _cut(numbers, where, levels, how, magnitudes, exempts, chances):
                 exempt[:] = False
                 if levels[1, j] <= run[peak[s, j]]:
                     _keep_echoes(
-                        run, exempt, at, levels[1, j], rule[1], (band[s, :, j], period),
+                        run, exempt, at, levels[1, j], rule.beside, (band[s, :, j], period),
                         lines[j, s],
                     )  # fmt: skip
             best = first
@@ -120,8 +143,9 @@ def _cut(numbers, where, levels, how, magnitudes, exempts, chances):
             chances[0, s, j], chances[1, s, j] = 0.0, 1.0
             if inside[s, j]:
                 chances[0, s, j], chances[1, s, j] = found_pair(
-                    run, exempt, peak[s, j], low[s, j], rule, (levels[0, j], levels[1, j])
-                )
+                    run, exempt, peak[s, j], low[s, j], rule, (levels[0, j], levels[1, j]),
+                    speckle_of(speckle[1], s, speckle[0][j]),
+                )  # fmt: skip
             if leaks[s]:
                 chances[2, s, j] = leakage_of(run, exempt, levels[1:, j])
 

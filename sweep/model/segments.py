@@ -15,7 +15,7 @@ import numpy as np
 from sweep.kernels import njit
 from sweep.model import line_shape
 from sweep.model.crossings import MOST_TERMS, crossing_series
-from sweep.model.detection import found_pair
+from sweep.model.detection import any_neighbour, found_pair, free_images, speckle_of
 from sweep.model.effects.circulator_leak import beside_leak
 from sweep.model.effects.line_width import gaussian_shifts
 from sweep.model.ground import different_rows
@@ -45,6 +45,7 @@ from sweep.model.search import cut
 from sweep.model.spectrum import (
     A_IM,
     A_RE,
+    CHANCE,
     COMPLEX,
     FOLDED,
     IMAGED,
@@ -459,13 +460,13 @@ def _some(
     rule = shots.echo_rule
     done = _inspect_points(
         np.ascontiguousarray(table[:, part].T),
-        np.stack([shots.row[part], together.which[first:]]),
+        np.stack([shots.row[part], together.which[first:], part]),
         shots.footprint,
         (together.centre, together.modes, together.number, shifts),
-        shapes._replace(sizes=np.append(shapes.sizes, (view(shots), rule[1]))),
+        shapes._replace(sizes=np.append(shapes.sizes, (view(shots), rule.beside))),
         (_node_limits(shots, together), tangents(shots.fft_size)),
         (shots.segments, levels[part], np.array([leaks * each.leaks for each in shots.waveform]),
-         shots.window.sum, rule),
+         shots.window.sum, rule, shots.speckle_table),
         (np.empty((segments, 2, places)), form),
         (np.empty((ROOM, width)), np.empty(width, np.bool_), np.empty(MOST_TERMS)),
         (numbers, values, magnitudes, exempt),
@@ -577,18 +578,19 @@ def _keep(at, count, room, exempt, magnitudes, exempts):
 def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, work, out):
     """Compute runs of points; return the number of points that there was room for.
 
-    ``points`` are rows of :meth:`sweep.model.preparation.Shots.point_table`; ``where`` (2, m) rows
-    in the footprints, and shapes; ``modes`` and ``shapes`` those of :class:`Together`, with shifts
-    (m, segments, 2, k) and with sizes that end in the view and half of the echo's main lobe;
-    ``tables`` limits of nodes, and tangents; ``how`` segments that there are, levels below which
-    bins may be left out, each segment's way to look at leakage, the window's sum, and the rule of
-    detection. ``made`` and ``work`` are room for shapes and for spectra. Results (``out``): low,
-    count, peak, exempted and start (5, segments, m); pd, miss, magnitude and leakage (4, segments,
-    m); magnitudes and exempt bins of runs, which may have no room at all.
+    ``points`` are rows of :meth:`sweep.model.preparation.Shots.point_table`; ``where`` (3, m) rows
+    in the footprints, shapes, and numbers of the points; ``modes`` and ``shapes`` those of
+    :class:`Together`, with shifts (m, segments, 2, k) and with sizes that end in the view and half
+    of the echo's main lobe; ``tables`` limits of nodes, and tangents; ``how`` segments that there
+    are, levels below which bins may be left out, each segment's way to look at leakage, the
+    window's sum, the rule of detection, and the speckle of all points. ``made`` and ``work`` are
+    room for shapes and for spectra. Results (``out``): low, count, peak, exempted and start (5,
+    segments, m); pd, miss, magnitude and leakage (4, segments, m); magnitudes and exempt bins of
+    runs, which may have no room at all.
     """
     centre, shifts = modes[0], modes[3]
     sizes, limits, tangent = shapes[0], tables[0], tables[1]
-    (segments, levels, leaks, window_sum, rule), (table, form) = how, made
+    (segments, levels, leaks, window_sum, rule, speckle), (table, form) = how, made
     room, exempt, series = work
     numbers, values, magnitudes, exempts = out
     keep, at = magnitudes.size > 0, np.int64(0)
@@ -635,14 +637,21 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
                     origin, lines, (level, levels[i]), shift[:, : (1 - sizes[4]) * shift.shape[1]],
                     table[s], form[s], sizes, tangent, room, exempt,
                 )  # fmt: skip
+            if p[16] > 0.0:
+                exempted = free_images(room[OUT, :count], exempt[:count], low, sizes[0], p[16])
             if keep:
                 if at + count > magnitudes.size:
                     return i
                 numbers[4, s, i] = at
                 at = _keep(at, count, room, exempt, magnitudes, exempts)
-            found, missed = found_pair(room[OUT, :count], exempt, peak, low, rule, (p[13], level))
+            found, missed = found_pair(
+                room[OUT, :count], exempt[:count], peak, low, rule, (p[13], level),
+                speckle_of(speckle, s, where[2, i]),
+            )  # fmt: skip
             if leaks[s] == BIN_BY_BIN:
                 leakage = of_bins(count, noise, p[12], room, exempt, series)
+                if p[16] > 0.0 and rule.pairs.size > 0:
+                    leakage = any_neighbour(room[CHANCE], count, rule.pairs)
             low += sizes[0] * (sizes[7] == COMPLEX)  # never below 0
             numbers[0, s, i], numbers[1, s, i], numbers[2, s, i] = low, count, peak
             numbers[3, s, i] = exempted

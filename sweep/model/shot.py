@@ -18,6 +18,7 @@ from sweep.model.looks import fading_any_two
 from sweep.model.marcum import log_any, log_at_least_one
 from sweep.model.outputs import WITHOUT_ECHO
 from sweep.model.preparation import Parameters, Shots, as_arrays, bare, require_finite
+from sweep.model.quadratures import mean_over_angles
 from sweep.model.resolution import resolved_categories
 from sweep.model.segments import find
 from sweep.model.strongest import outcomes
@@ -159,7 +160,19 @@ def chances(
         if shots.fading is None:
             return any_two(pd, miss), any_two(miss, pd)
         level = shots.threshold / shots.line_deviation
-        return fading_any_two(pd, miss, level, np.abs(np.array(shots.fading)))
+        alike = np.abs(np.array(shots.fading))
+        found, missed = fading_any_two(pd, miss, level, alike)
+        speckle = shots.speckle_table
+        near = np.flatnonzero(speckle.row.any(axis=0))
+        if near.size:
+            level = np.broadcast_to(level, shots.size)[near]
+            alike = alike[:, near]
+            found[near], missed[near] = mean_over_angles(
+                speckle.factors[speckle.row[:, near]],
+                tuple(pd[:, near]),
+                lambda *pd: fading_any_two(np.array(pd), 1 - np.array(pd), level, alike),
+            )
+        return found, missed
     both = shots.both(pd[0], pd[2], (magnitudes[0], magnitudes[2]))
     missed = miss[0] + pd[0] * miss[2]
     if shots.fading is not None:

@@ -28,7 +28,7 @@ import numpy as np
 
 from sweep.kernels import njit
 from sweep.model import alarms, waveform
-from sweep.model.detection import found_pair
+from sweep.model.detection import found_pair, speckle_of
 from sweep.model.marcum import marcum_q1_pair
 from sweep.model.search import leakage_of
 from sweep.model.segments import runs_of
@@ -83,7 +83,7 @@ def _of_runs(shots: Any, runs: Any, pd: np.ndarray) -> tuple[np.ndarray, np.ndar
     numbers = np.array([runs.low, runs.bins, runs.peak, runs.start])
     _at_levels(
         numbers, runs.inside, (runs.magnitudes, runs.exempt), level, (deviation, sigma, floor),
-        (shots.echo_rule, shots.leakage), lost, silence,
+        (shots.echo_rule, shots.leakage), (part, shots.speckle_table), lost, silence,
     )  # fmt: skip
     alarm = -np.expm1(-silence[..., 0])
     weight = _weights(silence[..., 1:], alarm)
@@ -142,13 +142,14 @@ def _excess_pair(a, b, alike):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _at_levels(numbers, inside, bins, levels, noise, how, lost, silence):
+def _at_levels(numbers, inside, bins, levels, noise, how, speckle, lost, silence):
     """Evaluate runs at all levels: what the echo loses there, and what leaked signal adds.
 
     ``numbers`` (4, segments, m) are low, count, peak and start of runs; ``bins`` |X| [V] of all
     runs, and whether they are of the echo; ``levels`` (segments, m, k) [V], the threshold first;
     ``noise`` that of bins with lines, and of others [V], and the floor of leakage over that;
-    ``how`` the rule of detection, and whether leakage is looked at. Results, of the levels' shape:
+    ``how`` the rule of detection, and whether leakage is looked at; ``speckle`` points (m,) and the
+    speckle of all. Results, of the levels' shape:
     ``lost`` P_b - P_z; ``silence`` -ln P(Z < z), to which that of leaked signal is added.
     """
     low, count, peak, start = numbers
@@ -164,8 +165,9 @@ def _at_levels(numbers, inside, bins, levels, noise, how, lost, silence):
                 level = levels[s, j, k]
                 if inside[s, j]:
                     found, missed = found_pair(
-                        run, echo, peak[s, j], low[s, j], how[0], (deviation[j], level)
-                    )
+                        run, echo, peak[s, j], low[s, j], how[0], (deviation[j], level),
+                        speckle_of(speckle[1], s, speckle[0][j]),
+                    )  # fmt: skip
                     if k == 0:
                         found_first, missed_first = found, missed
                     more = missed - missed_first if missed < 0.5 else found_first - found

@@ -77,7 +77,7 @@ def find(shots: Shots, *, range_walk: bool = True) -> np.ndarray:
             magnitude, out = np.sqrt(np.mean(np.square(each), axis=0)), np.empty((6, 1))
             detect_rows(
                 magnitude[None], np.zeros(1, np.int64), bins, shots.echo_rule, table[13, [i]],
-                table[11, [i]], out,
+                table[11, [i]], shots.speckle_table.at(segment, np.array([i])), out,
             )  # fmt: skip
             found[segment, :, i] = out[:, 0]
             if shots.complex_record:

@@ -206,7 +206,10 @@ def raised(
 
 def beside_leak(shots: Shots, runs: Any) -> Any:
     """Put the line to :class:`sweep.model.segments.Runs`: it masks bins, and raises others."""
-    from sweep.model.detection import found_pair  # needs the compiler, which reading specs does not
+    from sweep.model.detection import (  # needs the compiler, which reading specs does not
+        found_pair,
+        speckle_of,
+    )
 
     magnitudes = runs.magnitudes.copy()
     pd, miss, exempted, leakage = (
@@ -216,7 +219,7 @@ def beside_leak(shots: Shots, runs: Any) -> Any:
         np.broadcast_to(v, shots.size)[runs.part]
         for v in (shots.bin_deviation, shots.line_deviation, shots.threshold)
     )
-    size, rule = shots.fft_size, shots.echo_rule
+    size, rule, speckle = shots.fft_size, shots.echo_rule, shots.speckle_table
     for s, i in np.argwhere(runs.bins > 0):
         stretch = slice(runs.start[s, i], runs.start[s, i] + runs.bins[s, i])
         at = runs.low[s, i] + np.arange(runs.bins[s, i])
@@ -241,8 +244,9 @@ def beside_leak(shots: Shots, runs: Any) -> Any:
             pd[s, i], miss[s, i] = 0.0, 1.0
         else:
             pd[s, i], miss[s, i] = found_pair(
-                seen, echo, peak, runs.low[s, i], rule, (under[i], level[i])
-            )
+                seen, echo, peak, runs.low[s, i], rule, (under[i], level[i]),
+                speckle_of(speckle, s, runs.part[i]),
+            )  # fmt: skip
         exempted[s, i] += np.count_nonzero(masked & searched)
         if shots.waveform[s].leaks:
             chance = alarm(

@@ -41,7 +41,7 @@ from numpy.typing import ArrayLike
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.effect import Effect, Parameter, Realisation, Scene, Size
 from sweep.model.effects.points import Points
-from sweep.model.ground import Cast, Plane, Slopes
+from sweep.model.ground import Cast, Ground, Plane, Slopes
 from sweep.model.preparation import Shots
 from sweep.model.speckle_correlation import NARROW, SEGMENT_PAIRS, LineSpread, bin_correlation
 
@@ -179,13 +179,12 @@ def fade(shots: Shots, scene: Scene) -> Shots:
     law = str(scene.parameters[_LAW])
     if law == "none" or shots.architecture == "direct" or not shots.incoherent:
         return shots
-    phases = segment_phases(shots)
+    phases, moments = segment_phases(shots), _beamlet_moments(shots, scene.ground)
     if isinstance(scene.ground, Plane):
         slopes = scene.ground.slopes
         correlations = [scene.ground.mean_phasor(*phase) for phase in phases]
         across = [np.zeros(shots.size)] * len(phases)
     else:
-        moments = _beamlet_moments(shots, scene.ground)
         slopes = _cast_slopes(moments)
         mean, variance = _phase_moments(moments, phases)
         correlations = list(np.exp(1j * mean - 0.5 * variance))
@@ -200,7 +199,22 @@ def fade(shots: Shots, scene: Scene) -> Shots:
             of_bins = bin_correlation(shots.window, lines.at(wide))
             correlations[pair] = correlations[pair].astype(complex)
             correlations[pair][wide] = of_bins * np.exp(-0.5 * across[pair][wide])
-    return replace(shots, fading=Fading(*correlations))
+    spread = _line_deviation(shots, moments)
+    return replace(shots, fading=Fading(*correlations), line_spread=spread)
+
+
+def _line_deviation(shots: Shots, moments: "BeamletMoments") -> np.ndarray:
+    """Return the deviation of the beamlets' lines [bins of fs/N], (segments, n)."""
+    bins = shots.fft_size / shots.sample_rate
+    delay = 2 * shots.range / SPEED_OF_LIGHT
+    weights = np.array(
+        [
+            [bins * segment.carrier + 0 * delay, -bins * segment.chirp_rate * delay]
+            for segment in shots.waveform
+        ]
+    )
+    variance = np.einsum("sin,ijn,sjn->sn", weights, moments.covariance, weights)
+    return np.sqrt(np.maximum(variance, 0.0))
 
 
 class PhaseDifference(NamedTuple):
@@ -274,8 +288,8 @@ class BeamletMoments(NamedTuple):
     """(2, 2, n)."""
 
 
-def _beamlet_moments(shots: Shots, ground: Cast) -> BeamletMoments:
-    """Return the moments of beamlets that rays have found, about the mean of their own surface.
+def _beamlet_moments(shots: Shots, ground: Ground) -> BeamletMoments:
+    """Return the moments of beamlets, about the mean of their own surface.
 
     Surfaces at different ranges, as a roof and the ground below, are echoes of their own, each of
     which fades as a whole.
@@ -285,8 +299,9 @@ def _beamlet_moments(shots: Shots, ground: Cast) -> BeamletMoments:
     values = np.array([shots.doppler, shots.offset])
     mean = (share * values).sum(axis=-1)
     centred = values - mean[:, :, None]
-    if ground.beside is not None and ground.beside.any():
-        for surface in (ground.beside, ~ground.beside):
+    apart = ground.beside if isinstance(ground, Cast) else None
+    if apart is not None and apart.any():
+        for surface in (apart, ~apart):
             weight = np.where(surface, share, 0.0)
             whole = np.maximum(weight.sum(axis=1), _SMALLEST)
             own_mean = (weight * values).sum(axis=-1) / whole

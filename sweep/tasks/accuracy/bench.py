@@ -506,7 +506,8 @@ def find_on_grid(
             low, magnitude = magnitudes(shots, table, index, segment, cells, how)
             out = np.empty((6, index.size))
             levels = table[13, index], table[11, index]
-            detect_rows(magnitude, low, bins, shots.echo_rule, *levels, out)
+            speckle = shots.speckle_table.at(segment, index)
+            detect_rows(magnitude, low, bins, shots.echo_rule, *levels, speckle, out)
             out[3] *= table[6, index]
             found[segment][:, index] = out
     return found

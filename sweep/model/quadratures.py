@@ -1,0 +1,197 @@
+"""Developed speckle in bins near DC and Nyquist of a real record, whose quadratures differ.
+
+A real record holds each line A e^(i phase) with its image, the conjugate at the opposite frequency.
+Bin k of the transform about the record's middle, of lines at the places nu with the window's
+transform G, real and even, is
+
+    X = sum_b (A_b G(k - nu_b) + conj(A_b) G(k + nu_b)) + noise.
+
+With circular complex Gaussian amplitudes A_b of mean power P_b it is a Gaussian number. It has the
+mean power S + 2 sigma^2, and the pseudo-variance
+
+    E[X^2] = 2 sum_b P_b G(k - nu_b) G(k + nu_b) + 2 sigma^2 W2(2k) / W2(0),
+
+W2 the transform of the squared window. It is real, so that the quadratures are independent, of
+variances (1 +- q) / 2 of the mean power with q = E[X^2] / E[|X|^2]. At DC and Nyquist q is 1: the
+number is real. Some bins away q is 0, and the number is circular.
+
+The law of |X|^2 is in :mod:`sweep.model.hoyt`.
+
+Phase errors within the record widen a line and are left out of G here, as are the samples that the
+echo does not have; both change q between the bins 0 and that where it vanishes.
+"""
+
+import math
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sweep.model.detectors import main_lobe
+from sweep.model.hoyt import ANGLES, COSINES, hoyt_pair
+from sweep.model.looks import BINARY, Looks
+from sweep.model.search import beamlet_lines, centre_lines
+from sweep.model.speckle_correlation import window_transform
+from sweep.model.window import Window, samples
+
+SHARE_MIN = 0.05
+"""Size of a line's q below which its bins are taken to be circular; pd is off by less than 2e-4."""
+
+
+class SignalQuadratures(NamedTuple):
+    """Pseudo-variance over mean power of the signal in bins near DC and Nyquist."""
+
+    row: np.ndarray
+    """(segments, n) int64: row of ``share`` of each point; 0 where the echo lies elsewhere."""
+    share: np.ndarray
+    """(rows, bins): by the bin, counted from DC or Nyquist, that which is nearer."""
+    factors: np.ndarray
+    """(rows, ANGLES): power of the echo at phases of its amplitude, over its mean: of the strongest
+    bin, or of that which is the strongest at each phase where any bin detects."""
+
+
+def signal_quadratures(shots: Any) -> SignalQuadratures:
+    """Return the pseudo-variances of the signals of shots with real records and their images."""
+    size, ratio = shots.fft_size, shots.fft_size / shots.window.length
+    bins = number_of_bins(shots.window, size)
+    row = np.zeros((len(shots.waveform), shots.size), np.int64)
+    rows, factors = [np.zeros((1, bins))], [np.ones((1, ANGLES))]
+    near = lines_near_end(shots)
+    for s in np.flatnonzero(shots.segments):
+        points = np.flatnonzero(near[s])
+        if not points.size:
+            continue
+        places = beamlet_lines(shots, points)[:, s]
+        # About Nyquist lines and images mirror as about DC.
+        upper = places.mean(axis=1) > size / 4
+        places = np.where(upper[:, None], size / 2 - places, places) / ratio
+        power = shots.amplitude[shots.row[points]] ** 2
+        k = np.arange(bins) / ratio
+        line = window_transform(shots.window, k - places[..., None])
+        image = window_transform(shots.window, k + places[..., None])
+        both = (power[..., None] * (line * line + image * image)).sum(axis=1)
+        pseudo = (power[..., None] * 2 * line * image).sum(axis=1)
+        row[s, points] = sum(map(len, rows)) + np.arange(points.size)
+        rows.append(np.where(both > 1e-12 * both.max(axis=1)[:, None], pseudo, 0.0))
+        rows[-1] /= np.maximum(both, 1e-300)
+        rows[-1][:, 0] = 1.0
+        of_bins = both[..., None] * (1 + rows[-1][..., None] * COSINES)
+        peak = np.take_along_axis(of_bins, both.argmax(axis=1)[:, None, None], axis=1)[:, 0]
+        factor = peak if shots.detection == "peak_bin" else of_bins.max(axis=1)
+        factors.append(factor / both.max(axis=1)[:, None])
+    return SignalQuadratures(row, np.concatenate(rows), np.concatenate(factors))
+
+
+def mean_over_angles(
+    factors: np.ndarray,
+    chances: tuple[np.ndarray, ...],
+    law: Callable[..., tuple[np.ndarray, ...]],
+) -> tuple[np.ndarray, ...]:
+    """Mean of a law of several segments' probabilities over the phases of their amplitudes.
+
+    Parameters
+    ----------
+    factors
+        (segments, n, ANGLES): of :class:`SignalQuadratures`.
+    chances
+        (..., n) by segment: probabilities that each is detected.
+    law
+        Function of such probabilities for circular numbers, of results (..., n).
+
+    Notes
+    -----
+    At a phase t, uniform in 0 .. pi, a bin is detected as a circular number of f = 1 + q cos t
+    times the power is, with exp(-A / f); A is that of which the mean is the probability that is
+    given. Phases of different segments are independent.
+    """
+    turned = [_at_angles(*of_segment) for of_segment in zip(chances, factors, strict=True)]
+    total: list[np.ndarray] = []
+    for j in range(ANGLES):
+        # No two segments have the same order of phases.
+        results = law(*(each[(1 + 2 * s) * j % ANGLES] for s, each in enumerate(turned)))
+        total = [a + b for a, b in zip(total, results, strict=True)] if total else list(results)
+    return tuple(value / ANGLES for value in total)
+
+
+def _at_angles(chance: np.ndarray, factors: np.ndarray) -> np.ndarray:
+    """Probabilities of a detection at all phases, (ANGLES, ..., n), their mean ``chance``."""
+    factors = factors.T.reshape(ANGLES, *[1] * (chance.ndim - 1), -1)
+    there = np.isfinite(chance)
+    wanted = np.where(there, chance, 0.5)
+    low, high = np.zeros(chance.shape), np.full(chance.shape, 700.0)
+    for _ in range(50):
+        a = 0.5 * (low + high)
+        above = np.exp(-a / factors).mean(axis=0) > wanted
+        low, high = np.where(above, a, low), np.where(above, high, a)
+    return np.where(there, np.exp(-0.5 * (low + high) / factors), np.nan)
+
+
+def lines_near_end(shots: Any) -> np.ndarray:
+    """Return true where lines lie so near to DC or Nyquist that images matter, (segments, n)."""
+    reach = _reach(shots.window) * shots.fft_size / shots.window.length
+    place = centre_lines(shots)
+    edge = np.minimum(place, shots.fft_size / 2 - place)
+    return np.asarray(edge - 3 * shots.line_spread < reach)
+
+
+@lru_cache(maxsize=64)
+def number_of_bins(window: Window, fft_size: int) -> int:
+    """Bins from DC on in which the pseudo-variance of a signal is looked at."""
+    beyond = (_reach(window) + main_lobe(window) + 1) * fft_size / window.length
+    return min(math.ceil(beyond) + 1, fft_size // 4 + 1)
+
+
+@lru_cache(maxsize=64)
+def noise_quadratures(window: Window, fft_size: int) -> np.ndarray:
+    """Pseudo-variance of white noise over its mean power, W2(2k) / W2(0), (bins,), by bin k."""
+    squares = samples(window.name, window.length) ** 2
+    time = (np.arange(window.length) - window.length / 2) / fft_size
+    bins = np.arange(number_of_bins(window, fft_size))
+    found = [(squares * np.cos(4 * np.pi * k * time)).sum() / squares.sum() for k in bins]
+    return np.where(np.abs(found) > 1e-12, found, 0.0)
+
+
+def _reach(window: Window) -> float:
+    """Distance of a line from DC [bins of fs/L] beyond which its image is as good as away."""
+    far = window.reach[np.argmax(window.envelope < SHARE_MIN / 2)]
+    return 0.5 * min(float(far), 12.0)
+
+
+def faded_looks(
+    looks: Looks, signal: np.ndarray, level: np.ndarray, shares: np.ndarray, noise: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Probabilities that several records detect a bin in developed speckle, and that they miss it.
+
+    Parameters
+    ----------
+    signal, level
+        (m,): |X| and threshold over the noise per quadrature of one record.
+    shares, noise
+        (m,): pseudo-variance over power of the signal, and of the noise.
+
+    Notes
+    -----
+    Speckle that all records have in common is averaged over, by its size and its phase t, which
+    makes a factor 1 + q cos t on the signal's power; noise is circular but for real bins. Records
+    of independent speckle are Hoyt variables. The mean of N powers is taken as a gamma variable of
+    the same mean and variance, of the order N / (1 + q^2): exact for q = 0 and 1.
+    """
+    from scipy import special
+
+    if looks.independent:
+        power = np.square(signal) + 2
+        q = np.abs(np.square(signal) * shares + 2 * noise) / power
+        if looks.combine == BINARY:
+            each = np.array([hoyt_pair(*values) for values in zip(power, q, level, strict=True)])
+            return looks.votes_of(*each.reshape(-1, 2).T)
+        order = looks.number / (1 + q * q)
+        limit = order * np.square(level) / power
+        return special.gammaincc(order, limit), special.gammainc(order, limit)
+    turned = signal[:, None] * np.sqrt(np.maximum(1 + shares[:, None] * COSINES, 0.0))
+    levels = np.broadcast_to(level[:, None], turned.shape)
+    speckle, weight = looks.speckle_nodes(levels, turned)
+    real = (noise > 1 - 1e-9)[:, None, None]
+    found, missed = looks.steady(turned[..., None] * speckle, levels[..., None], real)
+    found, missed = ((chance * weight).sum(axis=-1).mean(axis=-1) for chance in (found, missed))
+    return found / (found + missed), missed / (found + missed)

@@ -1,0 +1,144 @@
+"""Developed speckle at and near DC and Nyquist, where a real record's bins hold image and line.
+
+Compared with drawn records of scatterers, which share the mean echo power, noise and threshold.
+"""
+
+import numpy as np
+import pytest
+from test_speckle_on_slopes import DRAWS, LANDER, drawn_detections, shots_of, with_threshold
+
+from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.effects.catalogue import DEFAULTS
+from sweep.model.hoyt import hoyt_pair
+from sweep.model.shot import find, statistics
+
+BIN_WIDTH = LANDER["instrument.processing.sample_rate"] / LANDER["instrument.processing.fft_size"]
+RANGE_BEAT = 1e9 / 50e-6 * 2 * 300.0 / SPEED_OF_LIGHT
+HOVER = LANDER | {
+    "target.range": 300.0, "target.grazing_angle": np.pi / 2, "instrument.processing.tnr": 6.0,
+    "target.transverse_velocity": 0.0, "instrument.processing.detection": "peak_bin",
+}  # fmt: skip
+
+
+def at_doppler(parameters, frequency):
+    """Parameters with the radial velocity of a Doppler frequency [Hz]."""
+    wavelength = parameters["instrument.laser.wavelength"]
+    return parameters | {"target.radial_velocity": frequency * wavelength / 2}
+
+
+def with_circular_pd(parameters, pd):
+    """Parameters with the laser power for which a circular number in the Doppler segment has pd."""
+    shots = shots_of(parameters)
+    snr = 0.5 * float(shots.threshold[0] / shots.bin_deviation[0]) ** 2 / -np.log(pd) - 1
+    now = 0.5 * float(find(shots)[1, 2, 0] / shots.bin_deviation[0]) ** 2
+    factor = parameters["instrument.laser.power"] * snr / now
+    return parameters | {"instrument.laser.power": factor}
+
+
+@pytest.mark.parametrize(
+    ("bins", "circular", "drawn", "error"),
+    [
+        (0.0, 0.8195, 0.6570, 0.0024),
+        (0.11, 0.8075, 0.6496, 0.0024),
+        (0.42, 0.6968, 0.5468, 0.0025),
+        (0.63, 0.5984, 0.4746, 0.0025),
+    ],
+)
+def test_a_hovering_lidar_detects_a_real_number(bins, circular, drawn, error, table_4_1):
+    """Shares drawn by another simulation, with the probabilities of circular numbers there."""
+    p = at_doppler(DEFAULTS | table_4_1() | HOVER, bins * BIN_WIDTH)
+    p = with_circular_pd(p, circular)
+    outputs = statistics(shots_of(p))
+    assert abs(outputs["pd_doppler"][0] - drawn) < 3 * error
+    assert outputs["pd_doppler"][0] + outputs["miss_doppler"][0] == pytest.approx(1, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("window", "rule", "doppler", "grazing", "tolerance"),
+    [
+        ("hamming", "peak_bin", 0.0, np.pi / 2, 0.0),
+        ("hamming", "any_bin", 0.42, np.pi / 2, 0.004),
+        ("rectangular", "peak_bin", 0.42, np.pi / 2, 0.0),
+        ("rectangular", "any_bin", 0.11, np.pi / 2, 0.004),
+        ("hann", "any_bin", 1.06, np.radians(30), 0.008),
+    ],
+)
+def test_slow_echoes_are_detected_as_often_as_drawn_ones(
+    window, rule, doppler, grazing, tolerance, table_4_1
+):
+    p = DEFAULTS | table_4_1() | HOVER | {
+        "instrument.processing.window": window, "instrument.processing.detection": rule,
+        "target.grazing_angle": grazing,
+    }  # fmt: skip
+    p = with_threshold(at_doppler(p, doppler * BIN_WIDTH), 1.6)
+    shots = shots_of(p)
+    drawn = drawn_detections(p, shots, seed=7)["doppler"].mean()
+    expected = float(statistics(shots)["pd_doppler"][0])
+    assert abs(drawn - expected) < 4 * np.sqrt(expected * (1 - expected) / DRAWS) + tolerance
+
+
+@pytest.mark.parametrize(("rule", "tolerance"), [("peak_bin", 0.008), ("any_bin", 0.014)])
+def test_an_up_beat_at_dc_is_a_real_number(rule, tolerance, table_4_1):
+    """The Doppler frequency takes the range beat away; the down beat is at twice that."""
+    p = DEFAULTS | table_4_1() | HOVER | {"instrument.processing.detection": rule}
+    p = with_threshold(at_doppler(p, RANGE_BEAT + 0.3 * BIN_WIDTH), 1.6)
+    shots = shots_of(p)
+    detections, outputs = drawn_detections(p, shots, seed=3), statistics(shots)
+    both = (detections["up"] & detections["down"]).mean()
+    error = np.sqrt(0.25 / DRAWS)
+    assert abs(detections["up"].mean() - outputs["pd_up"][0]) < 4 * error
+    # The poles take 1 % of the power at the down beat that the simulation leaves.
+    assert abs(both - outputs["pd_shot"][0]) < 4 * error + tolerance
+
+
+def test_any_two_segments_detect_a_hovering_lidar_as_drawn(table_4_1):
+    p = DEFAULTS | table_4_1() | HOVER | {"instrument.processing.shot_detection": "any_two"}
+    p = with_threshold(at_doppler(p, 0.2 * BIN_WIDTH), 1.6)
+    shots = shots_of(p)
+    detections = drawn_detections(p, shots, seed=3)
+    two = (np.sum([detections[name] for name in detections], axis=0) >= 2).mean()
+    outputs = statistics(shots)
+    assert abs(two - outputs["pd_shot"][0]) < 0.003 + 4 * np.sqrt(two * (1 - two) / DRAWS)
+    assert outputs["pd_shot"][0] + outputs["miss_shot"][0] == pytest.approx(1, abs=1e-9)
+
+
+@pytest.mark.parametrize("combine", ["power", "binary"])
+@pytest.mark.parametrize("speckle", ["common", "independent"])
+@pytest.mark.parametrize("place", [0.0, 0.3, 1.06])
+def test_looks_near_dc_detect_as_often_as_drawn_ones(combine, speckle, place, table_4_1):
+    looks, draws, rng = 4, 20_000, np.random.default_rng(5)
+    p = DEFAULTS | table_4_1() | HOVER | {
+        "instrument.processing.tnr": 4.0, "instrument.looks.number": looks,
+        "instrument.looks.combine": combine, "instrument.looks.votes": 2,
+        "instrument.looks.speckle": speckle,
+    }  # fmt: skip
+    shots = shots_of(with_threshold(at_doppler(p, place * BIN_WIDTH), 1.3))
+    w = shots.window.samples()
+    time, k = (np.arange(w.size) - w.size / 2) / w.size, round(place)
+    line, image = ((w * np.cos(2 * np.pi * y * time)).sum() for y in (k - place, k + place))
+    power = float(find(shots)[1, 2, 0]) ** 2 / (line**2 + image**2)
+    amplitude = rng.normal(size=(draws, looks, 2)) @ [1, 1j] * np.sqrt(power / 2)
+    if speckle == "common":
+        amplitude[:] = amplitude[:, :1]
+    pseudo = (w**2 * np.cos(4 * np.pi * k * time)).sum() / (w**2).sum()
+    noise = rng.normal(size=(draws, looks, 2)) * np.sqrt([1 + pseudo, 1 - pseudo])
+    noise = float(shots.bin_deviation[0]) * (noise @ [1, 1j])
+    magnitude = abs(amplitude * line + amplitude.conj() * image + noise)
+    level = float(shots.threshold[0])
+    if combine == "power":
+        detected = (magnitude**2).mean(axis=1) >= level**2
+    else:
+        detected = (magnitude >= level).sum(axis=1) >= 2
+    drawn, expected = detected.mean(), float(statistics(shots)["pd_doppler"][0])
+    assert abs(drawn - expected) < 4 * np.sqrt(expected * (1 - expected) / draws)
+
+
+@pytest.mark.parametrize("share", [-1.0, -0.4, 0.0, 1e-6, 0.3, 0.9, 0.9999, 1.0])
+@pytest.mark.parametrize("level", [1e-3, 0.7, 2.0, 9.0])
+def test_the_hoyt_law_is_the_mean_of_exponentials(share, level):
+    """Of |X|^2 = P (1 + q cos t) times an exponential variable, t uniform."""
+    found, missed = hoyt_pair(1.7, share, level)
+    t = np.pi * (np.arange(20_000) + 0.5) / 20_000
+    exponent = level**2 / (1.7 * (1 + share * np.cos(t)))
+    assert found == pytest.approx(np.exp(-exponent).mean(), rel=1e-9, abs=1e-300)
+    assert missed == pytest.approx(-np.expm1(-exponent).mean(), rel=1e-5)
