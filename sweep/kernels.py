@@ -115,6 +115,9 @@ class KernelCache(FunctionCache):
         """Return the kernel compiled for a signature, or None."""
         if not _CacheState.reads:
             return None
+        if _have_changed_by_first_load():
+            _CacheState.reads = _CacheState.writes = False
+            return None
         try:
             result = super().load_overload(sig, target_context)
         except Exception:  # whatever unpickling of damaged bytes raises
@@ -128,6 +131,9 @@ class KernelCache(FunctionCache):
     def save_overload(self, sig: Any, data: Any) -> None:
         """Save a compiled kernel; log once where that can't be done."""
         if not _CacheState.writes:
+            return
+        if _have_changed():  # a constant that is built in may be of another state
+            _CacheState.writes = False
             return
         folder = Path(self.cache_path).parent
         try:
@@ -260,6 +266,17 @@ def _has_changed(path: str) -> bool:
     except OSError:
         return True
     return known[1:] != (status.st_size, status.st_mtime_ns)
+
+
+def _have_changed() -> bool:
+    """Tell whether any file of the model is another than when it was fingerprinted."""
+    return any(map(_has_changed, _sources()))
+
+
+@cache
+def _have_changed_by_first_load() -> bool:
+    """Tell whether any had changed when the first kernel was looked for; once a process."""
+    return _have_changed()
 
 
 @cache

@@ -134,14 +134,19 @@ class Unit:
             raise QuantityError("must be a number that a float holds (below 1.8e308)") from None
 
 
-def read_number(written: object, about: str = "") -> tuple[Fraction, Unit]:
+def read_number(
+    written: object, about: str = "", *, is_power_ratio: bool = False
+) -> tuple[Fraction, Unit]:
     """Exact value and unit of a pure number: ``0.1``, ``"1e9"``, ``"2^17"`` or ``"10 %"``.
 
-    A `QuantityError` for any other unit says what the number is `about`.
+    A ratio of powers may be in decibels, ``"-3 dB"``. A `QuantityError` for any other unit says
+    what the number is `about`.
     """
     value, unit = _split(written, "must be a number")
     if unit in ("%", "percent"):
         return value, Unit("%", Fraction(1, 100))
+    if unit == DECIBEL and is_power_ratio:
+        return value, Unit(DECIBEL)
     if unit:
         what = f": {about}" if about else ""
         raise QuantityError(f"is a pure number and takes no unit{what}", _without_unit(value, unit))

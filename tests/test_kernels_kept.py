@@ -260,6 +260,30 @@ print(scale_twice(1.0))
     assert small.run(**cache) == "4.0 0"
 
 
+CHANGED_CONSTANT = """
+import os, pathlib
+import sweep.kernels
+sweep.kernels.cache_folder()  # fingerprints the sources
+path = pathlib.Path(sweep.kernels.__file__).parent / "model" / "constants.py"
+path.write_text("FACTOR = 5.00")
+"""
+
+
+def test_kernels_with_a_constant_that_changes_meanwhile_are_neither_cached_nor_loaded(
+    small, tmp_path
+):
+    """The file of the kernel is as it was: only that of the constant has changed."""
+    cache = {"NUMBA_CACHE_DIR": str(tmp_path)}
+    assert small.run(first=CHANGED_CONSTANT, **cache) == "25.0 0"
+    assert not files(tmp_path, "*.nbc")
+    small.set_factor(2.0)
+    assert small.run(**cache) == "4.0 0"
+    assert small.run(**cache) == "4.0 1"
+    assert small.run(first=CHANGED_CONSTANT, **cache) == "25.0 0"  # not the cached 4.0
+    small.set_factor(2.0)
+    assert small.run(**cache) == "4.0 0"  # numba compares the time of the kernel's file
+
+
 def test_settings_of_the_compiler_count(small, tmp_path):
     cache = {"NUMBA_CACHE_DIR": str(tmp_path)}
     small.run(**cache)

@@ -6,6 +6,7 @@ bytes.
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -140,7 +141,7 @@ class Cluster(Part):
 
     def path(self, name: str) -> str:
         """Path of a file that the cluster's file names."""
-        return str(self._base / Path(name).expanduser())
+        return str(self._base / os.path.expanduser(name))  # an unknown ~user stays as it is
 
     def certificates(self) -> tuple[str, str, str] | None:
         """Paths of authority, certificate and key; None without security."""

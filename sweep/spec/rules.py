@@ -260,6 +260,8 @@ class Numeric(Rule):
     below: str | None = None
     at_most: str | None = None
     whole: bool = False
+    is_power_ratio: bool = False
+    """True for a pure number that may be written in decibels, as a ratio of powers."""
     word: str = ""
     """A word that may stand in place of a number, not along axes; empty for none."""
     means: float | str = 0
@@ -284,7 +286,8 @@ class Numeric(Rule):
             rule = "is one value for a whole study, no point of an axis"
             raise QuantityError(rule, "leave it out")
         try:
-            return read_number(written, _first_clause(self.about))
+            about = _first_clause(self.about)
+            return read_number(written, about, is_power_ratio=self.is_power_ratio)
         except QuantityError as error:
             if not self.word:
                 raise
@@ -340,9 +343,10 @@ class Numeric(Rule):
             pattern += rf"|^{self.word}$" if self.word else ""
             return common | {"type": "string", "pattern": pattern}
         numbers = {_BOUNDS[name][2]: _bound(self, text) for name, text in self.bounds.items()}
+        units = "(%|dB)?" if self.is_power_ratio else "%?"
         kinds: list[Json] = [
             {"type": "integer" if self.whole else "number"} | numbers,
-            {"type": "string", "pattern": r"^\s*[-+.0-9][-+.0-9eE^*_ ]*%?\s*$"},
+            {"type": "string", "pattern": rf"^\s*[-+.0-9][-+.0-9eE^*_ ]*{units}\s*$"},
         ]
         kinds += [{"type": "string", "enum": [self.word]}] if self.word else []
         return common | {"anyOf": kinds}

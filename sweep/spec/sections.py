@@ -94,8 +94,9 @@ class Telescope(Part):
 
     aperture: float = of.length("Diameter of the aperture", "25 mm", "1 um", "1 km")
     optical_efficiency: float = of.number(
-        "Fraction of the collected light that reaches the detector", "0.8", "0", "1", default=1.0
-    )
+        "Fraction of the collected light that reaches the detector", "0.8", "0", "1", default=1.0,
+        is_power_ratio=True,
+    )  # fmt: skip
     coupling: str = of.choice(
         "Light that mixes with the local oscillator: that of a single mode, or all in "
         "the aperture, as the thesis has it; direct detection always has all",
@@ -161,7 +162,7 @@ class Receiver(Part):
     mixing_efficiency: float = of.number(
         "Heterodyne efficiency: share of the echo's power that mixes with the local "
         "oscillator, as which it counts in the SNR",
-        "0.7", "1e-9", "1", default=1.0,
+        "0.7", "1e-9", "1", default=1.0, is_power_ratio=True,
     )  # fmt: skip
     apd_gain: float = of.number("Avalanche gain; 1 for a PIN diode", "10", "1", "1e9", default=1.0)
     excess_noise_factor: float = of.number(

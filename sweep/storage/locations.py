@@ -647,6 +647,18 @@ def _delete(path: Path) -> None:
 NO_INODES = "No inodes left on device"
 
 
+#: What to do where a store can't be written, by the number of the error.
+REMEDIES = {
+    errno.ENOSPC: "make room on its disk",
+    errno.EDQUOT: "make room in your quota",
+    errno.EMFILE: "raise the limit of open files, `ulimit -n`",
+    errno.ENFILE: "raise the machine's limit of open files",
+    errno.EROFS: "have its disk mounted for writing",
+    errno.EACCES: "have the permission to write there",
+    errno.EPERM: "have the permission to write there",
+}
+
+
 def reason(error: OSError, place: object) -> str:
     """Words for why a place can't be written or read.
 

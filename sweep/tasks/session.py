@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import gc
 import math
 import os
@@ -38,7 +37,7 @@ from sweep.spec.clusters import (
 )
 from sweep.spec.rules import near_miss
 from sweep.spec.sections import Execution
-from sweep.storage.locations import NO_INODES, Location, ObjectStoreError, reason
+from sweep.storage.locations import NO_INODES, REMEDIES, Location, ObjectStoreError, reason
 from sweep.storage.opening import read_receipts
 from sweep.tasks import journal, store
 from sweep.tasks.interrupts import Interrupts
@@ -75,17 +74,6 @@ RAY, SHOT = 5e-6, 4e-4
 
 #: Blocks that may fail before any succeeds: beyond, the fault is not in the blocks.
 HOPELESS = 20
-
-#: What to do where a store can't be written, by the number of the error.
-REMEDIES = {
-    errno.ENOSPC: "make room on its disk",
-    errno.EDQUOT: "make room in your quota",
-    errno.EMFILE: "raise the limit of open files, `ulimit -n`",
-    errno.ENFILE: "raise the machine's limit of open files",
-    errno.EROFS: "have its disk mounted for writing",
-    errno.EACCES: "have the permission to write there",
-    errno.EPERM: "have the permission to write there",
-}
 
 #: Seconds for which a run waits to see that what is committed is there; of more files it begins
 #: with what the log says, and looks on meanwhile.

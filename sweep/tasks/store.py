@@ -36,6 +36,7 @@ from sweep.storage.chunks import DraftFiles, packed_bytes_max
 from sweep.storage.foreign import foreign_names, is_litter
 from sweep.storage.locations import (
     JOURNAL,
+    REMEDIES,
     Location,
     ObjectPath,
     discard,
@@ -118,7 +119,8 @@ def create(
     except OSError as error:
         if error.errno in (errno.ENOTEMPTY, errno.EEXIST) and path.exists():
             raise BusyError(f"{path} is there already: another process has made it") from error
-        raise StoreError(f"{path} can't be made: {error.strerror or error}") from error
+        remedy = REMEDIES.get(error.errno or 0, f"name another place, {option_name('store')}")
+        raise StoreError(f"{path} can't be made: {error.strerror or error}; {remedy}") from error
     return path
 
 

@@ -107,3 +107,18 @@ def test_each_kind_has_its_file():
     assert {file.stem for file in DEPLOY.glob("*.yaml")} == {
         "local", "scheduler", "ssh", "slurm", "pbs", "kubernetes",
     }  # fmt: skip
+
+
+def test_a_file_of_an_unknown_user_is_told_as_missing():
+    given = {
+        "kind": "scheduler", "address": "tls://127.0.0.1:8786",
+        "security": dict.fromkeys(("ca", "certificate", "key"), "~nobody-here/key.pem"),
+    }  # fmt: skip
+    with pytest.raises(SpecError, match=r"security.ca: names a file that is not there .*~nobody-h"):
+        cluster_of(given)
+    given = {
+        "kind": "ssh", "workers": 1, "hosts": ["node1"], "worker": {"memory": "1 GB"},
+        "scheduler": {"host": "localhost"}, "identity": "~nobody-here/id",
+    }  # fmt: skip
+    cluster = cluster_of(given)
+    assert cluster.path(cluster.identity).endswith("~nobody-here/id")

@@ -34,9 +34,10 @@ FIELDS = [
     ("instrument.laser", ..., "is missing; write 'laser:' with wavelength"),
     ("instrument.telescope.aperture", "25 mn", "did you mean 'mm'?"),
     ("instrument.telescope.optical_efficiency", 1.01, "must be at most 1"),
-    ("instrument.telescope.optical_efficiency", "-2.2 dB",
+    ("instrument.telescope.optical_efficiency", "3 dB", "must be at most 1 (you wrote '3 dB')"),
+    ("instrument.telescope.optical_efficiency", "0.5 mW",
      "takes no unit: fraction of the collected light that reaches the detector (you wrote "
-     "'-2.2 dB'); write 0.6026 for a ratio of powers, 0.7762 for one of amplitudes"),
+     "'0.5 mW'); write 0.5"),
     ("instrument.processing.tnr", "20 dB", "write 100 for a ratio of powers, 10 for one of ampl"),
     ("instrument.processing.tnr", "10 sigma",
      "takes no unit: threshold over the standard deviation of a noise-only bin's magnitude (you "

@@ -1,10 +1,11 @@
 import json
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
 import xarray as xr
-from small import everything, small
+from small import everything, quiet, small
 
 from sweep.storage import opening
 from sweep.tasks import store
@@ -133,3 +134,8 @@ def test_a_creation_cut_short_leaves_no_store(tmp_path, study, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         store.create(tmp_path / "small.zarr", study)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_place_where_no_folder_can_be_made_is_told_with_a_remedy():
+    with pytest.raises(StoreError, match=r"/proc/x.zarr can't be made: .*; name another place, st"):
+        quiet(small(), Path("/proc/x.zarr"))
