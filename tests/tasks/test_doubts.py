@@ -5,7 +5,7 @@ import warnings
 import pytest
 import yaml
 from click.testing import CliRunner
-from small import small, small_file
+from small import STUDY, small, small_file
 from small_flights import SCENE, small_scene
 
 import sweep
@@ -15,7 +15,7 @@ LATE = {"axes": {"target.range": ["1 km", "20 km"]}}
 OFF = {"effects": {"doppler": "off"}, "axes": {"target.range": ["1 km", "2 km"]}}
 NARROW = {
     "axes": {"target.range": ["1 km"]},
-    "instrument": small_file()["instrument"]
+    "instrument": STUDY["instrument"]
     | {"telescope": {"aperture": "10 mm", "coupling": "aperture"}},
 }
 WAYWARD = {
