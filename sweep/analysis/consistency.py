@@ -36,6 +36,16 @@ _NORMAL, _VECTOR = (1.0, 2.0), (1.8780, 2.8328)
 """Multiples of the standard error that hold these shares, of a number and of a vector of three."""
 
 
+_REMEDIES = {
+    "range": "Ground steeper than navigation.terrain_slope, or targets that move otherwise than "
+    "navigation.target_speed and target_acceleration state, may be the cause.",
+    "radial velocity": "Targets that move otherwise than navigation.target_speed and "
+    "target_acceleration state may be the cause.",
+    "altitude": "Relief other than navigation.relief states may be the cause.",
+}
+"""What may lie behind errors far larger than stated, by quantity."""
+
+
 class Consistency(NamedTuple):
     """Errors of one quantity of a scanner over the standard errors that are stated."""
 
@@ -56,7 +66,7 @@ class Consistency(NamedTuple):
         """Sentence on errors that are far larger than stated."""
         return (
             f"{self.scanner}: {self.quantity} is inconsistent: residuals are {self.ratio:.3g} "
-            "times the stated errors."
+            f"times the stated errors. {_REMEDIES.get(self.quantity, '')}".rstrip()
         )
 
 

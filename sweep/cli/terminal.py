@@ -245,7 +245,8 @@ def instrument_lines(own: Mapping[str, Any]) -> Iterator[str]:
         words = isinstance(number["published"], str)  # which have their unit
         unit = "" if words else f" {number['unit']}"
         yield folded(f"- {number['about']}: {number['published']}{unit}".rstrip())
-    yield "\n" + yaml.safe_dump({"instrument": own["instrument"]}, sort_keys=False).rstrip()
+    sections = {name: own[name] for name in ("error_floor", "instrument") if name in own}
+    yield "\n" + yaml.safe_dump(sections, sort_keys=False).rstrip()
 
 
 def conclude(outcome: Outcome, store: Location) -> None:
@@ -621,6 +622,8 @@ def warn_of(study: Spec | SceneSpec) -> None:
 
     for doubt in doubts_of_geometry(study):
         tell(f"warning: {doubt}", err=True)
+    for sentence in study.unstated_errors():
+        tell(f"note: {sentence}", err=True)
     most = max((any_ for any_, _ in alarms_of_study(study)), default=0.0)
     if most > MANY_ALARMS:
         tell(

@@ -25,7 +25,7 @@ from sweep.model.leaked_peaks import leaked_peaks
 from sweep.model.marcum import at_least_one
 from sweep.model.noisy_spectra import Methods
 from sweep.model.outputs import POINTS, STATISTICS
-from sweep.model.own_motion import own_motion
+from sweep.model.own_motion import MotionPriors, own_motion
 from sweep.model.preparation import Parameters, Shots, as_arrays
 from sweep.model.ray_error import ray_error
 from sweep.model.realisations import random_effects
@@ -57,6 +57,7 @@ def cloud(
     effects: Collection[str] = CORE,
     flags: np.ndarray | None = None,
     estimates_rays: bool = False,
+    priors: MotionPriors = MotionPriors(),  # noqa: B008  # a tuple
 ) -> dict[str, np.ndarray]:
     """Statistics and points of n shots, whether they see anything or not.
 
@@ -67,7 +68,8 @@ def cloud(
     `effects` and `flags` are as of :func:`sweep.model.shot.prepare_cast`. `estimates_rays` asks for
     ``beamlets_error``, which needs powers that add and is else nan. ``surface``, ``true_range`` and
     ``true_radial_velocity`` are those of the beamlet that a true or a misread point has seen: the
-    error of a misread one shows.
+    error of a misread one shows. `priors` are what the instrument knows beforehand of motion that
+    it does not measure; standard errors have it.
     """
     n = len(eyepoints.time)
     sizes = {"shot": n, "draw": draws, "return_number": returns, "xyz": 3}
@@ -97,12 +99,17 @@ def cloud(
                 keys=keys[part],
                 parameters=parameters,
                 methods=methods,
-                motion=own_motion(seen),
+                motion=own_motion(seen, priors),
                 **numbers,
             )
         else:
             drawn = draw_returns(
-                shots, found, keys=keys[part], method=method, motion=own_motion(seen), **numbers
+                shots,
+                found,
+                keys=keys[part],
+                method=method,
+                motion=own_motion(seen, priors),
+                **numbers,
             )
         left = np.full(shots.size, np.nan)
         if estimates_rays:

@@ -1,6 +1,6 @@
 """Floor of errors: what an instrument gets wrong however strong the echo is.
 
-Four errors, normal with a mean of 0. With u a beam's direction, R and v_r the range and the radial
+Five errors, normal with a mean of 0. With u a beam's direction, R and v_r the range and the radial
 velocity that it reports, v the instrument's velocity and v_perp the part of v across the beam:
 
 ========== ============================= ================= ================== =================
@@ -14,13 +14,15 @@ pointing   of the known direction on                       |v_perp| pointing  fr
            each of two axes [rad]
 vibration  of the instrument along the                     vibration          from shot to shot
            beam [m/s]
+range      of the range itself [m]       range noise                          from shot to shot
+noise
 ========== ============================= ================= ================== =================
 
 A range is that along the light's own way, however it is known to run; the point lies there along
 the direction that the beam is thought to have. Common errors are one number each of a draw; the
-pointing's, two of each beam and draw, which turn with the beam; vibration's, one of each shot and
-draw. Common errors scale the velocity's vector and the altitude, and add the outer product of the
-velocity, times their variance, to its covariance (:mod:`sweep.model.navigation`).
+pointing's, two of each beam and draw, which turn with the beam; vibration's and the range's, one of
+each shot and draw. Common errors scale the velocity's vector and the altitude, and add the outer
+product of the velocity, times their variance, to its covariance (:mod:`sweep.model.navigation`).
 """
 
 from __future__ import annotations
@@ -57,6 +59,8 @@ class ErrorFloor(NamedTuple):
     """Of the known wavelength, relative."""
     vibration: float = 0.0
     """Of the instrument's velocity along the beam [m/s]."""
+    range_noise: float = 0.0
+    """Of ranges [m]."""
 
     @property
     def scale(self) -> float:
@@ -98,8 +102,9 @@ def stray(
     clock, wavelength = _drawn(np.array([INSTRUMENT]), number, seed)[0].T
     every, whose = np.unique(eyepoints.beam, return_inverse=True)
     turned = floor.pointing * _drawn(every.astype(float), number, seed)[whose]
-    shaken = uniforms(np.repeat(keys, draws, axis=0), np.tile(number, n), STREAM_ERROR_FLOOR, 2)
-    shaken = floor.vibration * normals(shaken)[:, 0].reshape(n, draws, 1)
+    drawn = uniforms(np.repeat(keys, draws, axis=0), np.tile(number, n), STREAM_ERROR_FLOOR, 2)
+    vibration, noise = normals(drawn).T.reshape(2, n, draws, 1)
+    shaken, noise = floor.vibration * vibration, floor.range_noise * noise
     direction, velocity = eyepoints.direction[:, None], eyepoints.velocity[:, None]
     first, second = _frame(eyepoints.direction)
     off = turned[..., :1] * first[:, None] + turned[..., 1:] * second[:, None]
@@ -111,9 +116,10 @@ def stray(
     new = dict(points)
     for suffix in ("", "_interpolated"):
         far, closing = f"range{suffix}", f"radial_velocity{suffix}"
-        new[far] = points[far] * stretched
+        new[far] = points[far] * stretched + noise
         new[closing] = points[closing] * scaled + moved
-        errors = floor.clock * np.abs(new[far]), floor.velocity_error(new[closing], across)
+        far_error = np.hypot(floor.clock * np.abs(new[far]), floor.range_noise)
+        errors = far_error, floor.velocity_error(new[closing], across)
         for name, error in zip((far, closing), errors, strict=True):
             stated = f"{name}_standard_error"
             new[stated] = np.hypot(points[stated], error)

@@ -345,6 +345,14 @@ POINTS: dict[str, Output] = _over(("shot", "draw", "return_number"), {
         "platform_velocity on beam_direction; of what is at rest its error, of what moves its own, "
         f"{CLOSING}",
     ),
+    "range_per_slip": Output(
+        "s", "change of the interpolated range by slip",
+        "slip: radial velocity less the speed at which the range falls; the range is corrected for "
+        "that of level ground",
+    ),
+    "radial_velocity_per_slip": Output(
+        "1", "change of the interpolated radial velocity by slip", "as of range_per_slip"
+    ),
     "snr": Output("1", "signal-to-noise ratio of the weaker of up and down peak"),
     "pd": Output("1", "probability that both peaks are detected", "nan for a false peak"),
     "surface": Output("1", "surface seen", "-1: none, or no true return", "int16"),

@@ -21,9 +21,19 @@ rest. It takes the ground to be level (:func:`own_motion`): then a beam that poi
 a range that falls by u = (V + R d').z / d.z. A beam that points nowhere near the ground is taken to
 meet a surface that faces it, along which nothing slides. Range and velocity are corrected for both.
 
-**Unknown motion.** The instrument does not know the slope of the ground or the motion of a body
-that is hit. The changes of range and velocity that these make are added to the standard errors in
-quadrature, in their true size.
+**Unknown motion.** The instrument does not know the slope of the surface that a beam meets, nor how
+that moves. Of both it has standard deviations beforehand (:class:`MotionPriors`), which the spec of
+a flight states; they are never taken from the scene. With W = V + R d' and a gradient g of level
+ground, du/dg = (W_z d_h - W_h d_z) / d_z^2; with a gradient of a surface that faces the beam,
+du/dg = -W_perp. A target's velocity w changes v - u by (z / d.z - d).w over level ground and by
+nothing on a surface that faces the beam, and a by -w.d'. The standard errors of range and velocity
+have these deviations, times what range and velocity change by slip and acceleration, in quadrature.
+If the truth is outside the priors, its errors are not stated: a run, a report and an export compare
+errors with standard errors, and say so (:mod:`sweep.analysis.consistency`).
+
+The slip v - u moves a range only because it is referred to the shot's start. Ground points of
+navigation are placed where the beam meets the ground as the beats tell its range, whatever its
+slope (:mod:`sweep.model.navigation`).
 
 The angular acceleration is left out on both sides (:mod:`sweep.model.geometry.platform`).
 """
@@ -41,34 +51,111 @@ LEAST_DESCENT = 0.05
 """Sine of the angle below the horizon from which on a beam is taken to meet level ground."""
 
 
-class OwnMotion(NamedTuple):
-    """Motion of n shots' beams that the instrument knows; arrays (n,)."""
+class MotionPriors(NamedTuple):
+    """Standard deviations of what an instrument does not know of the motion along its beams."""
 
+    terrain_slope: float = 0.2
+    """Slope of the surface that a beam meets, against level ground or a surface that faces it."""
+    target_speed: float = 0.0
+    """Each component of the velocity of what a beam meets [m/s]."""
+    target_acceleration: float = 0.0
+    """Acceleration of what a beam meets, along the beam [m/s^2]."""
+
+
+class OwnMotion(NamedTuple):
+    """Motion along n shots' beams as the instrument knows it; arrays (n,) unless said otherwise."""
+
+    closing: np.ndarray
+    """Closing speed of ground at rest [m/s]."""
     acceleration: np.ndarray
-    """Rate at which the closing speed of ground at rest grows [m/s^2]."""
+    """Rate at which that grows [m/s^2]."""
     slip: np.ndarray
     """Closing speed less the speed at which the range of level ground falls, at range 0 [m/s]."""
     slip_by_range: np.ndarray
     """Growth of that difference with the range [1/s]."""
+    slip_by_slope: np.ndarray
+    """(n, 3): growth of that difference with the gradient of the surface, at range 0 [m/s]."""
+    slip_by_slope_and_range: np.ndarray
+    """(n, 3): growth of that with the range [1/s]."""
+    slip_by_target: np.ndarray
+    """Standard deviation of that difference over that of the target's velocity."""
+    turn_rate: np.ndarray
+    """Rate at which the beam turns [rad/s]."""
+    priors: MotionPriors
+    """Standard deviations of what is not known."""
 
     def slip_at(self, distance: np.ndarray) -> np.ndarray:
         """Return the closing speed less the speed at which ranges (n, ...) [m] fall [m/s]."""
-        dims = np.ndim(distance) - 1
-        slip, by_range = (v.reshape(-1, *[1] * dims) for v in (self.slip, self.slip_by_range))
+        slip, by_range = (_per_shot(v, distance) for v in (self.slip, self.slip_by_range))
         return np.asarray(slip + by_range * distance)
 
+    def approach_at(self, distance: np.ndarray) -> np.ndarray:
+        """Return the speed at which ranges (n, ...) [m] fall, as far as is known [m/s]."""
+        return np.asarray(_per_shot(self.closing, distance) - self.slip_at(distance))
 
-def own_motion(eyepoints: Eyepoints) -> OwnMotion:
-    """Motion along the commanded beams of n shots, over level ground.
+    def slip_error(self, distance: np.ndarray) -> np.ndarray:
+        """Return the standard deviation of that difference at ranges (n, ...) [m/s]."""
+        slope, speed, _ = self.priors
+        near, far = self.slip_by_slope, self.slip_by_slope_and_range
+        constant, linear, square = (
+            _per_shot(v, distance) for v in (_dot(near, near), 2 * _dot(near, far), _dot(far, far))
+        )
+        by_slope = slope**2 * (constant + (linear + square * distance) * distance)
+        by_target = speed**2 * (_per_shot(self.slip_by_target, distance) ** 2 + slope**2)
+        return np.sqrt(np.maximum(by_slope, 0.0) + by_target)
+
+    @property
+    def acceleration_error(self) -> np.ndarray:
+        """Standard deviation of the acceleration [m/s^2], (n,)."""
+        return np.hypot(self.priors.target_acceleration, self.priors.target_speed * self.turn_rate)
+
+
+def own_motion(eyepoints: Eyepoints, priors: MotionPriors = MotionPriors()) -> OwnMotion:  # noqa: B008  # a tuple
+    """Motion along the commanded beams of n shots, over level ground."""
+    return motion_of_beams(
+        eyepoints.direction, eyepoints.velocity, eyepoints.turning,
+        eyepoints.platform_acceleration, priors,
+    )  # fmt: skip
+
+
+def motion_of_beams(
+    direction: np.ndarray,
+    velocity: np.ndarray,
+    turning: np.ndarray,
+    acceleration: np.ndarray,
+    priors: MotionPriors,
+) -> OwnMotion:
+    """Motion along n beams (n, 3) that turn by `turning` [1/s], of a moving instrument.
 
     With the vertical z, u - V.d = V.z / d.z - V.d + R d'.z / d.z.
     """
-    direction, velocity, turning = eyepoints.direction, eyepoints.velocity, eyepoints.turning
-    grows = _dot(eyepoints.platform_acceleration, direction) + _dot(velocity, turning)
+    grows = _dot(acceleration, direction) + _dot(velocity, turning)
+    closing = _dot(velocity, direction)
     down = direction[:, 2] < -LEAST_DESCENT
     sine = np.where(down, direction[:, 2], -1.0)
-    slip = np.where(down, _dot(velocity, direction) - velocity[:, 2] / sine, 0.0)
-    return OwnMotion(grows, slip, np.where(down, -turning[:, 2] / sine, 0.0))
+
+    def by_slope(moving: np.ndarray) -> np.ndarray:
+        over_ground = moving * sine[:, None] - moving[:, 2:] * direction
+        over_ground /= sine[:, None] ** 2
+        facing = moving - _dot(moving, direction)[:, None] * direction
+        return np.where(down[:, None], over_ground, facing)
+
+    return OwnMotion(
+        closing=closing,
+        acceleration=grows,
+        slip=np.where(down, closing - velocity[:, 2] / sine, 0.0),
+        slip_by_range=np.where(down, -turning[:, 2] / sine, 0.0),
+        slip_by_slope=by_slope(velocity),
+        slip_by_slope_and_range=by_slope(turning),
+        slip_by_target=np.where(down, np.sqrt(np.maximum(sine**-2 - 1.0, 0.0)), 0.0),
+        turn_rate=np.sqrt(_dot(turning, turning)),
+        priors=priors,
+    )
+
+
+def _per_shot(values: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    """Values (n,) in the shape of ranges (n, ...)."""
+    return values.reshape(-1, *[1] * (np.ndim(distance) - 1))
 
 
 def _dot(one: np.ndarray, other: np.ndarray) -> np.ndarray:

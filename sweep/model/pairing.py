@@ -16,6 +16,10 @@ PHYSICS section 2 leaves both open. Range and velocity are exchanged where that 
 
 An up (or down) peak in which two surfaces coincide serves one return only.
 
+An instrument that accelerates closes at another speed in each segment. With the default slopes this
+cancels in the half sum, as the Doppler segment is in the middle; with others it does not, and the
+tolerance is wider by what the instrument knows of it.
+
 Complex records keep their beats' signs: there is the one reading
 :data:`sweep.model.waveform.SIGNED`, and each surface's Doppler peak confirms it. Segments of other
 slopes are paired alike, by the Doppler beat that an up and a down beat predict; readings of a pair
@@ -110,12 +114,14 @@ def pair_peaks(up, doppler, down, third, fft_size, signed, tolerance, pairs):
 def confirm(up, doppler, down, third, fft_size, signed, tolerance):
     """Doppler peak and reading of an up and a down peak that fit best, within a tolerance [bins].
 
-    ``third`` (2,) is the share of up and of down beat in the Doppler segment's. ``signed``, of
-    complex records, is 1 where the down beat rises against the up beat as the range does, -1 where
-    it falls; 0 of real records. Returns mismatch and penalties [bins], inf where none comes within
-    the tolerance; the Doppler peak and the reading, -1 for none.
+    ``third`` (3,) is the share of up and of down beat in the Doppler segment's, and what the
+    instrument's motion between the segments moves that by [bins], which adds to the tolerance.
+    ``signed``, of complex records, is 1 where the down beat rises against the up beat as the range
+    does, -1 where it falls; 0 of real records. Returns mismatch and penalties [bins], inf where
+    none comes within the tolerance; the Doppler peak and the reading, -1 for none.
     """
     least, peak, best = np.inf, -1, -1
+    tolerance += third[2]
     for k in range(doppler.size):
         for code in range(SIGNED if signed else 0, SIGNED + 1 if signed else READINGS):
             if signed:

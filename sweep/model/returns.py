@@ -34,6 +34,7 @@ false alarms.
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -118,6 +119,10 @@ class Returns(NamedTuple):
     """int32: beamlet that a true or misread return has seen, -1 otherwise."""
     group: np.ndarray
     """(n, draws, most, 3) int8: number of the up, Doppler and down group; -1 none or false."""
+    range_per_slip: np.ndarray
+    """Change of the interpolated range [m] for 1 m/s of slip (:mod:`sweep.model.own_motion`)."""
+    radial_velocity_per_slip: np.ndarray
+    """Change of the interpolated radial velocity [m/s] for 1 m/s of slip."""
 
 
 def draw_returns(
@@ -136,7 +141,7 @@ def draw_returns(
     ``motion`` is what the instrument knows of its own, by which it corrects range and velocity.
     """
     noisy = method == "noise"
-    known, drawn = known_of(shots, found), Drawn.nothing(found, draws)
+    known, drawn = known_of(shots, found, motion), Drawn.nothing(found, draws)
     one = np.exp(shots.looks.log_alarm(known.levels[:, 1:2]))
     how, tables = How.of(shots, first_draw, noisy), interpolator(shots.window, shots.fft_size)
     for part, seen, leaks in _spectra(shots, found, noisy):
@@ -229,7 +234,7 @@ class Known(NamedTuple):
     alarm: np.ndarray
     """(n, 3): probability of a false alarm by noise alone."""
     third: np.ndarray
-    """(n, 2): as of :func:`sweep.model.pairing.confirm`."""
+    """(n, 3): as of :func:`sweep.model.pairing.confirm`."""
     beside: np.ndarray
     """(n, 2, most): probability of a group in the down segment, where the up segment's of the same
     number is missed, or detected."""
@@ -262,8 +267,11 @@ class Drawn(NamedTuple):
         )  # fmt: skip
 
 
-def known_of(shots: Shots, found: Groups) -> Known:
-    """Return what is known of shots and their groups before any draw."""
+def known_of(shots: Shots, found: Groups, motion: OwnMotion | None = None) -> Known:
+    """Return what is known of shots and their groups before any draw.
+
+    ``motion`` is as of :func:`draw_returns`.
+    """
     lines, amplitude = beamlet_lines(shots), shots.amplitude[shots.row]
     if shots.complex_record:
         apart = (lines - found.bin[:, :, :1]) / shots.fft_size
@@ -285,20 +293,32 @@ def known_of(shots: Shots, found: Groups) -> Known:
         bins, found.pd, found.neighbours, np.sqrt(np.maximum(square - mean**2, 0.0)), lines,
         amplitude, np.stack([shots.bin_deviation, *noise_levels(shots)], axis=1),
         np.zeros(found.leakage.shape),
-        np.stack([np.broadcast_to(part, shots.size) for part in _third(shots)], axis=1),
+        np.stack([np.broadcast_to(part, shots.size) for part in _third(shots, motion)], axis=1),
         np.ascontiguousarray(np.moveaxis(beside, 0, 1)), _searched(shots),
         np.empty((shots.size, 0)) if shots.fading is None else shots.fading.mixing().T.copy(),
     )  # fmt: skip
 
 
-def _third(shots: Shots) -> tuple[np.ndarray, np.ndarray]:
-    """Share of the up and of the down beat in the Doppler segment's, which these two tell."""
+def _third(
+    shots: Shots, motion: OwnMotion | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Share of the up and of the down beat in the Doppler segment's, which these two tell.
+
+    And the bins by which that is off for the motion that the instrument knows.
+    """
     _, doppler, down = shots.slopes
     up_carrier, at_doppler, at_down = (np.asarray(carrier) for carrier in shots.carriers)
     whole = at_down - down * up_carrier
-    return (doppler * at_down - down * at_doppler) / whole, (
-        at_doppler - doppler * up_carrier
-    ) / whole
+    up_share = (doppler * at_down - down * at_doppler) / whole
+    down_share = (at_doppler - doppler * up_carrier) / whole
+    if motion is None:
+        return up_share, down_share, np.zeros(())
+    moved_by = (motion.acceleration, motion.slip_at(shots.range))
+    off = sum(
+        abs((up_share * beats[0] + down_share * beats[2] - beats[1]) * moved)
+        for beats, moved in zip(_beats_by_motion(shots), moved_by, strict=True)
+    )
+    return up_share, down_share, np.asarray(off * shots.fft_size / shots.sample_rate)
 
 
 def _searched(shots: Shots) -> np.ndarray:
@@ -343,7 +363,7 @@ def measured(shots: Shots, known: Known, drawn: Drawn, motion: OwnMotion | None 
     ``motion`` is as of :func:`draw_returns`.
     """
     fitted = shots.slopes != waveform.SIGNS
-    drawn = _with_drift(shots, drawn)
+    drawn = _with_drift(shots, drawn, motion)
     told = _fitted(shots, drawn) if fitted else _read(shots, drawn)
     point, group = np.arange(shots.size)[:, None, None], np.maximum(drawn.group, 0)
     sizes = (known.bins[:, :, LAST] - known.bins[:, :, FIRST])[
@@ -363,8 +383,9 @@ def measured(shots: Shots, known: Known, drawn: Drawn, motion: OwnMotion | None 
     if not fitted:  # what the ground came nearer by within the shot: the measured velocity tells
         told.velocity[..., FINE] *= 1 + columns(shots, shots.slowing, 2)
         told.range[..., FINE] += told.velocity[..., FINE] * columns(shots, shots.walk, 2)
+    per_slip: tuple[np.ndarray | float, np.ndarray | float] = 0.0, 0.0
     if motion is not None:
-        _correct_motion(shots, drawn, told, motion)
+        per_slip = _correct_motion(shots, drawn, told, motion)
     for values, errors, before in zip(
         (told.range, told.velocity),
         (told.range_error, told.velocity_error),
@@ -380,11 +401,19 @@ def measured(shots: Shots, known: Known, drawn: Drawn, motion: OwnMotion | None 
         drawn.peaks[..., ::2, RATIO].min(axis=-1) ** 2 / 2, np.where(signal, pd, np.nan),
         np.where(misread, drawn.flags ^ (TRUE | MISREAD), drawn.flags), drawn.beamlet,
         np.maximum(drawn.group, FALSE),
+        *(np.where(drawn.flags > 0, change, np.nan) for change in per_slip),
     )  # fmt: skip
 
 
-def _with_drift(shots: Shots, drawn: Drawn) -> Drawn:
-    """Add to the peaks' errors what the drift of their lines within the record makes."""
+def _with_drift(shots: Shots, drawn: Drawn, motion: OwnMotion | None) -> Drawn:
+    """Add to the peaks' errors what the drift of their lines within the record makes.
+
+    It is that by the motion that the instrument knows, if there is one.
+    """
+    if motion is not None:
+        shots = replace(
+            shots, acceleration=motion.acceleration, approach=motion.approach_at(shots.range)
+        )
     bins = shots.record_duration * shots.fft_size / shots.sample_rate
     drift = np.array([np.broadcast_to(abs(rate) * bins, shots.size) for rate in shots.drift_rates])
     peaks = drawn.peaks.copy()
@@ -394,22 +423,28 @@ def _with_drift(shots: Shots, drawn: Drawn) -> Drawn:
     return drawn._replace(peaks=peaks)
 
 
-def _correct_motion(shots: Shots, drawn: Drawn, told: Told, motion: OwnMotion) -> None:
+def _correct_motion(
+    shots: Shots, drawn: Drawn, told: Told, motion: OwnMotion
+) -> tuple[np.ndarray, np.ndarray]:
     """Correct range and velocity between bins for the motion that the instrument knows, in place.
 
-    What it does not know of it goes into the standard errors (:mod:`sweep.model.own_motion`).
+    The standard deviation of what it does not know goes into the standard errors
+    (:mod:`sweep.model.own_motion`). Returns what range [s] and velocity change by 1 m/s of slip.
     """
     acceleration, slip = _moved_by_motion(shots, drawn)
     known_slip = motion.slip_at(told.range[..., FINE])
-    missing_slip = shots.radial_velocity - shots.approach - motion.slip_at(shots.range)
-    missing_acceleration = shots.acceleration - motion.acceleration
-    grows = columns(shots, motion.acceleration, 2)
-    pairs = ((told.range, told.range_error), (told.velocity, told.velocity_error))
-    for (values, errors), by_slip, by_acceleration in zip(pairs, slip, acceleration, strict=True):
+    grows, error = (
+        columns(shots, values, 2) for values in (motion.acceleration, motion.acceleration_error)
+    )
+    values_by = zip((told.range, told.velocity), slip, acceleration, strict=True)
+    for values, by_slip, by_acceleration in values_by:
         values[..., FINE] -= by_slip * known_slip + by_acceleration * grows
-        left = by_slip * columns(shots, missing_slip, 2)
-        left = left + by_acceleration * columns(shots, missing_acceleration, 2)
-        errors[:] = np.hypot(errors, left[..., None])
+    slip_error = motion.slip_error(told.range[..., FINE])
+    errors_by = zip((told.range_error, told.velocity_error), slip, acceleration, strict=True)
+    for errors, by_slip, by_acceleration in errors_by:
+        unknown = np.hypot(by_slip * slip_error, by_acceleration * error)
+        errors[:] = np.hypot(errors, unknown[..., None])
+    return slip
 
 
 def _moved_by_motion(
@@ -421,13 +456,7 @@ def _moved_by_motion(
     returns (n, draws, most).
     """
     carriers, rates = shots.beats_by_motion
-    starts = np.array([np.broadcast_to(start, shots.size) for start in shots.starts])
-    within = shots.record_middle
-    light = 2 / SPEED_OF_LIGHT
-    optical = np.array([np.broadcast_to(carrier, shots.size) for carrier in shots.carriers])
-    nearer = starts**2 / 2 + 2 * starts * within + 1.5 * within * shots.speeding
-    by_acceleration = light * (optical * (starts + shots.speeding) + rates * nearer)
-    by_slip = -light * rates * (starts + within)
+    by_acceleration, by_slip = _beats_by_motion(shots)
     if shots.slopes == waveform.SIGNS:  # half sum and half difference of up and down beat
         point: np.ndarray | slice = slice(None)
         weights, shape = np.array([[1.0], [0.0], [1.0]]) + 0 * rates, (shots.size, 1, 1)
@@ -446,6 +475,18 @@ def _moved_by_motion(
         for beats in (by_acceleration, by_slip)
     )
     return acceleration, slip  # type: ignore[return-value]  # pairs
+
+
+def _beats_by_motion(shots: Shots) -> tuple[np.ndarray, np.ndarray]:
+    """Hz that beats (3, n) gain by 1 m/s^2 of acceleration, and by 1 m/s of slip."""
+    rates = shots.beats_by_motion[1]
+    starts = np.array([np.broadcast_to(start, shots.size) for start in shots.starts])
+    within = shots.record_middle
+    light = 2 / SPEED_OF_LIGHT
+    optical = np.array([np.broadcast_to(carrier, shots.size) for carrier in shots.carriers])
+    nearer = starts**2 / 2 + 2 * starts * within + 1.5 * within * shots.speeding
+    by_acceleration = light * (optical * (starts + shots.speeding) + rates * nearer)
+    return by_acceleration, -light * rates * (starts + within)
 
 
 def _read(shots: Shots, drawn: Drawn) -> Told:

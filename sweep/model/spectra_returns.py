@@ -58,7 +58,7 @@ def spectra_returns(
     `parameters` are scalars; :data:`sweep.model.estimators.DEFAULTS` stand for any not given.
     """
     p, most = {**DEFAULTS, **parameters}, found.bin.shape[2]
-    known, drawn = known_of(shots, found), Drawn.nothing(found, draws)
+    known, drawn = known_of(shots, found, motion), Drawn.nothing(found, draws)
     how, tables = How.of(shots, first_draw, True), interpolator(shots.window, shots.fft_size)
     peaks, which = np.zeros((3, most + 1, 4)), np.empty((3, most + 1), np.int64)
     pairs, looks = np.empty((most + 1, 4), np.int64), math.sqrt(shots.looks.number)

@@ -407,12 +407,13 @@ def navigation(spec: SceneSpec, found: Sequence[Seen]) -> Chart | None:
 
 
 def _floor(spec: SceneSpec) -> list[str]:
-    """Errors that no echo lowers, where a flight has any."""
+    """Errors that no echo lowers, and errors that are not stated."""
     own = spec.to_yaml_mapping()["error_floor"]
     named = [
         f"{labels.coordinate(name)} {own[name]}" for name, value in spec.error_floor if value > 0
     ]
-    return [f"errors that no echo lowers: {', '.join(named)}"] if named else []
+    stated = [f"errors that no echo lowers: {', '.join(named)}"] if named else []
+    return stated + spec.unstated_errors()
 
 
 def noise_budget(study: SceneStudy, found: Sequence[Seen]) -> Chart | None:

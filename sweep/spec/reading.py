@@ -46,6 +46,7 @@ MOST_NODES = 200_000
 _INSTRUMENT: Location = ("instrument",)
 _EXAMPLE = "settembrini_2026"
 """Instrument of the library that remedies name."""
+_FLOOR = "error_floor"
 _LIBRARY = Path(__file__).parents[1] / "instruments"
 _THRESHOLDS = {way.removeprefix(PROCESSING) for way in WAYS}
 
@@ -326,8 +327,12 @@ class _Loader(yaml.SafeLoader):
         return node
 
 
-def resolve_instrument(document: Document, base: Path) -> bool:
-    """Put an instrument of the library or of a file in the place of its name; False without one."""
+def resolve_instrument(document: Document, base: Path, *, has_floor: bool = False) -> bool:
+    """Put an instrument of the library or of a file in the place of its name; False without one.
+
+    With ``has_floor`` an instrument of the library brings its ``error_floor`` too, to a study that
+    may have one; fields that the study states itself take its place.
+    """
     written = document.value.get("instrument")
     reference, location = written, _INSTRUMENT
     overrides: dict[str, Any] = {}
@@ -352,6 +357,9 @@ def resolve_instrument(document: Document, base: Path) -> bool:
     own = read.value["instrument"]
     _read_error_table(document, own, Path(read.file).parent)
     document.value["instrument"] = merged(_without_threshold(own, overrides), overrides)
+    stated = document.value.get(_FLOOR, {})
+    if has_floor and _FLOOR in read.value and isinstance(stated, Mapping):
+        document.value[_FLOOR] = merged(read.value[_FLOOR], stated)
     kept = {place: at for place, at in document.places.items() if _is_leaf(document.value, place)}
     within = {place: at for place, at in read.places.items() if place[:1] == _INSTRUMENT != place}
     document.places = document.places | within | kept

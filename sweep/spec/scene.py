@@ -239,6 +239,13 @@ AnyObject = Annotated[
 ]
 
 
+def has_relief(thing: Part) -> bool:
+    """Return true for ground that is no plane, and for what stands on it in numbers."""
+    if isinstance(thing, Plane):
+        return thing.relief is not None or thing.craters is not None
+    return isinstance(thing, Ground | Boulders | Trees)
+
+
 def materials(name: str, thing: Part) -> list[tuple[str, Material]]:
     """Materials of an object with the names of their surfaces, in the order that faces count."""
     if isinstance(thing, Trees):
@@ -290,8 +297,25 @@ class Navigation(Part):
         "0.1", "0", "10", default=10.0,
     )  # fmt: skip
     relief: float = of.length(
-        "Standard deviation of the ground's height", "1 m", "0 m", default=0.0
-    )
+        "Standard deviation of the ground's height about a plane; 0 says that it is a plane",
+        "1 m", "0 m", default=0.0,
+    )  # fmt: skip
+    terrain_slope: float = of.number(
+        "Standard deviation of the slope of the surface that a single beam meets, as far as it is "
+        "known beforehand: it moves the range unseen while the beam slides, and is in the standard "
+        "errors of points",
+        "0.1", "0", "10", default=0.2,
+    )  # fmt: skip
+    target_speed: float = of.quantity(
+        "Standard deviation of each component of the velocity of what the beams hit, as far as it "
+        "is known beforehand; it is in the standard errors of points",
+        "m/s", "10 m/s", "0 m/s", "10 km/s", default=0.0,
+    )  # fmt: skip
+    target_acceleration: float = of.quantity(
+        "Standard deviation of the acceleration of what the beams hit, as far as it is known "
+        "beforehand; it is in the standard errors of points",
+        "m/s^2", "3 m/s^2", "0 m/s^2", "1000 m/s^2", default=0.0,
+    )  # fmt: skip
 
 
 class ErrorFloor(Part):
@@ -315,6 +339,9 @@ class ErrorFloor(Part):
         "Velocity of the instrument's vibration along the beam, independent from shot to shot",
         "m/s", "1 cm/s", "0 m/s", "1 km/s", default=0.0,
     )  # fmt: skip
+    range_noise: float = of.length(
+        "Error of ranges, independent from shot to shot", "1 cm", "0 m", "1 km", default=0.0
+    )
 
 
 _CLIPPED = "what lies beyond is clipped and reported as invalid"

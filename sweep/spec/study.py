@@ -27,7 +27,13 @@ from sweep.model.resolution import BEAMLETS, is_open, rays_needed
 from sweep.model.threshold import WAYS
 from sweep.model.waveform import ENDS
 from sweep.spec.axes import Axis, Member, axis_identity, in_units, paths_on_axes, read_axes
-from sweep.spec.figures import Figure, SceneFigure, figure_findings, scene_figure_findings
+from sweep.spec.figures import (
+    LEAST_BEAMS,
+    Figure,
+    SceneFigure,
+    figure_findings,
+    scene_figure_findings,
+)
 from sweep.spec.flight import AnyScanner, Platform, shots_a_cycle
 from sweep.spec.grid_rules import (
     Condition,
@@ -154,7 +160,8 @@ class Study(Part):
         field and its axis may differ.
         """
         by_the_user = {} if base is None else _written_twice(document.value)
-        has_instrument = resolve_instrument(document, base or Path())
+        has_floor = "error_floor" in cls.model_fields
+        has_instrument = resolve_instrument(document, base or Path(), has_floor=has_floor)
         written = document.value
         lacks_instrument = "instrument" not in written
         filled = [
@@ -275,6 +282,10 @@ class Study(Part):
         if not isinstance(rule, Numeric):
             return str(rule.read(written))
         return in_units(rule, written, member.units)
+
+    def unstated_errors(self) -> list[str]:
+        """Return sentences on errors whose size the spec does not state; a grid states all."""
+        return []
 
     def identity(self) -> dict[str, Any]:
         """Content that makes the study this one, in SI values.
@@ -547,6 +558,30 @@ class SceneSpec(Study):
     def shots_a_cycle(self, name: str) -> int:
         """Shots of a measurement cycle of a scanner."""
         return shots_a_cycle(self.scan(name))
+
+    @property
+    def navigates(self) -> bool:
+        """True if a scanner has the shots in a cycle that navigation takes."""
+        return any(self.shots_a_cycle(name) >= LEAST_BEAMS for name in self.scanners)
+
+    def unstated_errors(self) -> list[str]:
+        """Return sentences on errors of navigation whose size the spec does not state."""
+        if not self.navigates:
+            return []
+        sentences = []
+        if not any(value for _, value in self.error_floor):
+            sentences.append(
+                "no floor of errors is stated (error_floor): velocity, altitude and their "
+                "covariances have the errors of noise and footprint alone, far below those of a "
+                "real instrument"
+            )
+        rough = [name for name, thing in self.scene.objects.items() if scenes.has_relief(thing)]
+        if rough and not self.navigation.relief:
+            sentences.append(
+                f"no relief is stated (navigation.relief), and {', '.join(rough)} is no plane: the "
+                "altitude's variance knows of relief only by the residuals of the beams"
+            )
+        return sentences
 
     def cycles(self, name: str) -> int:
         """Whole measurement cycles of a scanner, all of whose shots begin during the flight."""

@@ -52,6 +52,7 @@ if TYPE_CHECKING:
     from sweep.model.error_floor import ErrorFloor
     from sweep.model.eyepoints import Eyepoints
     from sweep.model.geometry.mesh import Surface
+    from sweep.model.own_motion import MotionPriors
     from sweep.spec import SceneSpec
     from sweep.spec.scene import World
 
@@ -400,6 +401,7 @@ class FlightStudy(GrowingStudy):
             effects=effects,
             flags=flags,
             estimates_rays=self.rays_accuracy is not None,
+            priors=self.motion_priors,
         )
         if not any(self.error_floor):
             return found
@@ -442,6 +444,7 @@ class FlightStudy(GrowingStudy):
             relief=self.spec.navigation.relief,
             jitter=self.spec.platform.jitter,
             floor=self.error_floor,
+            priors=self.motion_priors,
         )
 
     def _known(self, block: int, selected: Selected) -> KnownCloud:
@@ -492,8 +495,17 @@ class FlightStudy(GrowingStudy):
 
         floor = self.spec.error_floor
         return ErrorFloor(
-            floor.pointing_error, floor.clock_error, floor.wavelength_error, floor.vibration
-        )
+            floor.pointing_error, floor.clock_error, floor.wavelength_error, floor.vibration,
+            floor.range_noise,
+        )  # fmt: skip
+
+    @cached_property
+    def motion_priors(self) -> MotionPriors:
+        """Deviations of motion that the instrument does not measure, as the spec states them."""
+        from sweep.model.own_motion import MotionPriors
+
+        stated = self.spec.navigation
+        return MotionPriors(stated.terrain_slope, stated.target_speed, stated.target_acceleration)
 
     @cached_property
     def surfaces(self) -> tuple[Surface, ...]:

@@ -27,6 +27,8 @@ def _shots(seen):
         "platform_position": seen.position,
         "platform_velocity": seen.velocity,
         "beam_direction": seen.direction,
+        "beam_turning": seen.turning,
+        "platform_acceleration": seen.platform_acceleration,
     }
 
 
@@ -39,6 +41,7 @@ def _points(seen, *, draws=1, returns=3, range_error=0.02, velocity_error=3e-4):
         ("range", seen.range, range_error),
         ("radial_velocity", seen.radial_velocity, velocity_error),
     ):
+        points[f"{name}_per_slip"] = np.zeros(shape)
         for suffix, given in (
             ("_interpolated", value[:, None]),
             ("_interpolated_standard_error", error),
@@ -180,7 +183,8 @@ def test_the_grounds_slope_and_relief_are_passed_on():
     off = np.abs(usual["altitude"] - 900.0) / np.sqrt(usual["altitude_variance"])
     assert off.max() < 1e-3 and (usual["altitude_variance"] < 1e-2).all()
     assert (np.abs(held["altitude"] - 900.0) > 1.0).all()
-    np.testing.assert_allclose(rough["altitude_variance"], 7.0**2 / 4, rtol=1e-3)
+    # Of the mean of four points, and of the ground straight below.
+    np.testing.assert_allclose(rough["altitude_variance"], 7.0**2 / 4 + 7.0**2, rtol=1e-3)
     # Ranges of a slope contradict level ground of that relief, and the variance follows them.
     assert (contradicted["altitude_variance"] > 100 * rough["altitude_variance"]).all()
 
@@ -308,7 +312,7 @@ def test_jitter_spreads_velocity_and_altitude_as_stated():
     ranges = 1000.0 / -FOUR[:, 2]
     covariance, variance = _propagated(FOUR, sigma * across, sigma * ranges * tangent)
     stated = got["velocity_covariance"][:, 0]
-    # Covariances follow residuals that contradict them, by chance in one cycle of a thousand.
+    # Covariances follow residuals that contradict them, by chance in one cycle of ten thousand.
     as_stated = (np.abs(stated - covariance) <= 0.01 * covariance.max()).all(axis=(1, 2))
     assert as_stated.mean() > 0.996
     close = np.isclose(got["altitude_variance"], variance, rtol=0.01)

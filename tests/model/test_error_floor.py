@@ -14,6 +14,7 @@ from sweep.model.error_floor import ErrorFloor, stray
 from sweep.model.geometry.scanner import BeamCycle
 from sweep.model.navigation import solve
 from sweep.model.pairing import TRUE
+from sweep.scenes.eyepoint_arrays import to_arrays
 from sweep.spec import SceneSpec
 
 DRAWS = 20_000
@@ -24,7 +25,7 @@ BEAMS = np.array([
 ])  # fmt: skip
 """Of the Doppler lidar of NASA's deorbit, descent and landing flights, DDL-F1."""
 BEAMS /= np.linalg.norm(BEAMS, axis=1, keepdims=True)
-FLOOR = ErrorFloor(pointing=2e-3, clock=3e-4, wavelength=2e-4, vibration=0.05)
+FLOOR = ErrorFloor(pointing=2e-3, clock=3e-4, wavelength=2e-4, vibration=0.05, range_noise=0.2)
 ALONE = pytest.mark.parametrize(
     "name", [name for name, value in FLOOR._asdict().items() if value > 0]
 )
@@ -52,14 +53,14 @@ def test_standard_errors_are_those_of_an_instrument_that_takes_its_errors_for_no
         rate = 1 + normal[:, 0]
     elif name == "wavelength":
         lengths = wavelength * (1 + normal[:, 0])
-    else:
+    elif name == "vibration":
         shaken = normal[:, 0]
     doppler = 2 * (MOVING @ beam + shaken) / wavelength
     closing = doppler * rate * lengths / 2 - known @ MOVING
     floor = ErrorFloor(**{name: sigma})
     across = np.linalg.norm(np.cross(beam, MOVING))
     expected = floor.velocity_error(np.array(MOVING @ beam), across)
-    assert _spread_is(np.ravel(closing), expected)
+    assert _spread_is(np.ravel(closing), expected) if expected else not closing.any()
     if name == "clock":
         assert _spread_is(per_metre * far * rate / per_metre, floor.clock * far)
 
@@ -76,6 +77,7 @@ def _points(seen, draws, noise=0.0):
     shape, random = (len(seen.time), draws, 1), np.random.default_rng(3)
     points = {"flags": np.full(shape, TRUE, np.uint8), "position": np.full((*shape, 3), np.nan)}
     for name, error in NOISE.items():
+        points[f"{name}_per_slip"] = np.zeros(shape)
         truth = getattr(seen, name)[:, None, None] + np.zeros(shape)
         for suffix in ("", "_interpolated"):
             drawn = noise * error * random.standard_normal(shape) if noise else 0.0
@@ -101,23 +103,26 @@ def test_points_stray_by_what_they_state_together_or_each_by_itself(name):
         stated = found[f"{key}_interpolated_standard_error"][..., 0]
         own = np.sqrt((stated**2 - NOISE[key] ** 2).mean(axis=1))
         for shot in range(8):
-            there = name == "clock" or key == "radial_velocity"
+            there = name == "clock" or (key == "range") == (name == "range_noise")
             assert _spread_is(error[shot], own[shot]) if there else not error[shot].any()
     np.testing.assert_allclose(found["radial_velocity_compensated"][..., 0], closing, atol=1e-9)
-    alike = np.corrcoef(closing)
+    alike = np.corrcoef(far if name == "range_noise" else closing)
     number = np.arange(8) % 4
     together = {
         "clock": np.ones((8, 8), bool), "wavelength": np.ones((8, 8), bool),
-        "pointing": number == number[:, None], "vibration": np.eye(8, dtype=bool),
-    }[name]  # fmt: skip
+        "pointing": number == number[:, None],
+    }.get(name, np.eye(8, dtype=bool))  # fmt: skip
     sign = np.sign(np.outer(seen.radial_velocity, seen.radial_velocity))
     assert alike[together] == pytest.approx(sign[together], abs=1e-9)
     assert np.abs(alike[~together]).max(initial=0) < 5 / np.sqrt(DRAWS)
     at = seen.position[:, None] + seen.range[:, None, None] * seen.direction[:, None]
     apart = np.linalg.norm(found["position"][:, :, 0] - at, axis=2)
-    expected = {"clock": floor.clock, "pointing": np.sqrt(2) * floor.pointing}.get(name, 0.0)
+    expected = {
+        "clock": floor.clock * seen.range, "pointing": np.sqrt(2) * floor.pointing * seen.range,
+        "range_noise": np.full(8, floor.range_noise),
+    }.get(name, np.zeros(8))  # fmt: skip
     rms = np.sqrt((apart**2).mean(axis=1))
-    assert rms == pytest.approx(expected * seen.range, rel=5 / np.sqrt(DRAWS), abs=1e-9)
+    assert rms == pytest.approx(expected, rel=5 / np.sqrt(DRAWS), abs=1e-9)
 
 
 def test_any_stretch_of_shots_and_draws_is_the_same_bit_for_bit():
@@ -137,11 +142,7 @@ def test_velocity_and_altitude_stray_by_their_covariances(floor):
     """And residuals show the pointing and the vibration alone."""
     seen = _flown(1)
     found = _strayed(seen, _points(seen, DRAWS, noise=1.0), floor)
-    shots = {
-        "platform_position": seen.position, "platform_velocity": seen.velocity,
-        "beam_direction": seen.direction,
-    }  # fmt: skip
-    got = solve(shots, found, shots_a_cycle=4, ground_slope=0.0, floor=floor)
+    got = solve(to_arrays(seen), found, shots_a_cycle=4, ground_slope=0.0, floor=floor)
     off, stated = got["velocity"][0] - MOVING, got["velocity_covariance"][0].mean(axis=0)
     variance = np.diag(stated)
     spread = np.sqrt((np.outer(variance, variance) + stated**2) / DRAWS)

@@ -15,7 +15,8 @@ from sweep.model.returns import How, _third
 N, FS = 2**17, 600e6
 WIDTH = FS / N
 OPTICS = {"carrier": 299792458.0 / 1550e-9, "bandwidth": 1e9, "duration": 500e-6}
-AT_START = np.full(2, 0.5 * OPTICS["carrier"] / (OPTICS["carrier"] + OPTICS["bandwidth"] / 2))
+_SHARE = 0.5 * OPTICS["carrier"] / (OPTICS["carrier"] + OPTICS["bandwidth"] / 2)
+AT_START = np.array([_SHARE, _SHARE, 0.0])
 
 
 def _beats(target_range, radial_velocity):
