@@ -160,6 +160,11 @@ def chances(
         if shots.fading is None:
             return any_two(pd, miss), any_two(miss, pd)
         level = shots.threshold / shots.line_deviation
+        if shots.looks.several:
+            in_looks = shots.look_speckle
+            alike = np.abs(np.array(shots.fading)) if in_looks is None else in_looks.between
+            signals = magnitudes / shots.line_deviation
+            return shots.looks.faded_any_two(signals, level, alike, pd, in_looks)
         alike = np.abs(np.array(shots.fading))
         found, missed = fading_any_two(pd, miss, level, alike)
         speckle = shots.speckle_table
