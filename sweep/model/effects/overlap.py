@@ -37,6 +37,7 @@ Checks: :mod:`sweep.model.truth` gates each sample of each beamlet by its own de
 """
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -61,7 +62,7 @@ def size(points: Points) -> Size | None:
     c = _IMAGE * np.sqrt(least) - besides
     magnitude = np.where(late.lost > 0, np.where(c > 0, late.lost / c, np.inf), 0.0)
     each, gone = left(points), late.all.any(axis=0).astype(float)
-    remain = {"left": each, "left_of_all": each * points.footprint.gain}
+    remain: dict[str, Any] = {"left": each, "left_of_all": each * points.footprint.gain}
     if not points.may_add:
         lone = points.lobe.near(points.offset) - late.lost  # powers: each line by its own share
         own = np.where(lone > 0, np.minimum(each / np.maximum(lone, 1e-300), 1.0), 1.0)

@@ -26,9 +26,9 @@ add as powers. A bin then crosses the threshold with Swerling's first probabilit
 bins as two correlated ones do. Their correlation falls with the Doppler shifts and the ranges that
 differ over the beam, by :mod:`sweep.model.speckle_correlation`. It is in
 closed form, as beamlets that are enough for the power of a bin may be too few for it. It acts on
-the detection. In the closed form of a segment's leakage the echo keeps its mean power; where false
-peaks are drawn, and in the probabilities of a flight, its leaked signal fades with it
-(:mod:`sweep.model.leaked_peaks`).
+the detection, and on leakage: what an echo leaks fades with it, in closed form
+(:mod:`sweep.model.leakage`) as where false peaks are drawn (:mod:`sweep.model.leaked_peaks`). Of
+several looks leakage is that of the mean echo.
 """
 
 import math
