@@ -47,6 +47,13 @@ class Facet:
     """In the order of time."""
     gap: float = 0.0
     complex_record: bool = False
+    looks: int = 1
+    """Waveforms that follow one another."""
+    slide: float = 0.0
+    """Speed at which the range falls beyond the scatterers' radial velocity [m/s].
+
+    The beam slides over the ground, and other scatterers of the same mean power take the places of
+    those that leave it."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +84,12 @@ def scatterer_delays(
 
 
 def scatterer_spectra(
-    facet: Facet, segment: str, bins: np.ndarray, delay: np.ndarray, doppler: np.ndarray
+    facet: Facet,
+    segment: str,
+    bins: np.ndarray,
+    delay: np.ndarray,
+    doppler: np.ndarray,
+    look: int = 0,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Windowed transforms of each scatterer's analytic beat at the bins and at their negatives.
 
@@ -86,7 +98,8 @@ def scatterer_spectra(
     """
     samples = np.arange(facet.window.size)
     time = facet.acquisition_delay + samples / facet.sample_rate
-    start = facet.segments.index(segment) * (facet.duration + facet.gap)
+    start = facet.segments.index(segment) + look * len(facet.segments)
+    start *= facet.duration + facet.gap
     slope = SLOPES[segment] * facet.bandwidth / facet.duration
     carrier = SPEED_OF_LIGHT / facet.wavelength
     carrier += facet.bandwidth if slope < 0 else 0.0
@@ -96,9 +109,14 @@ def scatterer_spectra(
         tau = tau_0 - beta * (start + time)
         # Whole cycles go first: float64 cannot hold them together with their fraction.
         cycles = -np.mod(carrier * tau_0, 1.0) + carrier * beta * (start + time)
+        tau = tau - 2 * facet.slide / SPEED_OF_LIGHT * (start + time)
         cycles += slope * tau * (tau / 2 - time)
         exists = (time >= tau) & (time <= facet.duration)
         record = facet.window * exists * np.exp(2j * np.pi * np.mod(cycles, 1.0))
+        if bins.size == 1:
+            turned = np.exp(-2j * np.pi * (bins[0] * samples % facet.fft_size) / facet.fft_size)
+            at_bins[b], at_negatives[b] = (record * turned).sum(), (record * turned.conj()).sum()
+            continue
         spectrum = np.fft.fft(record, facet.fft_size)
         at_bins[b] = spectrum[bins % facet.fft_size]
         at_negatives[b] = spectrum[-bins % facet.fft_size]
@@ -164,6 +182,44 @@ def draw_spectra(
             spectra.bins[segment] = bins
             spectra.values[segment] = echo + parts[:, : bins.size] + 1j * parts[:, bins.size :]
         yield spectra
+
+
+def draw_looks(
+    facet: Facet,
+    *,
+    bins: dict[str, int],
+    amplitude: dict[str, float],
+    noise_deviation: float,
+    draws: int,
+    seed: int,
+    scatterers: int = 48,
+    renewals: int = 4,
+) -> dict[str, np.ndarray]:
+    """Draw X of one bin of each segment in every look of a shot, (draws, looks) complex.
+
+    Parameters as of :func:`draw_spectra`. The noise of looks is independent, and circular: the bins
+    lie far from DC and Nyquist.
+    """
+    rng = np.random.default_rng(seed)
+    number = draws // renewals
+    drawn: dict[str, list[np.ndarray]] = {segment: [] for segment in facet.segments}
+    sigma = noise_deviation * np.sqrt((facet.window**2).sum() / 2)
+    for _ in range(renewals):
+        delay, doppler = scatterer_delays(facet, scatterers, rng)
+        waves = rng.normal(size=(number, scatterers)) + 1j * rng.normal(size=(number, scatterers))
+        waves /= np.sqrt(2 * scatterers)
+        for segment in facet.segments:
+            looks = np.empty((number, facet.looks), complex)
+            for look in range(facet.looks):
+                at_bin, at_negative = scatterer_spectra(
+                    facet, segment, np.array([bins[segment]]), delay, doppler, look
+                )
+                looks[:, look] = waves @ at_bin[:, 0] / 2
+                if not facet.complex_record:
+                    looks[:, look] += np.conj(waves @ at_negative[:, 0]) / 2
+            noise = rng.normal(size=(2, number, facet.looks))
+            drawn[segment].append(amplitude[segment] * looks + sigma * (noise[0] + 1j * noise[1]))
+    return {segment: np.concatenate(parts) for segment, parts in drawn.items()}
 
 
 def echo_bins(facet: Facet, segment: str, reach: int) -> np.ndarray:

@@ -16,6 +16,10 @@ bins). Three things bias the estimate: other lines within the reach of the kerne
 image near DC and Nyquist, and a footprint that spreads over bins. A footprint's estimate is that of
 its centre. Noise biases it in the rectangular window, where the wrong neighbour may be larger.
 
+An echo that arrives after its record has begun lacks the first samples, and its line is that of a
+shortened window. The place that these tables give is corrected for that, as the instrument knows
+its window and, from the whole bins, the delay (:func:`late_echo`): exact for a lone tone.
+
 A footprint whose lines add as powers and spread by s [bins, standard deviation] about their mean
 broadens the peak, which moves the estimate by some multiple of s^2, tabulated as `widening`.
 
@@ -254,6 +258,85 @@ def _drift_shifts(window: Window, fft_size: int) -> np.ndarray:
             estimate = sub_bin(magnitudes[0], magnitudes[1], magnitudes[2], tables)
             found[i, j] = abs(estimate - place) / drift**2
     return found
+
+
+_LATE_PLACES = 65
+"""Places past a bin at which echoes of part of a record are tried."""
+_LATE_SHARES = np.concatenate([np.arange(0.0, 0.8, 0.02), np.arange(0.8, 0.985, 0.01)])
+"""Shares of a record's samples that such echoes lack."""
+_LEAST_SLOPE = 0.05
+_STEP = 1e-4
+
+
+class LateEcho(NamedTuple):
+    """Correction of places between bins of echoes that lack a record's first samples."""
+
+    shift: np.ndarray
+    """To be added to the place past the centre bin [bins], of its sign."""
+    wider: np.ndarray
+    """Factor on the standard error, by noise, of :func:`sub_bin_error`."""
+
+
+def late_echo(delta: np.ndarray, lacking: np.ndarray, window: Window, fft_size: int) -> LateEcho:
+    """Correct :func:`sub_bin` for an echo that has no sample before a given one of the record.
+
+    Parameters
+    ----------
+    delta
+        Place past the centre bin that :func:`sub_bin` gives [bins].
+    lacking
+        Samples at the record's start without an echo.
+    """
+    shift, wider = _late_tables(window, fft_size)
+    delta, share = np.broadcast_arrays(delta, np.asarray(lacking) / window.length)
+    at = np.clip(share, 0.0, _LATE_SHARES[-1]), np.minimum(np.abs(delta), 1.0)
+    places = _LATE_SHARES, np.linspace(0.0, 1.0, _LATE_PLACES)
+    own_shift, own_width = (
+        RegularGridInterpolator(places, table, bounds_error=False)(at) for table in (shift, wider)
+    )
+    late = share > 0
+    return LateEcho(np.where(late, np.sign(delta) * own_shift, 0.0), np.where(late, own_width, 1.0))
+
+
+@lru_cache(maxsize=32)
+def _late_tables(window: Window, fft_size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Shift and factor on the error by share and place that is read, (shares, places) each."""
+    w, tables = samples(window.name, window.length), interpolator(window, fft_size)
+    first = np.minimum(np.rint(_LATE_SHARES * w.size).astype(int), w.size - 2)
+    place = np.linspace(0.0, 1.0, _LATE_PLACES)
+    tone = np.empty((first.size, place.size, 3), complex)
+    for j, delta in enumerate(place):
+        for k in (-1, 0, 1):
+            terms = w * phasors((k - delta) / fft_size, w.size)
+            tone[:, j, k + 1] = np.cumsum(terms[::-1])[::-1][first]
+    turns = np.arange(w.size) / fft_size
+    near, far = ((w**2 * np.exp(-2j * np.pi * d * turns)).sum() / window.energy for d in (1, 2))
+    noise = np.array(
+        [[1, near.conjugate(), far.conjugate()], [near, 1, near.conjugate()], [far, near, 1]]
+    )
+    shift, wider = np.zeros((2, first.size, place.size))
+    for i in range(first.size):
+        size = np.abs(tone[i])
+        scale = np.maximum(size[:, 1:2], 1e-300)
+        phase, size = tone[i] / np.maximum(size, 1e-300), size / scale
+        read = np.array([sub_bin(*row, tables) for row in size])
+        read = np.maximum.accumulate(np.maximum(read, 0.0))
+        slope = np.maximum(np.gradient(read, place), _LEAST_SLOPE)
+        rises = np.empty(size.shape)
+        for k in range(3):
+            less, more = size.copy(), size.copy()
+            less[:, k] -= _STEP
+            more[:, k] += _STEP
+            for j in range(place.size):
+                rises[j, k] = (sub_bin(*more[j], tables) - sub_bin(*less[j], tables)) / (2 * _STEP)
+        weight = rises * phase
+        variance = np.einsum("jk,kl,jl->j", weight.conj(), noise, weight).real
+        error = np.sqrt(np.maximum(variance, 0.0)) / slope
+        whole = np.interp(place, np.linspace(0, 1, tables.error.size), tables.error)
+        distinct = np.append(True, np.diff(read) > 1e-9)
+        shift[i] = np.interp(place, read[distinct], place[distinct]) - place
+        wider[i] = np.interp(place, read[distinct], (error / whole)[distinct])
+    return shift, wider
 
 
 @njit(cache=True, error_model="numpy")

@@ -11,6 +11,14 @@ over bins is an integral and corrections at its near end (Euler's and Maclaurin'
 differences). As |X|^2 is even about DC and about Nyquist, there is none at the far end but half the
 value there. In v = cot(pi q / N), q the distance from the lines, the integrand is nearly a
 polynomial: some thirty Gauss points stand for sixty thousand bins.
+
+If the echo is in developed speckle, what leaks fades with it. Given the power u of the speckle, of
+mean 1, bins of u |X|^2 leak with a probability 1 - exp(-R(u)), and the mean is
+
+    P = int_0^inf e^{-u} (1 - exp(-R(u))) du.
+
+ln R is computed at powers a factor of 2 apart, with a monotone cubic between
+(:func:`fading_mean`). Bins that the mean echo leaves exempt stay so at any power.
 """
 
 import math
@@ -27,6 +35,7 @@ from sweep.model.crossings import (
 )
 from sweep.model.detection import mark
 from sweep.model.spectrum import (
+    AFAR,
     CHANCE,
     F_IM,
     F_RE,
@@ -66,6 +75,13 @@ MOST_POINTS = 200
 WHOLE, HALF = np.bool_(False), np.bool_(True)
 """As arguments, of NumPy because Python's would compile what takes them once more."""
 
+LOUDEST = 16.0
+"""Power of speckle, of mean 1, up to which leakage is averaged: e^-16 of draws are brighter."""
+SPECKLE_POWERS = LOUDEST * 2.0 ** -np.arange(10.0)
+_SPECKLE_STEPS = 160
+FAINTEST_RATE = 1e-30
+"""R below which nothing leaks."""
+
 _LARGEST_ORDER = 12
 _GAUSS = np.zeros((2, _LARGEST_ORDER + 1, _LARGEST_ORDER))
 for _n in range(1, _LARGEST_ORDER + 1):
@@ -77,25 +93,31 @@ def inspect(origin, lines, noise, table, form, sizes, tangent, room, exempt, ser
     """Run of bins, detection and leakage of a segment's lines; all bins are accounted for.
 
     Arguments and results as of :func:`sweep.model.spectrum.detect`, and the leakage last.
-    ``noise``: sigma per quadrature; threshold; probability of leakage that may be left out.
+    ``noise``: sigma per quadrature; threshold; probability of leakage that may be left out; and
+    LOUDEST where the echo fades, else 1.
     ``series``:
     :func:`sweep.model.crossings.crossing_series` of the threshold.
     """
     n, lowest, highest, total, faint = lines
+    sigma, level, tolerance, loudest = noise
+    noise = sigma, level, tolerance
+    # Bounds are those of the brightest speckle.
+    dark = 1.0 / math.sqrt(loudest)
+    bright = sigma * dark, level * dark, tolerance
     half, beside, afar = sizes[0] // 2, sizes[6], total
     place = seen(origin, lowest, highest, sizes)
     mirror = max(min(place[0], half - place[1]), 0.0) if sizes[7] == IMAGED else math.inf
-    least = crossing = max(stays_below(noise[1], total, place, form, sizes), float(beside))
-    left = noise[2] - _all_beyond(afar, least, mirror, noise, form)
+    least = crossing = max(stays_below(bright[1], total, place, form, sizes), float(beside))
+    left = noise[2] - _all_beyond(afar, least, mirror, bright, form)
     if left < 0.0 or crossing > beside:
         sources = take_sources(n, lowest, highest, float(beside), SOURCE_DIGITS, sizes, room)
         afar = weight_afar(total, sources, sizes, room)
-        crossing = max(stays_below(noise[1], afar, place, form, sizes), float(beside))
+        crossing = max(stays_below(bright[1], afar, place, form, sizes), float(beside))
         least = min(crossing, float(beside + half))
-        left = noise[2] - _all_beyond(afar, least, mirror, noise, form)
+        left = noise[2] - _all_beyond(afar, least, mirror, bright, form)
         while left < 0.0 and least < sizes[2]:  # bins that tables hold take less than an integral
             least = min(1.25 * least, float(sizes[2]))
-            left = noise[2] - _all_beyond(afar, least, mirror, noise, form)
+            left = noise[2] - _all_beyond(afar, least, mirror, bright, form)
     known = n, lowest, highest, faint / max(total, 1e-300)
     if left >= 0.0:
         low, high = run_of(least, place, sizes)
@@ -103,12 +125,14 @@ def inspect(origin, lines, noise, table, form, sizes, tangent, room, exempt, ser
         magnitudes(low, count, origin, known, room[:2, :0], table, form, sizes, tangent, room)
         peak, exempted = mark(room[OUT], count, noise[1], exempt, sizes[8])
         chance = 0.0
-        if not (left > 0.0 and _at_most(count, noise, exempt, room) <= left):
+        if not (left > 0.0 and _at_most(count, bright, exempt, room) <= left):
             _chances(count, noise, room, exempt, series)
             chance = any_crossing(room[CHANCE], ZERO, count)
+            if loudest > 1.0:
+                chance = _faded_bins(count, noise, room, exempt, series)
         return low, count, peak, exempted, chance
     near_low, near_high = run_of(float(beside), place, sizes)
-    reach = _least_reach(afar, highest - lowest, noise, crossing, form, sizes)
+    reach = _least_reach(afar, highest - lowest, bright, crossing, form, sizes)
     while True:
         low, high = near_low - reach, near_high + reach
         low = 0 if low <= reach + APRON else low
@@ -118,8 +142,9 @@ def inspect(origin, lines, noise, table, form, sizes, tangent, room, exempt, ser
         peak, exempted = mark(room[OUT], count, noise[1], exempt, sizes[8])
         run = low, count, peak, origin
         leakage, settled = _leakage(
-            run, (n, lowest, highest), place, noise, form, sizes, tangent, room, exempt, series
-        )
+            run, (n, lowest, highest), place, noise, form, sizes, tangent, room, exempt, series,
+            loudest,
+        )  # fmt: skip
         if settled:
             return low, count, peak, exempted, leakage
         reach *= 2
@@ -133,6 +158,72 @@ def of_bins(count, noise, floor, room, exempt, series):
             exempt[i] = True
     _chances(count, noise, room, exempt, series)
     return any_crossing(room[CHANCE], ZERO, count)
+
+
+@njit(cache=True, error_model="numpy")
+def of_fading_bins(count, noise, floor, room, exempt, series):
+    """Compute :func:`of_bins` for an echo in developed speckle."""
+    for i in range(count):
+        if room[OUT, i] < floor * noise[0]:
+            exempt[i] = True
+    return _faded_bins(count, noise, room, exempt, series)
+
+
+@njit(cache=True, error_model="numpy")
+def _faded_bins(count, noise, room, exempt, series):
+    """Mean leakage of a run's bins over developed speckle."""
+    log_rates = np.empty(SPECKLE_POWERS.size)
+    for k in range(SPECKLE_POWERS.size):
+        root = math.sqrt(SPECKLE_POWERS[k])
+        _chances(count, (noise[0] / root, noise[1] / root), room, exempt, series)
+        chance = any_crossing(room[CHANCE], ZERO, count)
+        if k == 0 and chance < 1e-12:
+            return 0.0
+        log_rates[k] = _log_rate(chance)
+    return fading_mean(log_rates)
+
+
+@njit(cache=True, error_model="numpy")
+def _log_rate(chance):
+    """Logarithm of -ln(1 - chance)."""
+    return math.log(max(silence(min(chance, 1.0 - 1e-15)), FAINTEST_RATE))
+
+
+@njit(cache=True, error_model="numpy")
+def _common_slope(one, other):
+    """Harmonic mean of two slopes of one sign, or 0."""
+    return 2.0 * one * other / (one + other) if one * other > 0.0 else 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def fading_mean(log_rates):
+    """Mean of 1 - exp(-R) over an exponential power, of ln R at SPECKLE_POWERS.
+
+    Below the last of them R is proportional to the power.
+    """
+    last = log_rates.size - 1
+    mean, before, chance_before = 0.0, 0.0, 0.0
+    for i in range(1, _SPECKLE_STEPS + 1):
+        # Places closer together where powers are small, up to LOUDEST.
+        share = i / _SPECKLE_STEPS
+        power = LOUDEST * share * share
+        place = -math.log2(share * share)
+        k = int(place)
+        if k >= last:
+            log_rate = log_rates[last] - (place - last) * math.log(2.0)
+        else:
+            x, rest = place - k, log_rates[k + 1] - log_rates[k]
+            before_it = log_rates[k] - log_rates[k - 1] if k > 0 else rest
+            after_it = log_rates[k + 2] - log_rates[k + 1] if k + 2 <= last else rest
+            # A monotone cubic [Fritsch and Butland, SIAM J. Sci. Stat. Comput. 5, 300, 1984].
+            low, high = _common_slope(before_it, rest), _common_slope(rest, after_it)
+            log_rate = log_rates[k] + x * (
+                low + x * (3.0 * rest - 2.0 * low - high + x * (low + high - 2.0 * rest))
+            )
+        chance = -math.expm1(-math.exp(min(log_rate, 4.0))) * math.exp(-power)
+        mean += 0.5 * (chance + chance_before) * (power - before)
+        before, chance_before = power, chance
+    return mean
 
 
 @njit(cache=True, error_model="numpy")
@@ -197,7 +288,7 @@ def _at_most(count, noise, exempt, room):
 @njit(cache=True, error_model="numpy")
 def _chances(count, noise, room, exempt, series):
     """Compute the added crossing probabilities of a run of bins, into row CHANCE."""
-    sigma, level, _ = noise
+    sigma, level = noise[0], noise[1]
     scale = 0.5 / (sigma * sigma)
     for i in range(count):
         room[HALF_SQUARE, i] = 0.0 if exempt[i] else room[OUT, i] * room[OUT, i] * scale
@@ -216,8 +307,11 @@ def _least_reach(weight, spread, noise, crossing, form, sizes):
 
 
 @njit(cache=True, error_model="numpy")
-def _leakage(run, lines, place, noise, form, sizes, tangent, room, exempt, series):
-    """Leakage of the run and of all beyond it; False where the run is too short to tell."""
+def _leakage(run, lines, place, noise, form, sizes, tangent, room, exempt, series, loudest):
+    """Leakage of the run and of all beyond it; False where the run is too short to tell.
+
+    If the echo fades (``loudest`` above 1) the mean over its speckle.
+    """
     low, count, peak, origin = run
     sigma, level, _ = noise
     fft_size, half = sizes[0], sizes[0] // 2
@@ -226,6 +320,8 @@ def _leakage(run, lines, place, noise, form, sizes, tangent, room, exempt, serie
     below, above = low > 0, low + count - 1 < half
     some = any_crossing(room[CHANCE], APRON if below else ZERO, count - APRON if above else count)
     if not below and not above:
+        if loudest > 1.0:
+            some = _faded_bins(count, noise, room, exempt, series)
         return some, True
     centre = abs(math.floor(0.5 * (place[0] + place[1]) + 0.5))
     centre = fft_size - centre if centre > half else centre
@@ -251,13 +347,42 @@ def _leakage(run, lines, place, noise, form, sizes, tangent, room, exempt, serie
     _far_values(points, centre, origin, lines, digits, form, sizes, tangent, room)
     for i in range(points):
         room[HALF_SQUARE, i] *= scale
+        room[AFAR, i] = room[HALF_SQUARE, i]
     largest_beyond = largest(room[HALF_SQUARE, :points])
     added_crossings(room[HALF_SQUARE], points, beta, series, room[CHANCE])
     tail += weighted_silence(room[CHANCE, :points], room[WEIGHT, :points])
     most = min(0.45 * beta * beta, room[OUT, peak] * room[OUT, peak] * scale)
     if not (largest_beyond <= most and rest <= SMOOTHNESS * (some + tail)):
         return 0.0, False
+    if loudest > 1.0:
+        return _faded(run, points, noise, below, above, sizes, room, exempt, series), True
     return some - (1.0 - some) * math.expm1(-tail), True
+
+
+@njit(cache=True, error_model="numpy")
+def _faded(run, points, noise, below, above, sizes, room, exempt, series):
+    """Mean over developed speckle of the leakage of a run and of the points beyond it."""
+    count = run[1]
+    sigma, level, _ = noise
+    log_rates = np.empty(SPECKLE_POWERS.size)
+    first, last = APRON if below else 0, count - APRON if above else count
+    for k in range(SPECKLE_POWERS.size):
+        power = SPECKLE_POWERS[k]
+        root, tail = math.sqrt(power), 0.0
+        _chances(count, (sigma / root, level / root), room, exempt, series)
+        some = any_crossing(room[CHANCE], first, last)
+        for side in (-1, 1):
+            if below if side < 0 else above:
+                tail += _near_end(side, count, room[CHANCE], exempt)[0]
+        for i in range(points):
+            room[HALF_SQUARE, i] = room[AFAR, i] * power
+        added_crossings(room[HALF_SQUARE], points, level / sigma, series, room[CHANCE])
+        tail += weighted_silence(room[CHANCE, :points], room[WEIGHT, :points])
+        chance = some - (1.0 - some) * math.expm1(-max(tail, 0.0))
+        if k == 0 and chance < 1e-12:
+            return 0.0
+        log_rates[k] = _log_rate(chance)
+    return fading_mean(log_rates)
 
 
 @njit(cache=True, error_model="numpy")

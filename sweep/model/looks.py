@@ -13,21 +13,23 @@ noise per quadrature of one record,
   off, and are then one record of N times less noise. The part of their sum that a laser's walking
   phase and an acceleration leave is in :func:`coherent_gain`.
 
-An echo in developed speckle fades. Looks follow one another at once, so that by default all have
-one speckle; where the beam moves on by its own width from look to look each has its own
-(``speckle: independent``). The mean of Q_N over speckle is Swerling's first case, with x = a^2 / 2
-the mean SNR of one record and Y = N b^2 / 2,
+An echo in developed speckle fades. All looks have one speckle (``speckle: common``), or each has
+its own, as the beam moves on by its own width from look to look (``speckle: independent``). The
+mean of Q_N over speckle is Swerling's first case, with x = a^2 / 2 the mean SNR of one record and
+Y = N b^2 / 2,
 
     Q(N-1, Y) + (1 + 1 / (N x))^(N-1) e^(-Y / (1 + N x)) P(N-1, Y / (1 + 1 / (N x))),
 
 or, where looks fade apart, his second: Q(N, Y / (1 + x)) [Swerling, IRE Trans. Inf. Theory 6, 269,
-1960; Richards, Fundamentals of Radar Signal Processing, 2005, 6.3].
+1960; Richards, Fundamentals of Radar Signal Processing, 2005, 6.3]. Between these two, looks share
+their speckle in part, by the motion from one to the next (``speckle: motion``):
+:mod:`sweep.model.look_speckle`.
 
 Q_N is that of scipy's noncentral chi square, whose error is 1e-11 of either tail down to 1e-300.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -35,14 +37,22 @@ import numpy as np
 from scipy import special
 
 from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.look_speckle import (
+    NODES,
+    LookSpeckle,
+    correlated_magnitudes,
+    independent_speckles,
+    mean_power_tails,
+    votes_given_speckle,
+)
 
 POWER, BINARY, COHERENT = COMBINED = ("power", "binary", "coherent")
-COMMON, INDEPENDENT = SPECKLES = ("common", "independent")
+MOTION, COMMON, INDEPENDENT = SPECKLES = ("motion", "common", "independent")
 NUMBER, COMBINE, VOTES, SPECKLE = (
     f"instrument.looks.{name}" for name in ("number", "combine", "votes", "speckle")
 )
 DEFAULTS: dict[str, float | int | str | np.ndarray] = {
-    NUMBER: 1, COMBINE: POWER, VOTES: 1, SPECKLE: COMMON,
+    NUMBER: 1, COMBINE: POWER, VOTES: 1, SPECKLE: MOTION,
 }  # fmt: skip
 
 MOST_PLACES = 64
@@ -69,6 +79,8 @@ class Looks(NamedTuple):
     combine: str = POWER
     votes: int = 1
     independent: bool = False
+    moving: bool = False
+    """Speckle changes from look to look as the motion between them makes it."""
 
     @classmethod
     def of(cls, p: Mapping[str, Any]) -> "Looks":
@@ -76,7 +88,8 @@ class Looks(NamedTuple):
         number, combine, votes, speckle = (
             np.asarray(p.get(path, value)).flat[0] for path, value in DEFAULTS.items()
         )
-        return cls(int(number), str(combine), int(votes), str(speckle) == INDEPENDENT)
+        law = str(speckle)
+        return cls(int(number), str(combine), int(votes), law == INDEPENDENT, law == MOTION)
 
     @property
     def several(self) -> bool:
@@ -137,9 +150,16 @@ class Looks(NamedTuple):
         found[near], missed[near] = np.where(rare, (tail, 1 - tail), (1 - tail, tail))
         return found, missed
 
-    def faded(self, signal: np.ndarray, level: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Compute :meth:`steady` for a signal in developed speckle, of mean power signal^2."""
+    def faded(
+        self, signal: np.ndarray, level: np.ndarray, speckle: LookSpeckle | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Compute :meth:`steady` for a signal in developed speckle, of mean power signal^2.
+
+        ``speckle`` is that of looks which share it in part; signals are (..., 3, n) then.
+        """
         signal, level = np.broadcast_arrays(np.asarray(signal, float), np.asarray(level, float))
+        if speckle is not None and self.several:
+            return self._faded_in_part(signal, level, speckle)
         y = np.square(level) / (2 + np.square(signal))
         if not self.several or (self.combine == BINARY and self.independent):
             found, missed = np.exp(-y), -np.expm1(-y)
@@ -149,8 +169,8 @@ class Looks(NamedTuple):
                 self.number, self.number * y
             )
         if self.combine == BINARY:
-            speckle, weight = self.speckle_nodes(level, signal)
-            each = self.steady(signal[..., None] * speckle, level[..., None])
+            magnitude, weight = self.speckle_nodes(level, signal)
+            each = self.steady(signal[..., None] * magnitude, level[..., None])
             found, missed = (np.minimum((v * weight).sum(axis=-1), 1.0) for v in each)
             return found, missed
         n, least = self.number, 0.5 * self.number * np.square(level)
@@ -166,17 +186,79 @@ class Looks(NamedTuple):
         found = np.minimum(first + np.exp(log_rest), 1.0)
         return found, np.maximum(-np.expm1(log_rest) - first, 0.0)
 
+    def _faded_in_part(
+        self, signal: np.ndarray, level: np.ndarray, speckle: LookSpeckle
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Compute :meth:`faded` for looks that share their speckle in part."""
+        if self.combine == POWER:
+            snr, threshold = 0.5 * np.square(signal), 0.5 * self.number * np.square(level)
+            return mean_power_tails(speckle, self.number, snr, threshold)
+        found = np.empty(signal.shape)
+        for segment, point in np.ndindex(signal.shape[-2:]):
+            magnitude = self._speckle_nodes(speckle, segment, point)
+            for lead in np.ndindex(signal.shape[:-2]):
+                at = (*lead, segment, point)
+                given = votes_given_speckle(signal[at], level[at], self.votes, magnitude)
+                found[at] = given.mean()
+        lone = np.exp(-np.square(level) / (2 + np.square(signal)))
+        apart = self.votes_of(lone, 1 - lone)[0]
+        for at in np.ndindex(signal.shape):
+            of_lattice = votes_given_speckle(
+                signal[at], level[at], self.votes, self._lattice()
+            ).mean()
+            share = (speckle.shape[at[-2:]] - 1) / (self.number - 1)
+            found[at] += share * (apart[at] - of_lattice)
+        found = np.clip(found, 0.0, 1.0)
+        return found, 1 - found
+
+    def _lattice(self) -> np.ndarray:
+        """Magnitudes (NODES, N) of independent speckles."""
+        return np.abs(independent_speckles(self.number))
+
+    def _speckle_nodes(self, speckle: LookSpeckle, segment: int, point: int) -> np.ndarray:
+        """Magnitudes (NODES, N) of the speckle of a segment's looks."""
+        root = speckle.root(segment, point)
+        return correlated_magnitudes(independent_speckles(root.shape[1]), root)
+
+    def given_speckle(
+        self, signals: Sequence[np.ndarray], level: np.ndarray, speckle: LookSpeckle | None
+    ) -> tuple[list[np.ndarray], np.ndarray]:
+        """Compute detection given the speckle of all looks, if segments share all of it.
+
+        Returns
+        -------
+        list
+            Of each signal (..., n) the probability (..., n, k) in k speckles.
+        numpy.ndarray
+            Weights of the speckles, which add to 1.
+        """
+        if self.combine == POWER or (speckle is None and not self.independent):
+            shape = np.broadcast_to(self._effective_number(speckle), level.shape)
+            magnitude, weight = self.speckle_nodes(level, *signals, shape=shape)
+            given = [self.steady(v[..., None] * magnitude, level[..., None])[0] for v in signals]
+            return given, weight
+        given = [np.empty((*level.shape, NODES)) for _ in signals]
+        for at in np.ndindex(level.shape):
+            magnitude = (
+                self._lattice() if speckle is None else self._speckle_nodes(speckle, 0, at[-1])
+            )
+            for values, signal in zip(given, signals, strict=True):
+                values[at] = votes_given_speckle(signal[at], level[at], self.votes, magnitude)
+        return given, np.full(NODES, 1 / NODES)
+
     def faded_together(
-        self, one: np.ndarray, other: np.ndarray, level: np.ndarray, alike: np.ndarray
-    ) -> np.ndarray:
-        """Probability that two segments in developed speckle are both detected.
+        self, one: np.ndarray, other: np.ndarray, level: np.ndarray, alike: np.ndarray,
+        speckle: LookSpeckle | None = None,
+    ) -> np.ndarray:  # fmt: skip
+        """Probability that up and down segment in developed speckle are both detected.
 
         By |X| of their bins and threshold over the noise per quadrature, and the size of the
         correlation of their signals' amplitudes (``alike``). Looks of their own speckle are summed
         over that of the first segment: given it, the second's are a noncentral chi square. In one
         speckle of all, both segments see it: the mean over it of the product. If they share but a
         part of it, what they have in common is that share of it which two Rayleigh magnitudes of
-        the same probabilities have.
+        the same probabilities have. Looks that share their speckle in part (``speckle``) are
+        treated likewise, as :mod:`sweep.model.look_speckle` has it.
         """
         from scipy import stats
 
@@ -186,16 +268,17 @@ class Looks(NamedTuple):
         far = np.full(level.shape, 1e100)
         there = np.isfinite(one) & np.isfinite(other)
         a, b = (np.where(there, v, 0.0) for v in (one, other))
-        p, q = self.faded(a, level)[0], self.faded(b, level)[0]
-        if not self.independent:
-            speckle, weight = self.speckle_nodes(level, a, b)
-            each = [self.steady(v[..., None] * speckle, level[..., None])[0] for v in (a, b)]
-            whole = (each[0] * each[1] * weight).sum(axis=-1)
-            with np.errstate(divide="ignore", invalid="ignore"):
-                part = fading_together(p, q, far, alike) - p * q
-                part = part / (np.minimum(p, q) - p * q)
-            part = np.where(alike > 1 - 1e-9, 1.0, np.clip(np.nan_to_num(part), 0.0, 1.0))
-            return np.where(there, p * q + part * (whole - p * q), np.nan)
+        if speckle is not None:
+            signals = np.stack([a, 0 * a, b], axis=-2)
+            p, _, q = np.moveaxis(self.faded(signals, level[..., None, :], speckle)[0], -2, 0)
+        else:
+            p, q = self.faded(a, level)[0], self.faded(b, level)[0]
+        if speckle is not None or not self.independent:
+            (first, second), weight = self.given_speckle((a, b), level, speckle)
+            mean = [(given * weight).sum(axis=-1) for given in (first, second)]
+            shared = (first * second * weight).sum(axis=-1) - mean[0] * mean[1]
+            part = self._shared_part(p, q, alike, speckle)
+            return np.where(there, np.clip(p * q + part * shared, 0.0, np.minimum(p, q)), np.nan)
         means = (np.square(v) / (2 + np.square(v)) for v in (a, b))
         shared = np.minimum(np.square(alike) * np.prod(list(means), axis=0), 1 - 1e-9)
         y, z = (np.square(level) / (2 + np.square(v)) for v in (a, b))
@@ -219,6 +302,70 @@ class Looks(NamedTuple):
         return np.where(
             there, np.minimum((crosses * weight).sum(axis=-1), np.minimum(p, q)), np.nan
         )
+
+    def _shared_part(
+        self, p: np.ndarray, q: np.ndarray, alike: np.ndarray, speckle: LookSpeckle | None
+    ) -> np.ndarray:
+        """Part that two segments have of the covariance which they would have in one speckle."""
+        from sweep.model.detection import fading_together
+
+        far = np.full(np.shape(p), 1e100)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            part = fading_together(p, q, far, np.broadcast_to(alike, far.shape)) - p * q
+            part = part / (np.minimum(p, q) - p * q)
+        part = np.where(alike > 1 - 1e-9, 1.0, np.clip(np.nan_to_num(part), 0.0, 1.0))
+        lone = 1 / self._effective_number(speckle)
+        return np.asarray(lone * part + (1 - lone) * np.square(alike))
+
+    def _effective_number(self, speckle: LookSpeckle | None) -> np.ndarray | float:
+        """Return M, the number of looks of independent speckle that these are worth."""
+        if speckle is not None:
+            return np.asarray(speckle.shape.mean(axis=0))
+        return float(self.number if self.independent else 1)
+
+    def faded_any_two(
+        self, signals: np.ndarray, level: np.ndarray, alike: np.ndarray, pd: np.ndarray,
+        speckle: LookSpeckle | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+        """Probabilities that at least two of three segments are detected, and that they are not.
+
+        Parameters
+        ----------
+        signals
+            |X| of their bins over the noise per quadrature, (3, n).
+        level
+            Threshold over the same, (n,).
+        alike
+            Correlations of up and Doppler, up and down, Doppler and down segment, (3, n).
+        pd
+            Of the segments, (3, n).
+
+        Notes
+        -----
+        Segment i shares a common speckle in a part l_i of cases and else has its own, with
+        l_i l_j the part that :meth:`faded_together` gives two segments. Given that speckle segments
+        are independent, with probabilities l_i P_i(speckle) + (1 - l_i) P_i. If all looks have one
+        speckle, segments are detected as :func:`fading_any_two` has it of three magnitudes with the
+        same probabilities. The result is the mean of both, with weights 1 - 1/M and 1/M.
+        """
+        from sweep.model.detection import any_two
+
+        there = np.isfinite(pd).all(axis=0)
+        p = np.where(there, pd, 0.0)
+        a = list(np.where(there, signals, 0.0))
+        given, weight = self.given_speckle(a, level, speckle)
+        near, over, last = (
+            np.maximum(self._shared_part(p[i], p[j], np.minimum(alike[k], 1.0), speckle), 1e-12)
+            for k, (i, j) in enumerate(((0, 1), (0, 2), (1, 2)))
+        )
+        share = np.sqrt([near * over / last, near * last / over, over * last / near])
+        share = np.minimum(share, 1.0)[..., None]
+        found = share * np.array(given) + (1 - share) * p[..., None]
+        chance = np.clip((any_two(found, 1 - found) * weight).sum(axis=-1), 0.0, 1.0)
+        lone = 1 / self._effective_number(speckle)
+        one_speckle = fading_any_two(p, 1 - p, np.full(level.shape, 1e100), alike)[0]
+        chance = lone * one_speckle + (1 - lone) * chance
+        return np.where(there, chance, np.nan), np.where(there, 1 - chance, np.nan)
 
     def log_alarm(self, level: np.ndarray) -> np.ndarray:
         """Natural logarithm of the probability that a bin of noise alone is detected.
@@ -337,9 +484,12 @@ class Looks(NamedTuple):
         return special.betainc(enough, rest, crosses), special.betainc(rest, enough, stays)
 
     def speckle_nodes(
-        self, level: np.ndarray, *signals: np.ndarray
+        self, level: np.ndarray, *signals: np.ndarray, shape: np.ndarray | float = 1.0
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Magnitudes of speckle (..., k), of mean power 1, and weights; close about thresholds."""
+        """Magnitudes of speckle (..., k), of mean power 1, and weights; close about thresholds.
+
+        Its power is a gamma variable of a ``shape`` (...), exponential for 1.
+        """
         square, most = np.square(level), np.full(level.shape, 7.0)
         ends = [0 * most, most]
         # Enough votes come and go within a part of what one record takes.
@@ -350,8 +500,16 @@ class Looks(NamedTuple):
             a = np.maximum(np.square(signal), 1e-30)
             for d in np.linspace(-1, 1, pieces):
                 ends.append(np.minimum(np.sqrt(np.maximum(at + d * wide, 0.0) / a), most))
+        if np.any(shape != 1.0):  # a narrow peak about 1
+            wide = 4 / np.sqrt(shape)
+            ends += [np.clip(1 + d * wide, 0.0, most) for d in (-1.0, 0.0, 1.0)]
         node, weight = _gauss(np.sort(np.stack(ends, axis=-1), axis=-1))
-        return node, weight * 2 * node * np.exp(-np.square(node))
+        if np.all(shape == 1.0):
+            return node, weight * 2 * node * np.exp(-np.square(node))
+        shape, power = np.broadcast_to(shape, level.shape)[..., None], np.square(node)
+        log_density = shape * (np.log(shape) - power) - special.gammaln(shape)
+        log_density = log_density + (2 * shape - 1) * np.log(np.maximum(node, 1e-300))
+        return node, weight * 2 * np.exp(log_density)
 
 
 ONE = Looks()

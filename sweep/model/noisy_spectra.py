@@ -38,7 +38,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy import fft
 
-from sweep.model import waveform
+from sweep.kernels import njit
+from sweep.model import philox, waveform
 from sweep.model.band import is_searched
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detectors import DETECTORS, Detector, Setting, main_lobe, taper
@@ -298,11 +299,10 @@ def spectra_of(view: "View", segment: int, draws: np.ndarray) -> Iterator[np.nda
                 signal = signal_of(shots, view.i, segment, view.echoes_of(segment))
             known[id(shots)] = signal
         signal = known[id(shots)]
-        own = numbers if looks.independent else draws
-        factors = fading_of(shots, view.i, key=view.key, draws=own)[segment][:, None]
+        factors = _fading_in_look(view, segment, k, draws)[:, None]
         if signal.echo is not None:
             each = (
-                fading_of(shots, view.i, key=view.key, draws=own, echo=number)[segment]
+                _fading_in_look(view, segment, k, draws, echo=number)
                 for number in range(int(signal.echo.max()) + 1)
             )
             factors = np.stack(list(each), axis=1)[:, signal.echo]
@@ -314,6 +314,49 @@ def spectra_of(view: "View", segment: int, draws: np.ndarray) -> Iterator[np.nda
             total = total + spectra
     if looks.added > 1:
         yield total / looks.added
+
+
+@njit(cache=True, error_model="numpy")
+def _complex_fading(key, draws, segment, group, mixing):
+    """Factors (m,) complex by which the amplitude of a group fades in a segment, draw by draw.
+
+    Their magnitudes are :func:`sweep.model.draws.fading_factors`.
+    """
+    near, own, far, re, im, rest = mixing
+    factors, stream = np.empty(draws.size, np.complex128), philox.STREAM_SPECKLE
+    for d in range(draws.size):
+        a, b = philox.normal_pair(key[0], key[1], draws[d], stream, 3 * group)
+        c, e = philox.normal_pair(key[0], key[1], draws[d], stream, 3 * group + 1)
+        f, g = philox.normal_pair(key[0], key[1], draws[d], stream, 3 * group + 2)
+        first, second, third = complex(a, b), complex(c, e), complex(f, g)
+        if segment == 1:
+            first = near * first + own * second
+        elif segment == 2:
+            first = far * first + complex(re, im) * second + rest * third
+        factors[d] = math.sqrt(0.5) * first
+    return factors
+
+
+def _fading_in_look(
+    view: "View", segment: int, look: int, draws: np.ndarray, echo: int = 0
+) -> np.ndarray:
+    """Factors on an echo in a look of a segment, (m,): of one speckle, of its own, or of a part."""
+    shots, own = view.shots, draws
+    speckle = shots.look_speckle
+    if speckle is not None:
+        root = speckle.root(segment, view.i)[look]
+        # The mean power of the looks differs in the signal itself.
+        root = root / np.sqrt((np.abs(root) ** 2).sum())
+        assert shots.fading is not None
+        amplitude, mixing = np.zeros(draws.size, complex), shots.fading.mixing()[:, view.i]
+        for number, share in enumerate(root):
+            numbers = draws + number * _LOOK
+            fading = _complex_fading(view.key, numbers, segment, echo, mixing)
+            amplitude = amplitude + share * fading
+        return np.abs(amplitude)
+    if shots.looks.independent:
+        own = draws + look * _LOOK
+    return fading_of(shots, view.i, key=view.key, draws=own, echo=echo)[segment]
 
 
 class View(NamedTuple):

@@ -115,7 +115,7 @@ STRONGEST_OUTPUTS: dict[str, Output] = _by_segment(
     "probability of a detection with a wrong range",
     "a peak that is not the echo's crosses the threshold and is the strongest",
     joint="; ",
-    shot="both chirps report a peak, and one of the echo not both",
+    shot="both chirps report a peak, and one of the echo not both; or both do and are misread",
 )
 """Floats, one a point, of studies that report the strongest peak of a segment alone."""
 

@@ -29,6 +29,7 @@ from sweep.model.window import Window, canonical_name, window
 
 if TYPE_CHECKING:
     from sweep.model.detection import DetectionRule, Fading, SpeckleTable
+    from sweep.model.look_speckle import LookSpeckle
 
 Parameters = Mapping[str, float | int | str | np.ndarray]
 
@@ -190,6 +191,8 @@ class Shots:
     """Amplitude at the negative frequency that I and Q leave of a line's, 0..1, (n,)."""
     fading: "Fading | None" = None
     """Of echoes in developed speckle."""
+    look_speckle: "LookSpeckle | None" = None
+    """Speckle of looks that share it in part; None where all have the same, or each its own."""
     line_spread: np.ndarray | float = 0.0
     """(segments, n): deviation of the lines of an echo in developed speckle [bins of fs/N]."""
     leak_amplitude: np.ndarray | None = None
@@ -380,9 +383,12 @@ class Shots:
         level, alike = self.threshold / self.line_deviation, np.abs(self.fading.over)
         if self.looks.several:
             one, other = (magnitude / self.line_deviation for magnitude in magnitudes)
-            both = self.looks.faded_together(one, other, level, alike)
+            in_looks = self.look_speckle
+            if in_looks is not None:
+                alike = in_looks.between[1]
+            both = self.looks.faded_together(one, other, level, alike, in_looks)
             if self.speckle_table.row[[0, 2]].any():  # of the same share of what can be in common
-                p, q = (self.looks.faded(signal, level)[0] for signal in (one, other))
+                p, q = self._of_chirps(one, other, level)
                 with np.errstate(divide="ignore", invalid="ignore"):
                     part = (both - p * q) / (np.minimum(p, q) - p * q)
                 part = np.clip(np.nan_to_num(part), 0.0, 1.0)
@@ -426,13 +432,24 @@ class Shots:
         found, missed = (np.where(there, chance, np.nan) for chance in both)
         return found, missed
 
+    def _of_chirps(
+        self, one: np.ndarray, other: np.ndarray, level: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Probabilities of up and down segment in several looks, far from DC and Nyquist."""
+        signals = np.nan_to_num(np.stack([one, 0 * one, other], axis=-2))
+        up, _, down = np.moveaxis(
+            self.looks.faded(signals, level[..., None, :], self.look_speckle)[0], -2, 0
+        )
+        return up, down
+
     def _faded(
         self, signal: np.ndarray, level: np.ndarray, bins: np.ndarray, points: np.ndarray | slice
     ) -> tuple[np.ndarray, np.ndarray]:
         """Compute :meth:`detected` in developed speckle, by signal and threshold over the noise."""
         from sweep.model.quadratures import faded_looks
 
-        found, missed = self.looks.faded(signal, level)
+        in_looks = None if self.look_speckle is None else self.look_speckle.at(points)
+        found, missed = self.looks.faded(signal, level, in_looks)
         rule, speckle = self.echo_rule, self.speckle_table
         row, half = np.broadcast_to(speckle.row[:, points], signal.shape), self.fft_size // 2
         k = np.minimum(bins, half - bins)

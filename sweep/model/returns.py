@@ -35,6 +35,7 @@ false alarms.
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -60,6 +61,7 @@ from sweep.model.groups import BIN, FIRST, LAST, Groups
 from sweep.model.interpolation import (
     drift_error,
     interpolator,
+    late_echo,
     spread_error,
     sub_bin,
     sub_bin_error,
@@ -357,14 +359,25 @@ class Told(NamedTuple):
     """Excess of the range told over that at the shot's start [m], (n, 1, 1)."""
 
 
-def measured(shots: Shots, known: Known, drawn: Drawn, motion: OwnMotion | None = None) -> Returns:
+def measured(
+    shots: Shots,
+    known: Known,
+    drawn: Drawn,
+    motion: OwnMotion | None = None,
+    *,
+    from_three_bins: bool = True,
+) -> Returns:
     """Compute returns from pairs of peaks; flag those that misread their common beamlet.
 
-    ``motion`` is as of :func:`draw_returns`.
+    ``motion`` is as of :func:`draw_returns`. ``from_three_bins``: places between bins are those of
+    :mod:`sweep.model.interpolation`, and not another estimator's.
     """
     fitted = shots.slopes != waveform.SIGNS
     drawn = _with_drift(shots, drawn, motion)
-    told = _fitted(shots, drawn) if fitted else _read(shots, drawn)
+    read = _fitted if fitted else _read
+    if from_three_bins and shots.first_sample is not None:
+        drawn = _with_late_echo(shots, drawn, read(shots, drawn))
+    told = read(shots, drawn)
     point, group = np.arange(shots.size)[:, None, None], np.maximum(drawn.group, 0)
     sizes = (known.bins[:, :, LAST] - known.bins[:, :, FIRST])[
         point[..., None], np.arange(3), group
@@ -420,6 +433,31 @@ def _with_drift(shots: Shots, drawn: Drawn, motion: OwnMotion | None) -> Drawn:
     delta = peaks[..., FINE] - peaks[..., WHOLE]
     wide = drift_error(delta, drift.T[:, None, None], shots.window, shots.fft_size)
     peaks[..., ERROR] = np.hypot(peaks[..., ERROR], wide)
+    return drawn._replace(peaks=peaks)
+
+
+_HALF_A_BIN = 0.5
+
+
+def _with_late_echo(shots: Shots, drawn: Drawn, told: Told) -> Drawn:
+    """Correct places between bins for the samples that lack before the echo arrives.
+
+    The instrument knows them by the range that whole bins tell. Where so many lack that the place
+    can not be read, the error is half a bin.
+    """
+    column = partial(columns, shots, dims=2)
+    delay = 2 / SPEED_OF_LIGHT * np.nan_to_num(told.range[..., WHOLE])
+    beta = 2 / SPEED_OF_LIGHT * np.nan_to_num(told.velocity[..., WHOLE])
+    lacking = waveform.samples_before_echo(
+        delay=delay, beta=beta, start=column(shots.acquisition_delay),
+        sample_rate=column(shots.sample_rate), length=shots.window.length,
+    )  # fmt: skip
+    peaks = drawn.peaks.copy()
+    delta = np.nan_to_num(peaks[..., FINE] - peaks[..., WHOLE])
+    late = late_echo(delta, lacking[..., None], shots.window, shots.fft_size)
+    peaks[..., FINE] += late.shift
+    wider = np.minimum(peaks[..., ERROR] * late.wider, _HALF_A_BIN)
+    peaks[..., ERROR] = np.where(late.wider > 1, np.maximum(wider, peaks[..., ERROR]), wider)
     return drawn._replace(peaks=peaks)
 
 

@@ -19,7 +19,7 @@ from sweep.model.detection import any_neighbour, found_pair, free_images, speckl
 from sweep.model.effects.circulator_leak import beside_leak
 from sweep.model.effects.line_width import gaussian_shifts
 from sweep.model.ground import different_rows
-from sweep.model.leakage import MOST_POINTS, inspect, of_bins
+from sweep.model.leakage import LOUDEST, MOST_POINTS, inspect, of_bins, of_fading_bins
 from sweep.model.line_shape import Shapes
 from sweep.model.lines import (
     AMPLITUDE_TOLERANCES,
@@ -165,6 +165,8 @@ def runs_of(
     for together in _together(shots, some):
         leaks = _way_to_leakage(shots, together, every_bin) if leakage else NO_LEAKAGE
         floor = table[12] * table[10] if leaks == BIN_BY_BIN else np.inf
+        if shots.fading is not None:  # faint leakage of bright speckle counts
+            floor = floor / math.sqrt(LOUDEST)
         lowest, done = np.minimum(levels, floor), 0
         while done < together.part.size:
             held = keep or (shots.looks.several and bool(leaks))
@@ -627,7 +629,8 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
                 p, (s, row), footprint, centre[s, which], shift, window_sum, limits, sizes, room
             )
             lines = n, lowest, highest, total, p[15] * sigma / LINE_STEPS
-            noise, leakage = (sigma, level, p[14]), 0.0
+            fades = rule.fades >= 0.0
+            noise, leakage = (sigma, level, p[14], LOUDEST if fades else 1.0), 0.0
             if leaks[s] == INTEGRAL:
                 low, count, peak, exempted, leakage = inspect(
                     origin, lines, noise, table[s], form[s], sizes, tangent, room, exempt, series
@@ -649,9 +652,13 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
                 speckle_of(speckle, s, where[2, i]),
             )  # fmt: skip
             if leaks[s] == BIN_BY_BIN:
-                leakage = of_bins(count, noise, p[12], room, exempt, series)
-                if p[16] > 0.0 and rule.pairs.size > 0:
-                    leakage = any_neighbour(room[CHANCE], count, rule.pairs)
+                if fades:
+                    least = p[12] / math.sqrt(LOUDEST)
+                    leakage = of_fading_bins(count, noise[:3], least, room, exempt, series)
+                else:
+                    leakage = of_bins(count, noise[:3], p[12], room, exempt, series)
+                    if p[16] > 0.0 and rule.pairs.size > 0:
+                        leakage = any_neighbour(room[CHANCE], count, rule.pairs)
             low += sizes[0] * (sizes[7] == COMPLEX)  # never below 0
             numbers[0, s, i], numbers[1, s, i], numbers[2, s, i] = low, count, peak
             numbers[3, s, i] = exempted

@@ -123,6 +123,7 @@ def statistics(shots: Shots, found: np.ndarray | None = None) -> dict[str, np.nd
     snr = shots.snr(magnitude)
     alarms = _false_alarms(shots, exempted)
     reported = report(shots, found)
+    wrong_range, wrong_velocity = misread(shots, reported)
     pd_shot, miss_shot = chances(shots, pd, miss, magnitude)
     results = {
         f"{name}_{segment}": values[s]
@@ -139,12 +140,15 @@ def statistics(shots: Shots, found: np.ndarray | None = None) -> dict[str, np.nd
         "noise_variance": shots.noise_variance,
         "range_error": reported.range - shots.range,
         "radial_velocity_error": reported.radial_velocity - shots.radial_velocity,
-        "misread": misread(shots, reported).astype(float),
+        "misread": (wrong_range | wrong_velocity).astype(float),
     }
     if shots.any_two:
         results["pd_both_chirps"] = shots.both(pd[0], pd[2], (magnitude[0], magnitude[2]))
     if shots.peaks == waveform.STRONGEST:
         results |= outcomes(shots, pd, miss)
+        # Both peaks are the echo's, and they are read as another range.
+        right = np.where(wrong_range, results["pd_shot"], 0.0)
+        results["p_wrong_range_shot"] = results["p_wrong_range_shot"] + right
     dark = (shots.echo_power == 0) | np.isnan(found[shots.segments, 3]).any(axis=0)
     return results | {name: np.where(dark, np.nan, results[name]) for name in WITHOUT_ECHO}
 
@@ -160,6 +164,11 @@ def chances(
         if shots.fading is None:
             return any_two(pd, miss), any_two(miss, pd)
         level = shots.threshold / shots.line_deviation
+        if shots.looks.several:
+            in_looks = shots.look_speckle
+            alike = np.abs(np.array(shots.fading)) if in_looks is None else in_looks.between
+            signals = magnitudes / shots.line_deviation
+            return shots.looks.faded_any_two(signals, level, alike, pd, in_looks)
         alike = np.abs(np.array(shots.fading))
         found, missed = fading_any_two(pd, miss, level, alike)
         speckle = shots.speckle_table
@@ -205,10 +214,11 @@ and motion between and within records."""
 
 
 def misread(shots: Shots, reported: waveform.Resolution) -> np.ndarray:
-    """Return true where peaks without noise are read as another range or velocity than the echo's.
+    """Find where peaks without noise are read as another range or velocity than the echo's.
 
-    The footprint's own extent, and what the target does between and within records, are none of
-    it. Beats beyond half the sample rate fold, and readings by an assumption may be wrong.
+    Result (2, n) bool: of range and of velocity. The footprint's own extent, and what the target
+    does between and within records, are none of it. Beats beyond half the sample rate fold, and
+    readings by an assumption may be wrong.
     """
     bins = MISREAD_BINS * shots.sample_rate / shots.fft_size
     rows, last = shots.row, max(float(np.max(start)) for start in shots.schedule)
@@ -226,9 +236,10 @@ def misread(shots: Shots, reported: waveform.Resolution) -> np.ndarray:
     with np.errstate(divide="ignore"):  # a carrier of 0, of direct detection, tells no velocity
         per_hertz = SPEED_OF_LIGHT / (2 * carrier)
     speed = (bins + per_metre * metres) * per_hertz + shifted + own
-    off = np.abs(reported.range - shots.range) > metres
-    off |= np.abs(reported.radial_velocity - shots.radial_velocity) > speed
-    return np.asarray(off)
+    return np.array([
+        np.abs(reported.range - shots.range) > metres,
+        np.abs(reported.radial_velocity - shots.radial_velocity) > speed,
+    ])  # fmt: skip
 
 
 def fit(

@@ -88,7 +88,7 @@ def spectra_returns(
                     which[s, k] = groups[k]
                 number[s] = bins.size
             report((i, d), how, known, (peaks, which, number), pairs, drawn)
-    return measured(shots, known, drawn, motion)
+    return measured(shots, known, drawn, motion, from_three_bins=False)
 
 
 def _bins_of(view: View, segment: int, signal: Signal | None) -> np.ndarray:

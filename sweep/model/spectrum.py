@@ -38,10 +38,10 @@ F_RE, F_IM, OUT, OUT_IM = np.arange(18, 22)
 TAN, TURN_RE, TURN_IM, COT, P_RE, P_IM, Q_RE, Q_IM = np.arange(22, 30)
 """Of bins far away: tan(pi k / N), exp(i pi r k), and scratch."""
 
-SUM, HALF_SQUARE, CHANCE, POINT, WEIGHT = np.arange(30, 35)
+SUM, HALF_SQUARE, CHANCE, POINT, WEIGHT, AFAR = np.arange(30, 36)
 """Of averages; of leakage."""
 
-ROOM = 35
+ROOM = 36
 """Rows in all."""
 
 ZERO = np.int64(0)

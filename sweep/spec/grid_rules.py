@@ -413,9 +413,6 @@ def _looks_findings(grid: Grid) -> Iterator[Finding]:
         rule = "detects by the largest bin of an echo where several records are not added in "
         rule += "amplitude: the chance that any of its bins does is known for one record alone"
         yield grid.finding(DETECTION, rule, "write 'detection: peak_bin', or combine: coherent")
-    if grid.has_point(by_bin | {waveform.SHOT_DETECTION: _is(waveform.ANY_TWO)}):
-        rule = "asks for any two of three segments, of which several looks have no law"
-        yield grid.finding(waveform.SHOT_DETECTION, rule, "take both_chirps, or combine: coherent")
     if grid.has_point(voted | {looks.NUMBER: lambda number: number > MOST_VOTES}):
         rule = f"counts the votes of at most {MOST_VOTES} records"
         yield grid.finding(looks.NUMBER, rule, "take fewer, or combine: power")

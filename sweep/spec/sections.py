@@ -330,8 +330,9 @@ class LooksOfShot(Part):
         "Records that must cross in a bin; binary only", "3", "1", "256", default=1
     )
     speckle: str = of.choice(
-        "Speckle of the records: common to all, as they follow one another at once; or "
-        "independent, where the beam moves on by its own width from one to the next",
+        "Speckle of the records: as the motion from one to the next changes it; common to all; or "
+        "independent, where the beam moves on by its own width. Surfaces of a stated "
+        "target.roughness have one speckle for all records of a shot",
         SPECKLES,
     )
 

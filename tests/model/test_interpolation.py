@@ -8,6 +8,7 @@ from scipy import stats
 from sweep.model.estimators import beat_deviation, carrier_to_noise_ratio
 from sweep.model.interpolation import (
     interpolator,
+    late_echo,
     noise_correlation,
     spread_error,
     sub_bin,
@@ -175,3 +176,36 @@ def test_nothing_at_all_is_placed_on_its_bin():
     tables = interpolator(window("hann", 4096), 4096)
     assert sub_bin(0.0, 0.0, 0.0, tables) == 0.0
     assert sub_bin_error(0.0, 0.0, tables) == 0.5
+
+
+@pytest.mark.parametrize(("name", "length", "size"), [
+    ("hann", 4096, 4096), ("hamming", 3000, 4096), ("rectangular", 2048, 4096),
+    ("blackman", 2000, 2048),
+])  # fmt: skip
+@pytest.mark.parametrize("share", [0.01, 0.07, 0.15])
+def test_places_of_late_echoes_are_those_of_their_lines(name, length, size, share):
+    """Lone tones in part of a record, their bias, and the deviation of drawn noise."""
+    shape, missing = window(name, length), int(share * length)
+    tables, taper, n = interpolator(shape, size), samples(name, length), np.arange(length)
+    turns = np.exp(-2j * np.pi * np.outer(n, [99, 100, 101]) / size)
+    rng, draws, ratio = np.random.default_rng(length), 1000, 60.0
+    noise = rng.normal(size=(2, draws, length)) * taper
+    for place in (0.15, 0.35, 0.45):
+        tone = taper * (n >= missing) * np.exp(2j * np.pi * (100 + place) * n / size)
+        bins = tone @ turns
+        read = sub_bin(*np.abs(bins), tables)
+        late = late_echo(np.array(read), np.array(missing), shape, size)
+        assert read + late.shift == pytest.approx(place, abs=2e-3)
+        sigma = abs(bins[1]) / ratio / np.sqrt((taper**2).sum())
+        noisy = np.abs(bins + sigma * (noise[0] + 1j * noise[1]) @ turns)
+        found = np.array([sub_bin(*row, tables) for row in noisy])
+        found = found + late_echo(found, np.full(draws, missing), shape, size).shift
+        stated = sub_bin_error(read, ratio, tables) * late.wider
+        assert found.std() == pytest.approx(float(stated), rel=0.15)
+        assert found.mean() == pytest.approx(place, abs=0.2 * float(stated) + 2e-3)
+
+
+def test_whole_echoes_stay_as_they_are():
+    late = late_echo(np.array([-0.4, 0.2]), np.array([0, 0]), window("hann", 512), 512)
+    np.testing.assert_array_equal(late.shift, 0.0)
+    np.testing.assert_array_equal(late.wider, 1.0)

@@ -190,6 +190,10 @@ LOOKS = {
     "steady powers": ({NUMBER: 4}, ()),
     "common speckle": ({NUMBER: 4}, ("fading",)),
     "speckle apart": ({NUMBER: 4, SPECKLE: "independent"}, ("fading",)),
+    "speckle in part": (
+        {NUMBER: 4, "target.transverse_velocity": 300.0},
+        ("doppler_spread", "fading"),
+    ),
     "votes": ({NUMBER: 5, COMBINE: "binary", VOTES: 2}, ()),
     "votes apart": ({NUMBER: 5, COMBINE: "binary", VOTES: 2, SPECKLE: "independent"}, ("fading",)),
     "votes together": ({NUMBER: 5, COMBINE: "binary", VOTES: 2}, ("fading",)),

@@ -19,6 +19,10 @@ the local oscillator's, at the delay tau = d / c. It is there in every record:
   Quantum Electron. 22, 2070, 1986], which a line makes a noise of i^2 / 2 times that. It is taken
   to be white within B_e, and no more than 2 pi v tau altogether.
 
+The line is there from its own delay tau on, as an echo is (:mod:`sweep.model.effects.overlap`): a
+path of a metre takes 3 ns of a record that begins with the chirp. Records that are taken as whole
+have it whole.
+
 The processing knows the line, as it is always there: bins in which it comes to
 :data:`MASKED_FROM` of the threshold, at whatever phase, are **masked**. They raise no alarm, and an
 echo whose largest bin is among them is not detected. In other bins the line's skirts, as powers
@@ -44,6 +48,7 @@ from sweep.model.effects.effect import Effect, Parameter, Scene, Size, noisier
 from sweep.model.effects.points import Points
 from sweep.model.looks import Looks
 from sweep.model.preparation import LASER, RECEIVER, TELESCOPE, Shots, beat_current
+from sweep.model.waveform import samples_before_echo
 from sweep.model.window import Window, samples
 
 MASKED_FROM = 0.5
@@ -113,9 +118,11 @@ class Line(NamedTuple):
 
 
 @lru_cache(maxsize=16)
-def _line(window: Window, fft_size: int, place: float, signed: bool) -> Line:
+def _line(window: Window, fft_size: int, place: float, signed: bool, late: int = 0) -> Line:
+    """Return the line at a place [bins] that lacks the first samples of the record."""
     turns = place * np.arange(window.length) / fft_size
     record = samples(window.name, window.length) * np.exp(2j * np.pi * (turns - np.rint(turns)))
+    record[:late] = 0.0
     spectrum = np.fft.fft(record, fft_size)
     half = np.arange(fft_size // 2 + 1)
     both = [spectrum, 0 * spectrum] if signed else [spectrum[half], spectrum[-half].conj()]
@@ -130,10 +137,10 @@ def line_of(shots: Shots, i: int, segment: int, at: float | None = None) -> tupl
     """
     columns = (
         shots.leak_amplitude, shots.leak_delay, shots.chirp_rate, shots.sample_rate,
-        shots.detector_bandwidth, shots.amplifier_bandwidth,
+        shots.detector_bandwidth, shots.amplifier_bandwidth, shots.acquisition_delay,
     )  # fmt: skip
     assert shots.leak_amplitude is not None
-    amplitude, delay, rate, sampled, detector, amplifier = (
+    amplitude, delay, rate, sampled, detector, amplifier, start = (
         float(np.broadcast_to(np.asarray(column), shots.size)[i]) for column in columns
     )
     beat = -shots.waveform[segment].slope * rate * delay
@@ -146,7 +153,13 @@ def line_of(shots: Shots, i: int, segment: int, at: float | None = None) -> tupl
     own = float(np.broadcast_to(whitened, shots.size)[i])
     scale = 0.5 * amplitude * abs(complex(gain)) * own
     place = beat * shots.fft_size / sampled
-    return scale, _line(shots.window, shots.fft_size, place, shots.complex_record)
+    late = 0
+    if shots.first_sample is not None:
+        late = int(samples_before_echo(
+            delay=np.array(delay), beta=0.0, start=np.array(start), sample_rate=np.array(sampled),
+            length=shots.window.length,
+        ))  # fmt: skip
+    return scale, _line(shots.window, shots.fft_size, place, shots.complex_record, late)
 
 
 def alarm(looks: Looks, line: Line, bins: np.ndarray, *, scale: float, level: float) -> float:

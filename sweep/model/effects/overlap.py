@@ -22,8 +22,10 @@ begins with a step. [T] takes chirps to be far longer than delays, where records
 whole (``overlap: off``).
 
 One n_0 serves all lines of a footprint's segment: that of the beam's axis. A beamlet that is d
-farther away has 2 d f_s / c samples fewer. This is left out, and :func:`left` bounds it. It counts
-in what a point's effects leave out (``effects_error``).
+farther away has 2 d f_s / c samples fewer. It serves all looks of a shot as well, that of the
+middle one, between which the range changes. This is left out, and :func:`left` bounds it. It counts
+in what a point's effects leave out (``effects_error``). Places between bins are corrected for n_0
+(:func:`sweep.model.interpolation.late_echo`).
 
 Size: c is the largest bin's magnitude over that of all lines on a bin, and b the share of sum |w|
 in the samples that lack. No bin changes by more than b, and so the largest by b / c of itself at
@@ -35,6 +37,7 @@ Checks: :mod:`sweep.model.truth` gates each sample of each beamlet by its own de
 """
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -42,7 +45,7 @@ from sweep.model import waveform
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.effect import Effect, Scene, Size
 from sweep.model.effects.phase_errors import missed
-from sweep.model.effects.points import Points
+from sweep.model.effects.points import Points, largest_about
 from sweep.model.preparation import Shots
 
 _IMAGE = 0.9
@@ -59,7 +62,7 @@ def size(points: Points) -> Size | None:
     c = _IMAGE * np.sqrt(least) - besides
     magnitude = np.where(late.lost > 0, np.where(c > 0, late.lost / c, np.inf), 0.0)
     each, gone = left(points), late.all.any(axis=0).astype(float)
-    remain = {"left": np.minimum(2 * each, 1.0), "left_of_all": each * points.footprint.gain}
+    remain: dict[str, Any] = {"left": each, "left_of_all": each * points.footprint.gain}
     if not points.may_add:
         lone = points.lobe.near(points.offset) - late.lost  # powers: each line by its own share
         own = np.where(lone > 0, np.minimum(each / np.maximum(lone, 1e-300), 1.0), 1.0)
@@ -72,14 +75,26 @@ def size(points: Points) -> Size | None:
 
 
 def left(points: Points) -> np.ndarray:
-    """Change of any bin as beamlets have the axis's samples, over that of all lines on a bin."""
+    """Bound the change of any bin by samples that beamlets and looks have in common.
+
+    These are the axis's, and the middle look's. Over the magnitude of all lines on a bin.
+    """
     late = points.missing
     assert late is not None
     ranges = points.footprint.ranges
     off = np.minimum(np.abs(ranges.mean) + ranges.rms, ranges.extreme)
-    number = points.sample_rate * points.delay * np.minimum(off, 1e3)
-    each = np.minimum(late.cells * number, 1.0)
-    return np.asarray(np.where((late.lost > 0) & (late.lost < 1), each, 0.0))
+    looks = points.sample_rate * 2 / SPEED_OF_LIGHT * np.abs(points.approach) * points.late
+    farthest = points.sample_rate * points.delay * np.minimum(ranges.extreme, 1e3) + looks
+    number = points.sample_rate * points.delay * np.minimum(off, 1e3) + looks
+    # Numbers of samples are whole: those of two delays differ by up to one more.
+    whole = np.where(farthest > 0, number + 1, 0.0)
+    # Of none of the samples, and of all, the same lack at delays that are close.
+    middle = points.sample_rate * (points.delay - points.start)
+    begins = (middle + farthest > -1) & (middle - farthest < points.window.length + 1)
+    # The few samples change all bins alike, and the image at negative frequency does so as well.
+    each = 2 * largest_about(points.window, late.first, farthest + 1) * whole
+    each = np.minimum(each, 1.0)
+    return np.asarray(np.where(begins, each, 0.0))
 
 
 def act(shots: Shots, scene: Scene) -> Shots:

@@ -80,8 +80,8 @@ class Missing(NamedTuple):
     step: np.ndarray
     """Factor on the sidelobes of a rectangular window that bounds what their lack adds to others,
     relative to sum w."""
-    cells: np.ndarray
-    """Most that |w| of a sample about the first one comes to, over sum w."""
+    first: np.ndarray
+    """Number of these samples."""
     middle: np.ndarray
     """Bound on the mean place, -1..1, of what is left in the record."""
     all: np.ndarray
@@ -94,17 +94,17 @@ def missing_of(window: Window, first: np.ndarray) -> Missing:
     The transform of the samples that lack is at most their variation over 2 sin(pi y / L), and so
     is that of the samples that are left, which is what the sidelobes are where these are fewer.
     """
-    lost, before, after, level = _of_samples(window)
+    lost, before, after = _of_samples(window)
     share = lost[first]
     step = np.minimum(before[first], after[first]) * (window.length / window.sum)
     with np.errstate(divide="ignore"):
         middle = np.minimum(share / np.maximum(1 - share, 1e-300), 1.0)
     step = np.where(first > 0, step, 0.0)
-    return Missing(share, step, level[first], middle, first >= window.length)
+    return Missing(share, step, first, middle, first >= window.length)
 
 
 @lru_cache(maxsize=8)
-def _of_samples(window: Window) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _of_samples(window: Window) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Bounds of :func:`missing_of` by the number of samples that lack, (L + 1,) each."""
     w = samples(window.name, window.length)
     size = np.abs(w)
@@ -113,7 +113,28 @@ def _of_samples(window: Window) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.
     before = 0.5 * (size[0] + rises + size)
     after = 0.5 * (size + rises[-1] - rises + size[-1])
     before, after = np.append(0.0, before), np.append(after, 0.0)
-    return lost, before, after, np.append(size, size[-1]) / window.sum
+    return lost, before, after
+
+
+def largest_about(window: Window, first: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """Largest |w| of samples less than ``reach`` away from the first one, over sum w."""
+    powers = np.ceil(np.log2(np.clip(reach, 1, window.length))).astype(int)
+    found = np.empty(np.broadcast_shapes(first.shape, powers.shape))
+    first, powers = np.broadcast_arrays(first, powers)
+    for power in np.unique(powers):
+        where = powers == power
+        found[where] = _largest_within(window, int(power))[first[where]]
+    return found
+
+
+@lru_cache(maxsize=64)
+def _largest_within(window: Window, power: int) -> np.ndarray:
+    """Largest |w| within 2^power samples of each place of a record, (L + 1,), over sum w."""
+    from scipy.ndimage import maximum_filter1d  # slow to import
+
+    size = np.abs(samples(window.name, window.length))
+    size = np.append(size, size[-1])
+    return np.asarray(maximum_filter1d(size, 2 * 2**power + 1, mode="nearest")) / window.sum
 
 
 def by_power(change: np.ndarray) -> np.ndarray:
@@ -387,7 +408,9 @@ class Points:
             delay=delay, beta=self.faster + (0.0 if self.at_rest else self.beta),
             start=self.start, sample_rate=self.sample_rate, length=self.window.length,
         )  # fmt: skip
-        if not first.any():
+        latest = delay * np.minimum(self.footprint.ranges.extreme, 1e3)  # beyond the axis's
+        latest = latest + 2 / SPEED_OF_LIGHT * np.abs(self.approach) * self.late
+        if not first.any() and not (delay + latest > self.start).any():
             return None
         return missing_of(self.window, np.broadcast_to(first, self.frequency.shape))
 

@@ -26,9 +26,9 @@ add as powers. A bin then crosses the threshold with Swerling's first probabilit
 bins as two correlated ones do. Their correlation falls with the Doppler shifts and the ranges that
 differ over the beam, by :mod:`sweep.model.speckle_correlation`. It is in
 closed form, as beamlets that are enough for the power of a bin may be too few for it. It acts on
-the detection. In the closed form of a segment's leakage the echo keeps its mean power; where false
-peaks are drawn, and in the probabilities of a flight, its leaked signal fades with it
-(:mod:`sweep.model.leaked_peaks`).
+the detection, and on leakage: what an echo leaks fades with it, in closed form
+(:mod:`sweep.model.leakage`) as where false peaks are drawn (:mod:`sweep.model.leaked_peaks`). Of
+several looks leakage is that of the mean echo.
 """
 
 import math
@@ -42,8 +42,15 @@ from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.effect import Effect, Parameter, Realisation, Scene, Size
 from sweep.model.effects.points import Points
 from sweep.model.ground import Cast, Ground, Plane, Slopes
+from sweep.model.look_speckle import LookSpeckle
 from sweep.model.preparation import Shots
-from sweep.model.speckle_correlation import NARROW, SEGMENT_PAIRS, LineSpread, bin_correlation
+from sweep.model.speckle_correlation import (
+    NARROW,
+    SEGMENT_PAIRS,
+    LineSpread,
+    bin_correlation,
+    window_transform,
+)
 
 _ROUGHNESS = "target.roughness"
 _LAW = "footprint.speckle"
@@ -179,28 +186,14 @@ def fade(shots: Shots, scene: Scene) -> Shots:
     law = str(scene.parameters[_LAW])
     if law == "none" or shots.architecture == "direct" or not shots.incoherent:
         return shots
-    phases, moments = segment_phases(shots), _beamlet_moments(shots, scene.ground)
-    if isinstance(scene.ground, Plane):
-        slopes = scene.ground.slopes
-        correlations = [scene.ground.mean_phasor(*phase) for phase in phases]
-        across = [np.zeros(shots.size)] * len(phases)
-    else:
-        slopes = _cast_slopes(moments)
-        mean, variance = _phase_moments(moments, phases)
-        correlations = list(np.exp(1j * mean - 0.5 * variance))
-        across = [
-            np.maximum(total - phase.along(slopes) ** 2, 0.0)
-            for total, phase in zip(variance, phases, strict=True)
-        ]
-    for pair, phase in enumerate(phases):
-        lines = _line_spread(shots, SEGMENT_PAIRS[pair], phase, slopes)
-        wide = np.flatnonzero(lines.widest > NARROW)
-        if wide.size:
-            of_bins = bin_correlation(shots.window, lines.at(wide))
-            correlations[pair] = correlations[pair].astype(complex)
-            correlations[pair][wide] = of_bins * np.exp(-0.5 * across[pair][wide])
-    spread = _line_deviation(shots, moments)
-    return replace(shots, fading=Fading(*correlations), line_spread=spread)
+    ground = _ground_spread(shots, scene.ground)
+    spread = _line_deviation(shots, ground.moments)
+    correlations = [
+        ground.correlation(shots, pair, phase)
+        for pair, phase in zip(SEGMENT_PAIRS, segment_phases(shots), strict=True)
+    ]
+    shots = replace(shots, fading=Fading(*correlations), line_spread=spread)
+    return shots if shots.looks.number == 1 else _fade_in_looks(shots, ground)
 
 
 def _line_deviation(shots: Shots, moments: "BeamletMoments") -> np.ndarray:
@@ -215,6 +208,110 @@ def _line_deviation(shots: Shots, moments: "BeamletMoments") -> np.ndarray:
     )
     variance = np.einsum("sin,ijn,sjn->sn", weights, moments.covariance, weights)
     return np.sqrt(np.maximum(variance, 0.0))
+
+
+_ALIKE = 1e-9
+"""Loss of correlation from the first to the last look up to which all have one speckle."""
+
+
+def _fade_in_looks(shots: Shots, ground: "GroundSpread") -> Shots:
+    """Let the speckle change from look to look by the motion between them."""
+    looks = shots.looks
+    if not looks.moving:
+        return shots
+    number, size = looks.number, shots.size
+    frequencies, _ = _echo_frequencies(shots)
+    turns = [np.broadcast_to(f * shots.look_period, size) for f in frequencies]
+    nothing = np.zeros(size)
+    by_lag = np.ones((3, size, number), complex)
+    for segment in map(int, np.flatnonzero(shots.segments)):
+        for lag in range(1, number):
+            phase = PhaseDifference(turns[segment] * lag, nothing)
+            by_lag[segment, :, lag] = ground.correlation(shots, (segment, segment), phase)
+    if looks.added > 1:
+        # Added amplitudes of speckles that differ are, on the mean, a smaller amplitude.
+        lags = np.arange(1, number)
+        steady = np.exp(-1j * np.angle(by_lag[0, :, 1]))[:, None] ** lags
+        shared = (2 * (number - lags) * (by_lag[0, :, 1:] * steady).real).sum(axis=1)
+        gain = np.sqrt(np.maximum(number + shared, 0.0)) / number
+        return replace(shots, beat_scale=shots.beat_scale * gain)
+    power = _power_of_looks(shots, ground.slopes)
+    if np.abs(by_lag - 1).max() < _ALIKE and np.abs(power - 1).max() < _ALIKE:
+        return shots
+    between = np.abs(np.array(shots.fading))
+    weight = number - np.abs(np.arange(1 - number, number))
+    strength = [
+        (weight * np.abs(np.concatenate([by_lag[s, :, :0:-1], by_lag[s]], axis=1)) ** 2).sum(axis=1)
+        for s in range(3)
+    ]
+    for k, (pair, phase) in enumerate(zip(SEGMENT_PAIRS, segment_phases(shots), strict=True)):
+        if not shots.segments[list(pair)].all() or (k != 1 and not shots.any_two):
+            continue
+        shared = nothing
+        for lag in range(1 - number, number):
+            turned = PhaseDifference(phase.turn + lag * turns[pair[1]], phase.delay_cycles)
+            of_lag = np.abs(ground.correlation(shots, pair, turned)) ** 2
+            shared = shared + (number - abs(lag)) * of_lag
+        between[k] = np.sqrt(shared) / (strength[pair[0]] * strength[pair[1]]) ** 0.25
+    speckle = LookSpeckle.of(by_lag, power, np.minimum(between, 1.0))
+    return replace(shots, look_speckle=speckle)
+
+
+def _power_of_looks(shots: Shots, slopes: Slopes) -> np.ndarray:
+    """Power of each look in the strongest bin over its mean, (3, n, looks): lines move on."""
+    number = shots.looks.number
+    power = np.ones((3, shots.size, number))
+    if not np.any(shots.look_drift):
+        return power
+    nothing = PhaseDifference(np.zeros(shots.size), np.zeros(shots.size))
+    padding = shots.fft_size / shots.window.length
+    late = np.arange(number) - (number - 1) / 2
+    node, weight = np.polynomial.hermite_e.hermegauss(7)
+    drift = np.broadcast_to(shots.look_drift, (len(shots.waveform), shots.size)) / padding
+    for segment in map(int, np.flatnonzero(shots.segments)):
+        lines = _line_spread(shots, (segment, segment), nothing, slopes)
+        place = lines.distance[0][:, None] - drift[segment][:, None] * late
+        apart = place[..., None] - lines.spread[0][:, None, None] * node
+        power[segment] = (window_transform(shots.window, apart) ** 2 * weight).sum(axis=-1)
+    return power / np.maximum(power.mean(axis=-1, keepdims=True), _SMALLEST)
+
+
+class GroundSpread(NamedTuple):
+    """Ranges and Doppler shifts over a beam on the ground."""
+
+    slopes: Slopes
+    plane: Plane | None
+    """None of ground that rays have found."""
+    moments: "BeamletMoments"
+
+    def correlation(
+        self, shots: Shots, pair: tuple[int, int], phase: "PhaseDifference"
+    ) -> np.ndarray:
+        """Correlation of the speckle in two records by the phase between them, (n,) complex.
+
+        ``pair`` are the segments that the records are of.
+        """
+        if self.plane is not None:
+            found = self.plane.mean_phasor(*phase).astype(complex)
+            across = np.zeros(shots.size)
+        else:
+            (mean,), (variance,) = _phase_moments(self.moments, [phase])
+            found = np.exp(1j * mean - 0.5 * variance)
+            across = np.maximum(variance - phase.along(self.slopes) ** 2, 0.0)
+        lines = _line_spread(shots, pair, phase, self.slopes)
+        wide = np.flatnonzero(lines.widest > NARROW)
+        if wide.size:
+            of_bins = bin_correlation(shots.window, lines.at(wide))
+            found[wide] = of_bins * np.exp(-0.5 * across[wide])
+        return found
+
+
+def _ground_spread(shots: Shots, ground: Ground) -> GroundSpread:
+    """Spread over the beam, by a plane's slopes or by the beamlets that rays have found."""
+    moments = _beamlet_moments(shots, ground)
+    if isinstance(ground, Plane):
+        return GroundSpread(ground.slopes, ground, moments)
+    return GroundSpread(_cast_slopes(moments), None, moments)
 
 
 class PhaseDifference(NamedTuple):
@@ -235,15 +332,8 @@ def segment_phases(shots: Shots) -> list[PhaseDifference]:
 
     By equation (1) of :mod:`sweep.model.speckle_correlation`.
     """
+    echo_frequency, middles = _echo_frequencies(shots)
     delay = 2 * shots.range / SPEED_OF_LIGHT
-    first = 0 if shots.first_sample is None else shots.first_sample
-    late = np.broadcast_to(first, (len(shots.carriers), shots.size)) / shots.sample_rate
-    # The middle of the samples that hold the echo.
-    middles = shots.acquisition_delay + (shots.record_duration + late) / 2
-    echo_frequency = [
-        carrier + slope * shots.chirp_rate * (middle - delay)
-        for carrier, slope, middle in zip(shots.carriers, shots.slopes, middles, strict=True)
-    ]
     turned = [
         frequency * (start + middle)
         for frequency, start, middle in zip(echo_frequency, shots.schedule, middles, strict=True)
@@ -255,6 +345,19 @@ def segment_phases(shots: Shots) -> list[PhaseDifference]:
         )
         for first, second in SEGMENT_PAIRS
     ]
+
+
+def _echo_frequencies(shots: Shots) -> tuple[list[np.ndarray], np.ndarray]:
+    """Optical frequencies F of the echo in the middle of each segment's record, and its times."""
+    delay = 2 * shots.range / SPEED_OF_LIGHT
+    first = 0 if shots.first_sample is None else shots.first_sample
+    late = np.broadcast_to(first, (len(shots.carriers), shots.size)) / shots.sample_rate
+    # The middle of the samples that hold the echo.
+    middles = shots.acquisition_delay + (shots.record_duration + late) / 2
+    return [
+        carrier + slope * shots.chirp_rate * (middle - delay)
+        for carrier, slope, middle in zip(shots.carriers, shots.slopes, middles, strict=True)
+    ], middles
 
 
 def _line_spread(

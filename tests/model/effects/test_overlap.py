@@ -6,7 +6,7 @@ from effect_points import kept_in, planned, points_of
 
 from sweep.model import sampling, segments, shot, truth
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects import overlap
+from sweep.model.effects import overlap, segment_motion
 from sweep.model.effects.catalogue import CORE, DEFAULTS
 from sweep.model.effects.phase_errors import drift_time
 from sweep.model.line_shape import COSINE_SUMS
@@ -237,6 +237,44 @@ def test_what_beamlets_at_other_ranges_leave_is_bounded(table_4_1):
     assert (np.nansum(abs(fast[:, 0] - exact[:, 0]), axis=0) <= made.error + 1e-9).all()
 
 
+@pytest.mark.parametrize("number", range(24))
+def test_one_number_of_samples_for_all_beamlets_is_within_its_bound(table_4_1, number):
+    """Random footprints over relief of up to tens of samples, each beamlet gated by its own delay.
+
+    With looks, the truth of the first one, whose range is that of its time.
+    """
+    rng = np.random.default_rng((50, number))
+    rate, size = float(rng.choice([250e6, 600e6])), int(rng.choice([1024, 4096]))
+    duration = float(rng.uniform(0.8, 2.0)) * size / rate
+    scene = DEFAULTS | table_4_1(
+        window=str(rng.choice(["hann", "rectangular", "kaiser(8.6)", "flattop"])),
+        range=SPEED_OF_LIGHT / 2 * duration * np.sort(rng.uniform(0.05, 0.9, 4)),
+        grazing_angle=np.radians(rng.uniform(2, 30)), beam_divergence=10 ** rng.uniform(-3, -2),
+        phases=str(rng.choice(["incoherent", "coherent"])), beamlets=19, fft_size=size,
+        sample_rate=rate, duration=duration, reflectance_law="lambert",
+        bandwidth=10 ** rng.uniform(7, 8), power=1.0, tnr=5.0, radial_velocity=0.0,
+    )  # fmt: skip
+    shots, bound = shots_of(scene), np.atleast_2d(overlap.left(points_of(scene)))
+    for i in range(shots.size):
+        for row, segment in enumerate(np.flatnonzero(shots.segments).tolist()):
+            off = difference(shots, i, segment, range_walk=False)
+            assert off <= np.broadcast_to(bound, (3, shots.size))[row, i] + AGREEMENT
+
+
+def test_looks_that_begin_before_the_middle_one_are_within_its_bound(table_4_1):
+    """16 looks towards a target at 3 km/s, whose first look has its own number of samples."""
+    scene = DEFAULTS | table_4_1(
+        range=np.array([400.0]), fft_size=2048, sample_rate=250e6, duration=10e-6,
+        window="rectangular", phases="incoherent", beamlets=1, bandwidth=1e7,
+        radial_velocity=3000.0,
+    ) | {"instrument.looks.number": 16}  # fmt: skip
+    ((_, shots),) = shot.prepare(scene, (*WITH_OVERLAP, "segment_motion"))
+    bound = float(np.ravel(overlap.left(points_of(scene)))[0])
+    first = segment_motion.looks_of(shots)[0]
+    assert 0 < bound < 0.05
+    assert difference(first, 0, 0, range_walk=False) <= bound + AGREEMENT
+
+
 def test_leakage_of_an_echo_that_begins_with_a_step_is_within_its_size(table_4_1):
     """Its sidelobes fall as 1/y where those of the window do as 1/y^3."""
     rng = np.random.default_rng(5)
@@ -350,6 +388,18 @@ def test_beats_that_fold_are_flagged_as_misread(table_4_1, record):
     assert np.array_equal(found["misread"] == 1, wrong)
     assert (abs(found["range_error"][wrong]) > 1e3).all()
     assert (abs(found["range_error"][~wrong]) < 1.0).all()
+
+
+def test_peaks_of_the_echo_that_are_misread_have_a_wrong_range(table_4_1):
+    """Strongest peaks: what both chirps report is wrong where their beats fold."""
+    ranges = np.array([5e3, 30e3])
+    scene = table_4_1(range=ranges, radial_velocity=0.0, beamlets=1, duration=500e-6, power=100.0)
+    scene |= {"footprint.speckle": "none", "instrument.processing.peaks": "strongest"}
+    found = shot.evaluate(scene, CORE)
+    assert found["misread"].tolist() == [0.0, 1.0]
+    assert found["pd_shot"][1] > 0.5
+    assert found["p_wrong_range_shot"][1] >= found["pd_shot"][1]
+    assert found["p_wrong_range_shot"][0] < 1e-3
 
 
 def test_a_slope_and_motion_are_no_misreading(table_4_1):

@@ -1,0 +1,242 @@
+"""Speckle that the looks of a shot share in part, as the target or the beam moves on between them.
+
+In look k a bin of a segment holds ``z_k = s_k sqrt(x_k) + n_k``: the speckle s, circular complex
+Gaussian of power 1, times the root of the look's SNR, and noise of power 1. The speckles of looks
+k and l have the correlation mu(l - k), equation (2) of :mod:`sweep.model.speckle_correlation` with
+the turn F beta (l - k) T of a scatterer between two looks that start T apart, or (3) where the echo
+spreads over bins. Looks in which the line has moved on to other bins have less power in this one.
+
+**Mean power.** With the eigenvalues c_j of the matrix sqrt(x_k x_l) mu(l - k) / x, of which the sum
+is N and x is the mean SNR, the sum of |z_k|^2 is one of independent exponential variables of means
+1 + x c_j. It exceeds y with
+
+    P(y) = 1 / (2 pi i) int exp(-s y) / s prod_j (1 - (1 + x c_j) s)^(-m_j) ds                 (1)
+
+along a parabola through the saddle point of the integrand, which the poles lie within. In contrast
+to partial fractions this keeps its digits where eigenvalues are alike. m_j is 1. More than
+MATRIX_LOOKS_MAX looks have the eigenvalues of as many looks that are farther apart; or, where their
+speckle has no memory over this distance, one of multiplicity M = N^2 / sum c^2, which is a gamma
+variable of the same variance [Goodman, Speckle Phenomena in Optics, 2007, 4.6].
+
+**Votes.** Given the speckles, records cross independently, by Q_1. The probability that enough do
+is averaged over NODES fixed speckles, a Kronecker lattice with its second moments made exact. The
+lattice's error for looks of independent speckle, of which the binomial law is known, is taken off
+in proportion to (M - 1) / (N - 1).
+
+**Two segments.** Let r be the correlation of the segments' mean powers,
+
+    r = sum_kl |mu_12(k, l)|^2 / sqrt(sum_kl |mu_11|^2 sum_kl |mu_22|^2).
+
+If they share all their speckle, the product of both is averaged over it. Of the covariance that
+this leaves they have a part: that which two Rayleigh magnitudes have at r if M is 1, and r if M is
+large.
+"""
+
+import math
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from sweep.kernels import njit
+from sweep.model.marcum import marcum_q1_pair
+
+MATRIX_LOOKS_MAX = 64
+"""Looks whose correlation matrix is taken as it is."""
+
+GAMMA_SHAPE_MIN = 32.0
+"""Effective number of looks from which the mean power of more than MATRIX_LOOKS_MAX is a gamma
+variable."""
+
+NODES = 2048
+"""Speckles of all looks over which votes are averaged."""
+
+_CONTOUR_NODES = 40
+_CONTOUR_END = 4.6
+_HALVINGS = 60
+_Q_STEPS = 512
+_SPECKLE_MAX = 5.0
+"""Largest magnitude of speckle over its root mean square."""
+
+
+class LookSpeckle(NamedTuple):
+    """Correlation of the speckle of N looks, by segment and point."""
+
+    strength: np.ndarray
+    """(3, n, k): eigenvalues c_j of the matrix of the looks' speckle."""
+    multiplicity: np.ndarray
+    """(3, n, k): m_j, 0 where there is no such eigenvalue; the sum of c_j m_j is N."""
+    shape: np.ndarray
+    """(3, n): M, the effective number of looks whose speckle is independent."""
+    between: np.ndarray
+    """(3, n): root of r, of up and Doppler, up and down, Doppler and down segment."""
+    by_lag: np.ndarray
+    """(3, n, N) complex: mu of looks that are 0, 1 .. N - 1 looks apart."""
+    power: np.ndarray
+    """(3, n, N): power of the looks in the strongest bin, of mean 1."""
+
+    @classmethod
+    def of(cls, by_lag: np.ndarray, power: np.ndarray, between: np.ndarray) -> "LookSpeckle":
+        """Take the eigenvalues of the looks' matrices."""
+        number = by_lag.shape[2]
+        strength = np.maximum(np.linalg.eigvalsh(look_matrices(by_lag, power)), 0.0)
+        strength *= number / strength.sum(axis=-1, keepdims=True)
+        multiplicity = np.ones(strength.shape)
+        shape = number**2 / np.square(strength).sum(axis=-1)
+        if number > MATRIX_LOOKS_MAX:
+            lags = np.arange(number)
+            pairs = np.where(lags > 0, 2.0, 1.0) * (number - lags)
+            is_gamma = shape > GAMMA_SHAPE_MIN
+            of_all = number**2 / (pairs * np.abs(by_lag) ** 2).sum(axis=-1)
+            shape = np.where(is_gamma, np.maximum(of_all, GAMMA_SHAPE_MIN), shape)
+            strength[is_gamma], multiplicity[is_gamma] = 0.0, 0.0
+            strength[is_gamma, 0] = number / shape[is_gamma]
+            multiplicity[is_gamma, 0] = shape[is_gamma]
+        return cls(strength, multiplicity, np.clip(shape, 1.0, number), between, by_lag, power)
+
+    def at(self, points: np.ndarray | slice) -> "LookSpeckle":
+        """Take some points, by their numbers."""
+        return LookSpeckle(*(column[:, points] for column in self))
+
+    def root(self, segment: int, point: int) -> np.ndarray:
+        """Matrix (N, N) that makes the looks' speckles of as many independent ones."""
+        by_lag = self.by_lag[segment, point]
+        matrix = look_matrices(by_lag, self.power[segment, point], by_lag.size)
+        value, vector = np.linalg.eigh(matrix)
+        return vector[:, ::-1] * np.sqrt(np.maximum(value[::-1], 0.0))
+
+
+def look_matrices(
+    by_lag: np.ndarray, power: np.ndarray, most: int = MATRIX_LOOKS_MAX
+) -> np.ndarray:
+    """Correlation matrices of the looks' speckle times the roots of their powers, (..., k, k).
+
+    Of more than ``most`` looks those of as many that are farther apart, of the same mean square
+    distance.
+    """
+    number = by_lag.shape[-1]
+    few = min(number, most)
+    if few < number:
+        step = math.sqrt((number**2 - 1) / (few**2 - 1))
+        place = np.minimum(np.arange(few) * step, number - 1)
+        lower = np.minimum(place.astype(int), number - 2)
+        share = place - lower
+        by_lag, power = (
+            values[..., lower] * (1 - share) + values[..., lower + 1] * share
+            for values in (by_lag, power)
+        )
+    lag = np.arange(few) - np.arange(few)[:, None]
+    matrix = by_lag[..., np.abs(lag)]
+    matrix = np.where(lag < 0, np.conj(matrix), matrix)
+    return matrix * np.sqrt(power[..., :, None] * power[..., None, :])
+
+
+def mean_power_tails(
+    speckle: LookSpeckle, number: int, snr: np.ndarray, threshold: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Probabilities (..., 3, n) that the sum of the looks' powers exceeds a threshold, and not.
+
+    By equation (1). ``snr`` is the mean of a look, ``threshold`` is over the noise's mean power in
+    one look.
+    """
+    snr, threshold = np.broadcast_arrays(snr, threshold)
+    noise_alone = number - speckle.multiplicity.sum(axis=-1, keepdims=True)
+    weight = np.concatenate([speckle.multiplicity, np.maximum(noise_alone, 0.0)], axis=-1)
+    mean = 1 + snr[..., None] * speckle.strength
+    mean = np.concatenate([mean, np.ones((*mean.shape[:-1], 1))], axis=-1)
+    largest = mean.max(axis=-1)
+    mean, y = mean / largest[..., None], threshold / largest
+    is_rare = y > (weight * mean).sum(axis=-1)
+    saddle, bend, skew = _saddle_point(weight, mean, y, is_rare)
+    wide = 1 / np.sqrt(bend)
+    curve = np.clip(skew / (6 * bend), 0.05 / wide, 2 / wide)[..., None]
+    step = _CONTOUR_END / _CONTOUR_NODES
+    node = (np.arange(_CONTOUR_NODES) + 0.5) * step
+    across = wide[..., None] * np.sinh(node)
+    s = saddle[..., None] + 1j * across + curve * across * across
+    slope = (1j + 2 * curve * across) * wide[..., None] * np.cosh(node) * step
+    exponent = -s * y[..., None]
+    for j in range(mean.shape[-1]):
+        exponent = exponent - weight[..., j, None] * np.log(1 - mean[..., j, None] * s)
+    tail = np.abs((np.exp(exponent) / s * slope / 1j).real.sum(axis=-1)) / np.pi
+    tail = np.minimum(tail, 1.0)
+    return np.where(is_rare, tail, 1 - tail), np.where(is_rare, 1 - tail, tail)
+
+
+def _saddle_point(
+    weight: np.ndarray, mean: np.ndarray, y: np.ndarray, is_rare: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Saddle point of the integrand of (1), and the second and third derivative of its logarithm.
+
+    It lies between 0 and the first pole for the upper tail, below 0 for the lower one.
+    """
+    low = np.where(is_rare, 1e-12, -1e12)
+    high = np.where(is_rare, 1 - 1e-12, -1e-12)
+    for _ in range(_HALVINGS):
+        middle = np.where(is_rare, 0.5 * (low + high), -np.sqrt(low * high))
+        ratio = mean / (1 - mean * middle[..., None])
+        rises = (weight * ratio).sum(axis=-1) - y - 1 / middle > 0
+        low, high = np.where(rises, low, middle), np.where(rises, middle, high)
+    bend = (weight * ratio**2).sum(axis=-1) + 1 / middle**2
+    return middle, bend, 2 * (weight * ratio**3).sum(axis=-1) - 2 / middle**3
+
+
+@lru_cache(maxsize=8)
+def independent_speckles(number: int) -> np.ndarray:
+    """Speckles (NODES, number) complex of looks that are independent: a fixed lattice.
+
+    Their mean is 0 and their covariance the unit matrix.
+    """
+    primes = [2]
+    while len(primes) < 2 * number:
+        following = primes[-1] + 1
+        while any(following % prime == 0 for prime in primes):
+            following += 1
+        primes.append(following)
+    place = np.mod((np.arange(NODES)[:, None] + 0.5) * np.sqrt(primes), 1.0)
+    place = np.clip(place, 1e-9, 1 - 1e-9)
+    speckle = np.sqrt(-np.log(place[:, :number])) * np.exp(2j * np.pi * place[:, number:])
+    speckle -= speckle.mean(axis=0)
+    factor = np.linalg.cholesky(speckle.conj().T @ speckle / NODES)
+    return speckle @ np.linalg.inv(factor).conj().T
+
+
+@njit(cache=True, error_model="numpy")
+def correlated_magnitudes(speckle, root):
+    """Magnitudes (m, N) of the looks' speckle, of independent ones (m, k) by a matrix (N, k)."""
+    magnitude = np.empty((speckle.shape[0], root.shape[0]))
+    for i in range(speckle.shape[0]):
+        for k in range(root.shape[0]):
+            re, im = 0.0, 0.0
+            for j in range(root.shape[1]):
+                product = speckle[i, j] * root[k, j]
+                re += product.real
+                im += product.imag
+            magnitude[i, k] = math.hypot(re, im)
+    return magnitude
+
+
+@njit(cache=True, error_model="numpy")
+def votes_given_speckle(signal, level, votes, magnitude):
+    """Probability (m,) that enough looks cross, given the magnitudes (m, N) of their speckle.
+
+    ``signal`` and ``level``: root mean square signal and threshold over the noise per quadrature.
+    """
+    crossing = np.empty(_Q_STEPS + 1)
+    step = _SPECKLE_MAX / _Q_STEPS
+    for k in range(_Q_STEPS + 1):
+        crossing[k] = marcum_q1_pair(signal * k * step, level)[0]
+    enough, share = np.empty(magnitude.shape[0]), np.empty(votes + 1)
+    for i in range(magnitude.shape[0]):
+        share[:] = 0.0
+        share[0] = 1.0
+        for j in range(magnitude.shape[1]):
+            place = min(magnitude[i, j] / step, _Q_STEPS - 1e-9)
+            k = int(place)
+            chance = crossing[k] + (place - k) * (crossing[k + 1] - crossing[k])
+            share[votes] += share[votes - 1] * chance
+            for v in range(votes - 1, 0, -1):
+                share[v] = share[v] * (1.0 - chance) + share[v - 1] * chance
+            share[0] *= 1.0 - chance
+        enough[i] = share[votes]
+    return enough

@@ -1,0 +1,219 @@
+"""Looks whose speckle motion between them changes, compared with drawn scatterers and amplitudes.
+
+Records of scatterers share the mean echo power, the noise and the threshold with the model.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scatterers import draw_looks
+from test_speckle_on_slopes import LANDER, facet_of, shots_of, with_threshold
+
+from sweep.model import link
+from sweep.model.effects.catalogue import DEFAULTS
+from sweep.model.look_speckle import LookSpeckle
+from sweep.model.looks import COMBINE, NUMBER, SPECKLE, VOTES, Looks
+from sweep.model.shot import find, statistics
+
+TOLERANCE = 0.02
+DRAWS = 8000
+
+
+def detections(p, shots, seed):
+    """Detections of drawn shots by segment, (draws,) bool."""
+    facet, looks = facet_of(p, shots), shots.looks
+    slide = float(np.ravel(shots.approach - shots.radial_velocity)[0])
+    bins, amplitude = {}, {}
+    for number, segment in enumerate(("up", "doppler", "down")):
+        if segment in facet.segments:
+            beat = find(shots)[number, 3]
+            gain = link.transfer(
+                beat, detector_bandwidth=shots.detector_bandwidth,
+                amplifier_bandwidth=shots.amplifier_bandwidth,
+            )  # fmt: skip
+            echo = shots.beat_scale * np.sqrt(shots.relative_echo) * np.abs(gain)
+            amplitude[segment] = float(np.ravel(echo * shots.whitening[number])[0])
+            bins[segment] = round(float(beat[0]) / float(shots.sample_rate[0]) * shots.fft_size)
+    found = {}
+    drawn = draw_looks(
+        replace(facet, looks=looks.number, slide=slide), bins=bins, amplitude=amplitude,
+        noise_deviation=float(np.sqrt(shots.noise_variance[0])), draws=DRAWS, seed=seed,
+    )  # fmt: skip
+    for segment, values in drawn.items():
+        power, level = np.abs(values) ** 2, float(shots.threshold[0]) ** 2
+        if looks.combine == "power":
+            found[segment] = power.mean(axis=1) >= level
+        else:
+            found[segment] = (power >= level).sum(axis=1) >= looks.votes
+    return found
+
+
+SLOPE = {
+    "target.range": 300.0, "target.grazing_angle": np.radians(25),
+    "target.transverse_velocity": 12.0, "target.radial_velocity": 15.0,
+    "instrument.chirp.segments": "up down",
+    "instrument.processing.detection": "peak_bin",
+}  # fmt: skip
+ANY_TWO = {
+    "instrument.processing.shot_detection": "any_two",
+    "instrument.chirp.segments": "up doppler down",
+}  # fmt: skip
+CASES = {
+    "four powers": {NUMBER: 4},
+    "eight powers, slowly": {NUMBER: 8, "target.transverse_velocity": 4.0},
+    "eight powers, fast and down": {
+        NUMBER: 8, "target.transverse_velocity": -20.0, "target.radial_velocity": 20.0,
+    },
+    "two thirds of a bin": {
+        NUMBER: 4, "target.range": 600.0, "target.grazing_angle": np.radians(10),
+    },
+    "one and a half bins of hann": {
+        NUMBER: 4, "target.range": 407.0, "target.grazing_angle": np.radians(3),
+        "instrument.processing.window": "hann", "target.transverse_velocity": 6.0,
+    },
+    "looks that drift by a bin": {
+        NUMBER: 24, "target.radial_velocity": 25.0, "target.transverse_velocity": 8.0,
+    },
+    "three votes of eight": {NUMBER: 8, COMBINE: "binary", VOTES: 3},
+    "one vote of four": {NUMBER: 4, COMBINE: "binary", VOTES: 1},
+    "six votes of eight, slowly": {
+        NUMBER: 8, COMBINE: "binary", VOTES: 6, "target.transverse_velocity": 4.0,
+    },
+    "any two of powers": {NUMBER: 4, **ANY_TWO},
+    "any two of powers, slowly": {
+        NUMBER: 8, **ANY_TWO,
+        "target.transverse_velocity": 4.0,
+    },
+    "any two of votes": {
+        NUMBER: 4, COMBINE: "binary", VOTES: 2, **ANY_TWO,
+    },
+    "any two in one speckle": {
+        NUMBER: 4, **ANY_TWO, "target.transverse_velocity": 0.0,
+    },
+}  # fmt: skip
+
+
+FAST = ("eight powers, fast and down", "three votes of eight", "any two of powers")
+
+
+@pytest.mark.parametrize(
+    "case", [pytest.param(case, marks=[pytest.mark.slow] * (case not in FAST)) for case in CASES]
+)
+def test_looks_detect_as_often_as_in_drawn_records(case, table_4_1):
+    p = DEFAULTS | table_4_1() | LANDER | SLOPE | CASES[case]
+    p = with_threshold(p | {NUMBER: 1}, 1.3 if COMBINE not in p else 1.0) | {NUMBER: p[NUMBER]}
+    shots = shots_of(p)
+    outputs = statistics(shots)
+    found = detections(p, shots, seed=len(case))
+    shot = found["up"] & found["down"]
+    if shots.any_two:
+        shot = sum(found[segment].astype(int) for segment in found) >= 2
+    shares = {"pd_up": found["up"].mean(), "pd_down": found["down"].mean(), "pd_shot": shot.mean()}
+    for name, share in shares.items():
+        pd = float(outputs[name][0])
+        error = np.sqrt(pd * (1 - pd) / DRAWS)
+        assert abs(pd - share) < 4 * error + TOLERANCE, name
+
+
+def drawn_amplitudes(number, turn, apart, snr, draws, rng):
+    """Powers (draws, 3, looks) of segments whose speckle turns by these phases, noise included."""
+    times = np.concatenate([np.arange(number) * turn + segment * apart for segment in range(3)])
+    values, vectors = np.linalg.eigh(np.exp(-0.5 * (times[:, None] - times) ** 2))
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    echo, noise = (
+        (rng.normal(size=(draws, 3 * number)) + 1j * rng.normal(size=(draws, 3 * number)))
+        / np.sqrt(2)
+        for _ in range(2)
+    )
+    power = np.abs(echo @ root.T * np.repeat(np.sqrt(snr), number) + noise) ** 2
+    return power.reshape(draws, 3, number)
+
+
+def speckle_of(number, turn, apart):
+    lag = np.arange(number)
+    by_lag = np.broadcast_to(np.exp(-0.5 * (turn * lag) ** 2).astype(complex), (3, 1, number))
+    lags = np.arange(1 - number, number)
+    weight = number - np.abs(lags)
+    alone = (weight * np.exp(-((turn * lags) ** 2))).sum()
+    between = [
+        np.sqrt((weight * np.exp(-((distance * apart + turn * lags) ** 2))).sum() / alone)
+        for distance in (1, 2, 1)
+    ]
+    return LookSpeckle.of(by_lag, np.ones((3, 1, number)), np.array(between)[:, None])
+
+
+@pytest.mark.parametrize(
+    ("number", "combine", "votes"),
+    [(2, "power", 1), (8, "power", 1), (100, "power", 1), (2, "binary", 1), (8, "binary", 3)],
+)
+@pytest.mark.parametrize("turn", [0.03, 0.3, 1.0])
+def test_looks_detect_as_often_as_drawn_amplitudes(number, combine, votes, turn):
+    rng, draws, snr = np.random.default_rng(number), 20_000 if number < 20 else 4000, (3, 8, 5)
+    looks, speckle = Looks(number, combine, votes, moving=True), speckle_of(number, turn, turn / 3)
+    power = drawn_amplitudes(number, turn, turn / 3, snr, draws, rng)
+    shown = power.mean(axis=2) if combine == "power" else np.sort(power, axis=2)[:, :, -votes]
+    least = np.quantile(shown[:, 0], 0.5)
+    detected = shown >= least
+    signals, level = np.sqrt(2 * np.array(snr, float))[:, None], np.sqrt(2 * np.array([least]))
+    pd, miss = looks.faded(signals, level, speckle)
+    np.testing.assert_allclose(pd + miss, 1.0, atol=1e-12)
+    both = looks.faded_together(signals[0], signals[2], level, speckle.between[1], speckle)
+    two = looks.faded_any_two(signals, level, speckle.between, pd, speckle)[0]
+    told = [*pd[:, 0], both[0], two[0]]
+    drawn = [
+        *detected.mean(axis=0), (detected[:, 0] & detected[:, 2]).mean(),
+        (detected.sum(axis=1) >= 2).mean(),
+    ]  # fmt: skip
+    np.testing.assert_allclose(told, drawn, atol=TOLERANCE + 3 * 0.5 / np.sqrt(draws))
+
+
+def test_looks_of_one_speckle_and_of_independent_ones_are_swerlings_cases():
+    signal = np.array([[0.5, 2.0, 6.0, 20.0]] * 3)
+    level = np.full(4, 2.5)
+    for turn, law in ((1e-9, Looks(8)), (50.0, Looks(8, independent=True))):
+        found, missed = Looks(8, moving=True).faded(signal, level, speckle_of(8, turn, 0.0))
+        expected, lost = law.faded(signal, level)
+        np.testing.assert_allclose(found, expected, rtol=1e-6)
+        np.testing.assert_allclose(missed, lost, rtol=1e-6)
+
+
+def test_tails_keep_their_digits():
+    """Partial fractions of four eigenvalues in 60 digits, by mpmath."""
+    mpmath = pytest.importorskip("mpmath")
+    speckle = speckle_of(4, 0.8, 0.0)
+    for signal, level in ((1.0, 6.0), (30.0, 2.0)):
+        a, b = np.full((3, 1), signal), np.full((3, 1), level)
+        found, missed = Looks(4, moving=True).faded(a, b, speckle)
+        with mpmath.workdps(60):
+            mean = [1 + mpmath.mpf(float(c)) * signal**2 / 2 for c in speckle.strength[0, 0]]
+            exact = sum(
+                mpmath.exp(-2 * mpmath.mpf(level) ** 2 / own)
+                * mpmath.fprod(own / (own - other) for other in mean if other != own)
+                for own in mean
+            )
+        if exact < 0.5:
+            assert float(found[0, 0]) == pytest.approx(float(exact), rel=1e-6)
+        else:
+            assert float(missed[0, 0]) == pytest.approx(float(1 - exact), rel=1e-6)
+
+
+def test_a_target_at_rest_has_one_speckle_in_all_looks(table_4_1):
+    p = DEFAULTS | table_4_1() | LANDER | SLOPE | {NUMBER: 8}
+    p |= {"target.radial_velocity": 0.0, "target.transverse_velocity": 0.0}
+    shots = shots_of(p)
+    assert shots.look_speckle is None
+    common = statistics(shots_of(p | {SPECKLE: "common"}))
+    np.testing.assert_array_equal(statistics(shots)["pd_shot"], common["pd_shot"])
+
+
+def test_added_amplitudes_of_looks_lose_what_their_speckle_does_not_share(table_4_1):
+    """The mean amplitude of N looks: sum of mu over all pairs of looks, over N^2, of the power."""
+    p = DEFAULTS | table_4_1() | LANDER | SLOPE | {NUMBER: 6, COMBINE: "coherent"}
+    moving, common = shots_of(p), shots_of(p | {SPECKLE: "common"})
+    powers = shots_of(p | {COMBINE: "power"}).look_speckle.by_lag[0, 0]
+    lag = np.arange(6) - np.arange(6)[:, None]
+    shared = np.abs(powers)[np.abs(lag)].sum() / 36
+    assert 0.05 < shared < 0.9
+    ratio = (find(moving)[0, 2, 0] / find(common)[0, 2, 0]) ** 2
+    assert ratio == pytest.approx(shared, rel=1e-3)
