@@ -2,20 +2,21 @@
 
 In look k a bin of a segment holds ``z_k = s_k sqrt(x_k) + n_k``: the speckle s, circular complex
 Gaussian of power 1, times the root of the look's SNR, and noise of power 1. The speckles of looks
-k and l have the correlation mu(l - k), equation (2) of :mod:`sweep.model.speckle_correlation` with
-the turn F beta (l - k) T of a scatterer between two looks that start T apart, or (3) where the echo
-spreads over bins. Looks in which the line has moved on to other bins have less power in this one.
+k and l have the correlation mu(l - k), equation (2) of :mod:`sweep.model.speckle_correlation`: with
+the turn F beta (l - k) T of a scatterer between two looks, which start T apart. If the echo spreads
+over bins it is equation (3). Looks in which the line has moved on to other bins have less power in
+this one.
 
-**Mean power.** With the eigenvalues c_j of the matrix sqrt(x_k x_l) mu(l - k) / x, of which the sum
-is N and x is the mean SNR, the sum of |z_k|^2 is one of independent exponential variables of means
-1 + x c_j. It exceeds y with
+**Mean power.** Let x be the mean SNR, and c_j the eigenvalues of the matrix sqrt(x_k x_l) mu(l - k)
+over x, of which the sum is N. The sum of |z_k|^2 is one of independent exponential variables, of
+means 1 + x c_j. It exceeds y with
 
     P(y) = 1 / (2 pi i) int exp(-s y) / s prod_j (1 - (1 + x c_j) s)^(-m_j) ds                 (1)
 
 along a parabola through the saddle point of the integrand, which the poles lie within. In contrast
 to partial fractions this keeps its digits where eigenvalues are alike. m_j is 1. More than
-MATRIX_LOOKS_MAX looks have the eigenvalues of as many looks that are farther apart; or, where their
-speckle has no memory over this distance, one of multiplicity M = N^2 / sum c^2, which is a gamma
+MATRIX_LOOKS_MAX looks have the eigenvalues of as many looks that are farther apart. If their
+speckle has no memory over this distance, there is one of multiplicity M = N^2 / sum c^2: a gamma
 variable of the same variance [Goodman, Speckle Phenomena in Optics, 2007, 4.6].
 
 **Votes.** Given the speckles, records cross independently, by Q_1. The probability that enough do
