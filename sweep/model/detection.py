@@ -57,6 +57,18 @@ class DetectionRule(NamedTuple):
     """Modes of echoes that any bin detects."""
 
 
+class BinLevels(NamedTuple):
+    """Threshold and noise of the bins of an echo [V, summed over the record]."""
+
+    line: float
+    """Noise per quadrature in bins that lines fill, with what of their pedestal |X| sees."""
+    threshold: float
+    quiet: float
+    """Noise per quadrature without the pedestal."""
+    beside: float
+    """Noise per quadrature in bins beside the lines, with all of the pedestal."""
+
+
 class BinSpeckle(NamedTuple):
     """Speckle in the bins of a point's segment."""
 
@@ -87,6 +99,12 @@ class SpeckleTable(NamedTuple):
         """Speckle of one segment of some points."""
         spread, row = (values[[segment]][:, points] for values in (self.spread, self.row))
         return SpeckleTable(spread, row, self.quadratures, self.factors)
+
+
+@njit(cache=True, error_model="numpy")
+def levels_of(table, i):
+    """:class:`BinLevels` of a point, from a table (4, n) of them."""
+    return BinLevels(table[0, i], table[1, i], table[2, i], table[3, i])
 
 
 @njit(cache=True, error_model="numpy")
@@ -222,13 +240,20 @@ def found_pair(magnitude, echo, peak, low, rule, levels, speckle):
     """Probabilities that an echo is detected, and that it is missed.
 
     By any of its bins (:func:`any_pair`), or by the peak of a run alone where half of a main lobe
-    is 0. ``rule`` is a :class:`DetectionRule`, ``speckle`` the :class:`BinSpeckle` of the segment;
-    ``levels`` are the noise per quadrature and the threshold.
+    is 0. ``rule`` is a :class:`DetectionRule`, ``levels`` are :class:`BinLevels`, and ``speckle``
+    is the :class:`BinSpeckle` of the segment. A pedestal of phase noise is light of the echo and
+    fades with it.
     """
-    deviation, level = levels
+    deviation, level = levels.line, levels.threshold
     if rule.fades >= 0.0:
         if rule.beside > 0:
             return any_faded(magnitude, echo, low, rule, levels, speckle)
+        if deviation > levels.quiet:
+            steady = np.empty((4, 1))
+            steady[0, 0], steady[1, 0] = magnitude[peak] / levels.quiet, level / levels.quiet
+            steady[2, 0] = 0.0
+            steady[3, 0] = (deviation / levels.quiet) ** 2 - 1.0
+            return _mean_over_phases(steady, np.array([True]), low + peak, rule, speckle)
         signal, noise = magnitude[peak] * magnitude[peak], 2.0 * deviation * deviation
         share = 0.0
         if speckle.quadratures.size > 0:
@@ -237,13 +262,13 @@ def found_pair(magnitude, echo, peak, low, rule, levels, speckle):
             share /= signal + noise
         return hoyt_pair(signal + noise, share, level)
     if rule.beside > 0:
-        return any_pair(magnitude, echo, low, rule.ends, deviation, level, rule.pairs)
+        return any_pair(magnitude, echo, low, rule.ends, levels, rule.pairs)
     real = is_end(low + peak, rule.ends)
     return crossing_pair(magnitude[peak] / deviation, level / deviation, real)
 
 
 @njit(cache=True, error_model="numpy")
-def any_pair(magnitude, echo, low, ends, deviation, level, pairs):
+def any_pair(magnitude, echo, low, ends, levels, pairs):
     """Probabilities that any bin of an echo reaches the threshold, and that none does.
 
     Each bin by itself crosses with :func:`crossing_pair`. Neighbours' noise is correlated, and in
@@ -253,13 +278,18 @@ def any_pair(magnitude, echo, low, ends, deviation, level, pairs):
         1 / (2 pi) int_0^{asin rho} exp(-(s^2 + t^2 - 2 s t sin u) / (2 cos^2 u)) du
 
     to the product [Owen, Ann. Math. Statist. 27, 1956], by the rule ``pairs`` of
-    :func:`sweep.model.alarms.pair_nodes`; bins are a Markov chain of first order.
+    :func:`sweep.model.alarms.pair_nodes`; bins are a Markov chain of first order. ``levels`` are
+    :class:`BinLevels`.
     """
-    found, missed, before, t_before = 0.0, 1.0, -1.0, 0.0
+    found, missed, before, t_before, largest = 0.0, 1.0, -1.0, 0.0, 0.0
+    level = levels.threshold
+    for i in range(magnitude.size):
+        largest = max(largest, magnitude[i] if echo[i] else 0.0)
     for i in range(magnitude.size):
         if not echo[i]:
             before = -1.0
             continue
+        deviation = levels.line if magnitude[i] >= 0.5 * largest else levels.beside
         real = is_end(low + i, ends)
         crosses, stays = crossing_pair(magnitude[i] / deviation, level / deviation, real)
         if not stays > 0.0:
@@ -384,41 +414,60 @@ def _stretch_faded(magnitude, echo, bounds, low, rule, levels, speckle):
         below = above = max(below, above)  # bins mirror there
     lean = lean_of(below, magnitude[nearest], above)
     at, modes = modes_of(rule.modes, speckle.spread, lean), rule.modes
-    noise = 2.0 * levels[0] * levels[0]
+    noise = 2.0 * levels.quiet * levels.quiet
     # Over the noise per quadrature that the other modes make with the receiver's: the strongest
-    # mode, the threshold; and the correlation of this noise with that of the bin below.
-    steady, bins = np.empty((5, end - begin)), end - begin
+    # mode, the threshold; the correlation of this noise with that of the bin below; the pedestal
+    # that fades with the mode, as a power.
+    steady, bins = np.empty((6, end - begin)), end - begin
     share_before = 0.0
     for k in range(bins):
         i = begin + k
         power = magnitude[i] * magnitude[i]
         share = interpolated(modes.share, at, i - nearest)
-        other = (1.0 - share) * power + noise
+        deviation = levels.line if magnitude[i] >= 0.5 * magnitude[nearest] else levels.beside
+        pedestal = 2.0 * deviation * deviation - noise
+        other = (1.0 - share) * (power + pedestal) + noise
         scale = math.sqrt(2.0 / other)
-        steady[0, k], steady[1, k] = scale * math.sqrt(share * power), scale * levels[1]
+        steady[3, k] = share * pedestal / other
+        steady[0, k], steady[1, k] = scale * math.sqrt(share * power), scale * levels.threshold
         steady[2, k] = 0.0
         if k > 0 and echo[i] and echo[i - 1]:
             alike = interpolated(modes.coherence, at, i - nearest)
             own = (abs(alike) - math.sqrt(share * share_before)) * magnitude[i] * magnitude[i - 1]
             own += noise * math.copysign(rule.fades, alike)
-            steady[2, k] = min(max(0.5 * own * scale * steady[3, k - 1], -0.999), 0.999)
-        steady[3, k], steady[4, k], share_before = scale, share, share
+            steady[2, k] = min(max(0.5 * own * scale * steady[4, k - 1], -0.999), 0.999)
+        steady[4, k], steady[5, k], share_before = scale, share, share
+    for k in range(bins):
+        # Of bins near an end, but these, the other modes go with the phase too.
+        bin_ = low + begin + k
+        others = (1.0 - steady[5, k]) * magnitude[begin + k] ** 2
+        steady[4, k] = 0.0
+        if bin_ != 0 and bin_ != rule.half:
+            steady[4, k] = others / (others + noise)
+    return _mean_over_phases(steady, echo[begin:end], low + begin, rule, speckle)
+
+
+@njit(cache=True, error_model="numpy")
+def _mean_over_phases(steady, echo, low, rule, speckle):
+    """:func:`_mean_over_mode`, and over the phases of the mode where quadratures differ.
+
+    A fifth row of ``steady``, where there is one, is the share of the noise that is echo as well.
+    """
     if speckle.quadratures.size == 0:
-        return _mean_over_mode(steady, echo[begin:end], low + begin, rule.ends)
+        return _mean_over_mode(steady, echo, low, rule.ends)
     found, missed = 0.0, 0.0
     turned = steady.copy()
     for angle in range(ANGLES):
-        cosine = COSINES[angle]
-        for k in range(bins):
-            bin_ = low + begin + k
-            factor = max(1.0 + bin_share(bin_, rule.half, speckle.quadratures) * cosine, 0.0)
-            turned[0, k] = steady[0, k] * math.sqrt(factor)
-            if bin_ != 0 and bin_ != rule.half:  # else the others are real noise
-                others = factor * (1.0 - steady[4, k]) * magnitude[begin + k] ** 2
-                scale = math.sqrt(2.0 / (others + noise)) / steady[3, k]
-                turned[0, k] *= scale
-                turned[1, k] = steady[1, k] * scale
-        one = _mean_over_mode(turned, echo[begin:end], low + begin, rule.ends)
+        for k in range(echo.size):
+            share = bin_share(low + k, rule.half, speckle.quadratures)
+            factor = max(1.0 + share * COSINES[angle], 0.0)
+            scale = 1.0
+            if steady.shape[0] > 4:
+                scale = 1.0 / math.sqrt(1.0 + (factor - 1.0) * steady[4, k])
+            turned[0, k] = steady[0, k] * math.sqrt(factor) * scale
+            turned[1, k] = steady[1, k] * scale
+            turned[3, k] = steady[3, k] * factor * scale * scale
+        one = _mean_over_mode(turned, echo, low, rule.ends)
         found, missed = found + one[0] / ANGLES, missed + one[1] / ANGLES
     return found, missed
 
@@ -427,25 +476,35 @@ def _stretch_faded(magnitude, echo, bounds, low, rule, levels, speckle):
 def _mean_over_mode(steady, echo, low, ends):
     """Probabilities that any, and that no, bin crosses, over a signal that fades in all alike.
 
-    ``steady`` (3, bins): the signal's root mean square over the noise, the threshold over the
-    noise, and the correlation of the noise with that of the bin below.
+    ``steady`` (4, bins): the signal's root mean square over the noise; the threshold over the
+    noise; the correlation of the noise with that of the bin below; the mean power of noise that
+    fades with the signal, over the other's.
     """
-    first, last = _Z_MAX, _Z_MAX
+    first, last, middle = _Z_MAX, _Z_MAX, _Z_MAX
     for k in range(echo.size):
         if echo[k] and steady[0, k] > 0.0:
-            first = min(first, max(steady[1, k] - _REACH, 0.0) / steady[0, k])
-            last = min(last, (steady[1, k] + _REACH) / steady[0, k])
+            wide = _REACH * math.sqrt(steady[3, k])
+            middle = min(middle, steady[1, k] / steady[0, k])
+            first = min(first, max(steady[1, k] - _REACH, 0.0) / (steady[0, k] + wide))
+            if steady[0, k] > wide:
+                last = min(last, (steady[1, k] + _REACH) / (steady[0, k] - wide))
+    last = min(last, math.sqrt(middle * middle + 10.0))  # what is beyond is 5e-5 of it all
     found, missed = math.exp(-last * last), 0.0
     if first > 0.0:
         weight = -math.expm1(-first * first)
         one = _any_steady(steady, 0.6 * first, echo, low, ends)
         found, missed = found + weight * one[0], weight * one[1]
-    half = 0.5 * (last - first)
-    for j in range(_ORDER if half > 0.0 else 0):
-        z = first + half * (_NODE[j] + 1.0)
-        weight = half * _WEIGHT[j] * 2.0 * z * math.exp(-z * z)
-        one = _any_steady(steady, z, echo, low, ends)
-        found, missed = found + weight * one[0], missed + weight * one[1]
+    # Probabilities rise about the middle, of a fading pedestal as far as it goes.
+    ends_of_pieces = (first, last, last)
+    if steady[3].max() > 0.0 and first < middle < last:
+        ends_of_pieces = (first, middle, last)
+    for piece in range(2):
+        half = 0.5 * (ends_of_pieces[piece + 1] - ends_of_pieces[piece])
+        for j in range(_ORDER if half > 0.0 else 0):
+            z = ends_of_pieces[piece] + half * (_NODE[j] + 1.0)
+            weight = half * _WEIGHT[j] * 2.0 * z * math.exp(-z * z)
+            one = _any_steady(steady, z, echo, low, ends)
+            found, missed = found + weight * one[0], missed + weight * one[1]
     whole = found + missed  # 1 but for the quadrature
     return found / whole, missed / whole
 
@@ -466,8 +525,9 @@ def _any_steady(steady, z, echo, low, ends):
         if not echo[k]:
             before = -1.0
             continue
-        a = steady[0, k] * z
-        crosses, stays = crossing_pair(a, steady[1, k], is_end(low + k, ends))
+        scale = 1.0 / math.sqrt(1.0 + steady[3, k] * z * z)
+        a = steady[0, k] * z * scale
+        crosses, stays = crossing_pair(a, steady[1, k] * scale, is_end(low + k, ends))
         if not stays > 0.0:
             return 1.0, 0.0
         if crosses < _RARE:  # so is that both of a pair cross
@@ -543,12 +603,13 @@ def _exempt(first, last, count, exempt):
 
 
 @njit(cache=True, error_model="numpy")
-def detect_rows(magnitude, first, bins, rule, deviation, level, speckle, out):
+def detect_rows(magnitude, first, bins, rule, levels, speckle, out):
     """Detect in runs of spectra without noise, (m, count), into ``out`` (6, m).
 
     Its rows are those of :data:`sweep.model.segments.SEGMENT_FIELDS`; no leakage. ``bins`` are the
     last bin of the spectrum and the bin width [Hz]; bins outside 0..N/2 are passed over.
-    ``speckle`` is a :class:`SpeckleTable`, (1, m).
+    ``levels`` (4, m) are those of :class:`BinLevels`; ``speckle`` is a :class:`SpeckleTable`,
+    (1, m).
     """
     half, width = bins
     exempt = np.empty(magnitude.shape[1], np.bool_)
@@ -556,9 +617,9 @@ def detect_rows(magnitude, first, bins, rule, deviation, level, speckle, out):
         low = max(-first[i], 0)
         high = min(half + 1 - first[i], magnitude.shape[1])
         run = magnitude[i, low:high]
-        peak, exempted = mark(run, run.size, level[i], exempt, rule.beside)
+        peak, exempted = mark(run, run.size, levels[1, i], exempt, rule.beside)
         found, missed = found_pair(
-            run, exempt[: run.size], peak, first[i] + low, rule, (deviation[i], level[i]),
+            run, exempt[: run.size], peak, first[i] + low, rule, levels_of(levels, i),
             speckle_of(speckle, 0, i),
         )  # fmt: skip
         out[0, i], out[1, i], out[2, i] = found, missed, run[peak]

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sweep.kernels import njit
-from sweep.model.detection import echo_of, found_pair, speckle_of
+from sweep.model.detection import echo_of, found_pair, levels_of, speckle_of
 from sweep.model.preparation import Shots
 from sweep.model.segments import Runs, runs_of
 
@@ -50,7 +50,7 @@ def groups(shots: Shots, *, most: int = 4, every_bin: bool = False) -> Groups:
     bins = np.full((3, n, 3, most), -1, np.int64)
     neighbours, pd = np.full((n, 3, most, 3), np.nan), np.full((n, 3, most), np.nan)
     exempted, leakage = np.full((n, 3), np.nan), np.full((n, 3), np.nan)
-    levels = np.stack([shots.threshold, shots.line_deviation])
+    levels = shots.bin_levels
     mirror = 0 if shots.complex_record else shots.fft_size // 2
     for runs in runs_of(shots, every_bin=every_bin):
         count, magnitudes = (runs.bins, runs.magnitudes) if shots.band is None else _echoes(runs)
@@ -96,7 +96,7 @@ def _find_groups(part, runs, of_bins, levels, how, bins, neighbours, pd):
     magnitudes, exempts = of_bins
     for j in range(part.size):
         i = part[j]
-        level, deviation = levels[0, i], levels[1, i]
+        level = levels[1, i]
         for s in range(3):
             if count[s, j] == 0:
                 continue
@@ -111,7 +111,7 @@ def _find_groups(part, runs, of_bins, levels, how, bins, neighbours, pd):
                 echo = np.ones(last - first + 1, np.bool_)
                 pd[i, s, g] = found_pair(
                     magnitude[first : last + 1], echo, k - first, low[s, j] + first, rule,
-                    (deviation, level), speckle_of(speckle, s, i),
+                    levels_of(levels, i), speckle_of(speckle, s, i),
                 )[0]  # fmt: skip
                 for side in range(3):
                     neighbours[i, s, g, side] = _beside(magnitude, low[s, j], k + side - 1, half)

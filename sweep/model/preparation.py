@@ -179,6 +179,8 @@ class Shots:
     """(n,): FWHM [Hz] of the beat's Gaussian line."""
     laser_width: np.ndarray | float = 0.0
     """FWHM [Hz] of the Lorentzian line of a laser, whose phase walks randomly, (n,)."""
+    pedestal_beside: np.ndarray | float = 0.0
+    """Noise variance at the ADC [V^2] that stands in bins beside the lines."""
     pedestal: np.ndarray | float = 0.0
     """Noise variance at the ADC [V^2] that stands under the lines, and nowhere else."""
     noise_gain: np.ndarray | float = 1.0
@@ -340,6 +342,13 @@ class Shots:
     def line_deviation(self) -> np.ndarray:
         """Noise sigma of a bin that holds lines, per quadrature [V], (n,)."""
         return self._deviation(self.noise_variance + self.pedestal)
+
+    @cached_property
+    def bin_levels(self) -> np.ndarray:
+        """Levels of a point's bins, (4, n): :class:`sweep.model.detection.BinLevels`."""
+        beside = self._deviation(self.noise_variance + self.pedestal_beside)
+        levels = self.line_deviation, self.threshold, self.bin_deviation, beside
+        return in_rows(levels, (self.size,))
 
     def snr(self, magnitude: np.ndarray) -> np.ndarray:
         """Mean power of a bin's signal over the mean power of its noise, (..., n).
@@ -571,6 +580,7 @@ class Shots:
             self.amplifier_bandwidth, self.sample_rate, self.acquisition_delay, self.carriers[0],
             self.carriers[2], self.bin_deviation, self.threshold, self.floor,
             self.line_deviation, self.leakage_tolerance, self.line_tolerance, self.image_gain,
+            self.bin_levels[3],
         )  # fmt: skip
         further = (
             x

@@ -17,8 +17,8 @@ number is real. Some bins away q is 0, and the number is circular.
 
 The law of |X|^2 is in :mod:`sweep.model.hoyt`.
 
-Phase errors within the record widen a line and are left out of G here, as are the samples that the
-echo does not have; both change q between the bins 0 and that where it vanishes.
+Phase errors within the record widen a line. They are left out of G here, as are the samples that
+the echo does not have. Neither changes q at DC, where it is 1.
 """
 
 import math

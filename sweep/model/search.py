@@ -7,7 +7,7 @@ import numpy as np
 
 from sweep.kernels import njit
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.detection import echo_of, found_pair, speckle_of
+from sweep.model.detection import echo_of, found_pair, levels_of, speckle_of
 from sweep.model.marcum import excess_crossing
 
 
@@ -28,8 +28,8 @@ def cut(shots: Any, runs: Any) -> Any:
     apart = apart % period if period else apart
     inside = (runs.bins == 0) | ((apart >= 0) & (apart < band[:, 1]))
     lines = np.empty((part.size, 3, 0)) if inside.all() else beamlet_lines(shots)[part]
-    each = shots.line_deviation, shots.threshold, shots.bin_deviation, shots.floor
-    levels = np.array([np.broadcast_to(column, shots.size)[part] for column in each])
+    floor = np.broadcast_to(shots.floor, shots.size)[part]
+    levels = np.concatenate([shots.bin_levels[:, part], floor[None]])
     leaks = np.array([shots.leakage and each.leaks for each in shots.waveform])
     where = band, period, lines, inside
     speckle = part, shots.speckle_table
@@ -103,10 +103,10 @@ def _cut(numbers, where, levels, how, speckle, magnitudes, exempts, chances):
 
     ``numbers`` (5, segments, m) are low, count, peak, exempted and start of runs; ``where`` the
     band (3, 2, m), N of complex records or 0, places of lines (m, 3, beamlets), and whether a run's
-    largest bin is searched; ``levels`` (4, m) noise under lines, threshold, noise of other bins,
-    and floor of leakage over that; ``how`` the rule of detection and segments whose leakage is
-    looked at; ``speckle`` points (m,) and the speckle of all; ``chances`` (3, segments, m) pd, miss
-    and leakage.
+    largest bin is searched; ``levels`` (5, m) those of :class:`sweep.model.detection.BinLevels`,
+    and the floor of leakage over the noise; ``how`` the rule of detection and segments whose
+    leakage is looked at; ``speckle`` points (m,) and the speckle of all; ``chances`` (3, segments,
+    m) pd, miss and leakage.
     """
     (band, period, lines, inside), (rule, leaks) = where, how
     low, count, peak, exempted, start = numbers
@@ -143,11 +143,13 @@ def _cut(numbers, where, levels, how, speckle, magnitudes, exempts, chances):
             chances[0, s, j], chances[1, s, j] = 0.0, 1.0
             if inside[s, j]:
                 chances[0, s, j], chances[1, s, j] = found_pair(
-                    run, exempt, peak[s, j], low[s, j], rule, (levels[0, j], levels[1, j]),
+                    run, exempt, peak[s, j], low[s, j], rule, levels_of(levels, j),
                     speckle_of(speckle[1], s, speckle[0][j]),
                 )  # fmt: skip
             if leaks[s]:
-                chances[2, s, j] = leakage_of(run, exempt, levels[1:, j])
+                chances[2, s, j] = leakage_of(
+                    run, exempt, (levels[1, j], levels[2, j], levels[4, j])
+                )
 
 
 @njit(cache=True, error_model="numpy")

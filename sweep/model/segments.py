@@ -15,7 +15,7 @@ import numpy as np
 from sweep.kernels import njit
 from sweep.model import line_shape
 from sweep.model.crossings import MOST_TERMS, crossing_series
-from sweep.model.detection import any_neighbour, found_pair, free_images, speckle_of
+from sweep.model.detection import BinLevels, any_neighbour, found_pair, free_images, speckle_of
 from sweep.model.effects.circulator_leak import beside_leak
 from sweep.model.effects.line_width import gaussian_shifts
 from sweep.model.ground import different_rows
@@ -648,8 +648,8 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
                 numbers[4, s, i] = at
                 at = _keep(at, count, room, exempt, magnitudes, exempts)
             found, missed = found_pair(
-                room[OUT, :count], exempt[:count], peak, low, rule, (p[13], level),
-                speckle_of(speckle, s, where[2, i]),
+                room[OUT, :count], exempt[:count], peak, low, rule,
+                BinLevels(p[13], level, sigma, p[17]), speckle_of(speckle, s, where[2, i]),
             )  # fmt: skip
             if leaks[s] == BIN_BY_BIN:
                 if fades:

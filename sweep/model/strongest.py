@@ -28,7 +28,7 @@ import numpy as np
 
 from sweep.kernels import njit
 from sweep.model import alarms, waveform
-from sweep.model.detection import found_pair, speckle_of
+from sweep.model.detection import BinLevels, found_pair, speckle_of
 from sweep.model.marcum import marcum_q1_pair
 from sweep.model.search import leakage_of
 from sweep.model.segments import runs_of
@@ -82,7 +82,8 @@ def _of_runs(shots: Any, runs: Any, pd: np.ndarray) -> tuple[np.ndarray, np.ndar
     lost = np.zeros(level.shape)
     numbers = np.array([runs.low, runs.bins, runs.peak, runs.start])
     _at_levels(
-        numbers, runs.inside, (runs.magnitudes, runs.exempt), level, (deviation, sigma, floor),
+        numbers, runs.inside, (runs.magnitudes, runs.exempt), level,
+        (deviation, sigma, floor, shots.bin_levels[3, part]),
         (shots.echo_rule, shots.leakage), (part, shots.speckle_table), lost, silence,
     )  # fmt: skip
     alarm = -np.expm1(-silence[..., 0])
@@ -147,13 +148,14 @@ def _at_levels(numbers, inside, bins, levels, noise, how, speckle, lost, silence
 
     ``numbers`` (4, segments, m) are low, count, peak and start of runs; ``bins`` |X| [V] of all
     runs, and whether they are of the echo; ``levels`` (segments, m, k) [V], the threshold first;
-    ``noise`` that of bins with lines, and of others [V], and the floor of leakage over that;
+    ``noise`` that of bins with lines, and of others [V], the floor of leakage over that, and the
+    noise beside lines;
     ``how`` the rule of detection, and whether leakage is looked at; ``speckle`` points (m,) and the
     speckle of all. Results, of the levels' shape:
     ``lost`` P_b - P_z; ``silence`` -ln P(Z < z), to which that of leaked signal is added.
     """
     low, count, peak, start = numbers
-    deviation, sigma, floor = noise
+    deviation, sigma, floor, beside = noise
     for s in range(low.shape[0]):
         for j in range(low.shape[1]):
             if count[s, j] == 0:
@@ -165,7 +167,8 @@ def _at_levels(numbers, inside, bins, levels, noise, how, speckle, lost, silence
                 level = levels[s, j, k]
                 if inside[s, j]:
                     found, missed = found_pair(
-                        run, echo, peak[s, j], low[s, j], how[0], (deviation[j], level),
+                        run, echo, peak[s, j], low[s, j], how[0],
+                        BinLevels(deviation[j], level, sigma[j], beside[j]),
                         speckle_of(speckle[1], s, speckle[0][j]),
                     )  # fmt: skip
                     if k == 0:

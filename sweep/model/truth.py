@@ -66,7 +66,7 @@ def find(shots: Shots, *, range_walk: bool = True) -> np.ndarray:
 
     Range walk is the only change of lines within a record that is included.
     """
-    found, table = np.full((3, 6, shots.size), np.nan), shots.point_table()
+    found = np.full((3, 6, shots.size), np.nan)
     for i in range(shots.size):
         bins = shots.bins - 1, float(shots.sample_rate[i]) / shots.fft_size
         for segment in map(int, np.flatnonzero(shots.segments)):
@@ -76,8 +76,8 @@ def find(shots: Shots, *, range_walk: bool = True) -> np.ndarray:
             ]
             magnitude, out = np.sqrt(np.mean(np.square(each), axis=0)), np.empty((6, 1))
             detect_rows(
-                magnitude[None], np.zeros(1, np.int64), bins, shots.echo_rule, table[13, [i]],
-                table[11, [i]], shots.speckle_table.at(segment, np.array([i])), out,
+                magnitude[None], np.zeros(1, np.int64), bins, shots.echo_rule, 
+                shots.bin_levels[:, [i]], shots.speckle_table.at(segment, np.array([i])), out,
             )  # fmt: skip
             found[segment, :, i] = out[:, 0]
             if shots.complex_record:

@@ -14,7 +14,7 @@ from engine import every
 
 from sweep.model import link, philox, shot, truth
 from sweep.model.alarms import first_circular, neighbour_correlation
-from sweep.model.detection import BinSpeckle, DetectionRule, found_pair, mark
+from sweep.model.detection import BinLevels, BinSpeckle, DetectionRule, found_pair, mark
 from sweep.model.detectors import main_lobe
 from sweep.model.sampling import simulate
 from sweep.model.speckle_modes import mode_table
@@ -195,8 +195,8 @@ def test_sidelobes_of_a_fading_line_fade_with_it(name, place, snr):
         0, beside, np.empty((3, 0)), neighbour_correlation(shape, size), 0, np.empty(0),
         mode_table(shape, size),
     )  # fmt: skip
-    speckle = BinSpeckle(0.0, np.empty(0))
-    pd, _ = found_pair(magnitude, echo, int(magnitude.argmax()), 70, rule, (1.0, level), speckle)
+    speckle, levels = BinSpeckle(0.0, np.empty(0)), BinLevels(1.0, level, 1.0, 1.0)
+    pd, _ = found_pair(magnitude, echo, int(magnitude.argmax()), 70, rule, levels, speckle)
     rng, found = np.random.default_rng(int(10 * place) + snr), 0
     for _ in range(draws // 2000):
         noise = rng.normal(size=(2000, size, 2)) @ np.array([1, 1j])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sweep.model.alarms import neighbour_correlation
-from sweep.model.detection import BinSpeckle, DetectionRule, found_pair, mark
+from sweep.model.detection import BinLevels, BinSpeckle, DetectionRule, found_pair, mark
 from sweep.model.detectors import main_lobe
 from sweep.model.speckle_modes import mode_table
 from sweep.model.window import samples, window
@@ -50,9 +50,10 @@ def drawn_and_expected(name, padding, spread, place, snr, seed=1):
         0, beside, np.empty((3, 0)), neighbour_correlation(shape, size), 0, np.empty(0),
         mode_table(shape, size),
     )  # fmt: skip
+    levels = BinLevels(1.0, LEVEL, 1.0, 1.0)
     speckle = BinSpeckle(spread * padding, np.empty(0))
     pd, missed = found_pair(
-        magnitude, echo, int(magnitude.argmax()), int(bins[0]), rule, (1.0, LEVEL), speckle
+        magnitude, echo, int(magnitude.argmax()), int(bins[0]), rule, levels, speckle
     )
     assert pd + missed == pytest.approx(1, abs=1e-9)
     return detected.mean(), pd

@@ -220,6 +220,7 @@ def raised(
 def beside_leak(shots: Shots, runs: Any) -> Any:
     """Put the line to :class:`sweep.model.segments.Runs`: it masks bins, and raises others."""
     from sweep.model.detection import (  # needs the compiler, which reading specs does not
+        BinLevels,
         found_pair,
         speckle_of,
     )
@@ -257,7 +258,8 @@ def beside_leak(shots: Shots, runs: Any) -> Any:
             pd[s, i], miss[s, i] = 0.0, 1.0
         else:
             pd[s, i], miss[s, i] = found_pair(
-                seen, echo, peak, runs.low[s, i], rule, (under[i], level[i]),
+                seen, echo, peak, runs.low[s, i], rule,
+                BinLevels(*shots.bin_levels[:, runs.part[i]]),
                 speckle_of(speckle, s, runs.part[i]),
             )  # fmt: skip
         exempted[s, i] += np.count_nonzero(masked & searched)

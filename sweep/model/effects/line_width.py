@@ -391,11 +391,15 @@ def act(shots: Shots, scene: Scene) -> Shots:
         )
     share, in_phase = _seen_lines(shots, timing)
     power = (shots.beat_scale / 2) ** 2 * shots.relative_echo
+    beside = power_under_line(window=shots.window, **timing)
+    if shots.first_sample is not None:
+        beside = beside * energy_left(shots.window)[shots.first_sample[0]] / shots.window.energy
     return replace(
         shots,
         beat_scale=shots.beat_scale * np.sqrt(share),
         laser_width=width,
         pedestal=power * 2 * in_phase / shots.window.energy,
+        pedestal_beside=power * beside / shots.window.energy,
     )
 
 

@@ -249,6 +249,7 @@ def draw(shots: Shots, scene: Scene, realisation: Realisation) -> Shots:
         beat_scale=shots.beat_scale * beat,
         noise_sources=sources,
         pedestal=shots.pedestal * beat**2,
+        pedestal_beside=shots.pedestal_beside * beat**2,
     )
 
 

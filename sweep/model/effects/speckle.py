@@ -170,6 +170,7 @@ def draw(shots: Shots, scene: Scene, realisation: Realisation) -> Shots:
         phase=phase,
         incoherent=False,
         pedestal=shots.pedestal * brighter,
+        pedestal_beside=shots.pedestal_beside * brighter,
     )
 
 

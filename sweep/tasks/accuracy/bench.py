@@ -505,9 +505,9 @@ def find_on_grid(
         for index in np.split(members, range(_ROWS, members.size, _ROWS)):
             low, magnitude = magnitudes(shots, table, index, segment, cells, how)
             out = np.empty((6, index.size))
-            levels = table[13, index], table[11, index]
+            levels = shots.bin_levels[:, index]
             speckle = shots.speckle_table.at(segment, index)
-            detect_rows(magnitude, low, bins, shots.echo_rule, *levels, speckle, out)
+            detect_rows(magnitude, low, bins, shots.echo_rule, levels, speckle, out)
             out[3] *= table[6, index]
             found[segment][:, index] = out
     return found

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from sweep.model import philox, window
-from sweep.model.detection import Fading, fading_together, found_pair
+from sweep.model.detection import (
+    STEADY,
+    BinLevels,
+    DetectionRule,
+    Fading,
+    fading_together,
+    found_pair,
+)
 from sweep.model.draws import Rows, count_by_chance, count_in_noise, fading_factors
 from sweep.model.effects.catalogue import CORE
 from sweep.model.footprint import plane_footprint
@@ -18,6 +25,7 @@ from sweep.model.realisations import realise
 from sweep.model.returns import draw_returns
 from sweep.model.shot import find, prepare, prepare_cast, statistics
 from sweep.model.speckle_correlation import SEGMENT_PAIRS
+from sweep.model.speckle_modes import NO_MODES
 
 FADING = (*CORE, "fading")
 COUNTS = list(DRAW_OUTPUTS)
@@ -30,8 +38,10 @@ def amplitudes(rng, size):
 
 def of_one_bin(magnitude, level):
     """Chances of a bin in noise of power 1 to be found, and to be missed."""
-    rule = 0, 0, np.empty((3, 0)), 0.0
-    return found_pair(np.array([magnitude]), np.ones(1, bool), 0, 5, rule, (np.sqrt(0.5), level))
+    rule = DetectionRule(0, 0, np.empty((3, 0)), 0.0, 0, np.empty(0), NO_MODES)
+    noise = np.sqrt(0.5)
+    levels, one = BinLevels(noise, level, noise, noise), np.ones(1, bool)
+    return found_pair(np.array([magnitude]), one, 0, 5, rule, levels, STEADY)
 
 
 def db(value):
