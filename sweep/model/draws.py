@@ -20,6 +20,7 @@ import numpy as np
 from sweep.kernels import njit
 from sweep.model import philox
 from sweep.model.alarms import TAPS, noise_filter
+from sweep.model.hoyt import bin_share
 from sweep.model.marcum import at_least_one
 from sweep.model.philox import (
     STREAM_DETECTION,
@@ -62,14 +63,15 @@ def count_by_chance(
     rule = np.empty((0, TAPS)), np.empty(0, np.int64), 0
     none = False, *rule, np.isfinite(outputs.get(BOTH, np.full(size, np.nan)))
     nothing = Seen.nothing(size), np.empty((0, size))
-    _count(rows, ends, np.zeros((2, size)), chances, none, *nothing, counts)
+    circular = np.zeros((3, size), np.int64), np.zeros((1, 0)), 0
+    _count(rows, ends, np.zeros((2, size)), chances, none, *nothing, circular, counts)
 
 
 def count_in_noise(rows: Rows, ends: np.ndarray, shots: Shots, counts: np.ndarray) -> None:
     """Add the draws of some rows, in the noise of their shots, as :func:`count_by_chance` does."""
     levels = noise_levels(shots)
     mixing = np.empty((0, shots.size)) if shots.fading is None else shots.fading.mixing()
-    one = np.exp(-0.5 * levels[0] ** 2)
+    one, speckle = np.exp(-0.5 * levels[0] ** 2), shots.speckle_table
     for part, seen in seen_spectra(shots):
         others = at_least_one(one[part], seen.others.T)
         chances = np.array([others, *np.zeros((2, *others.shape))])  # in C order
@@ -81,6 +83,7 @@ def count_in_noise(rows: Rows, ends: np.ndarray, shots: Shots, counts: np.ndarra
             (True, *rule, np.full(part.size, shots.any_two)),
             seen,
             mixing[:, part].copy(),
+            (speckle.row[:, part].copy(), speckle.quadratures, shots.fft_size // 2),
         )
         _count(some, ends, *own, counts)
 
@@ -229,7 +232,7 @@ def seen_spectra(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _count(rows, ends, levels, chances, how, seen, mixing, counts):
+def _count(rows, ends, levels, chances, how, seen, mixing, quadratures, counts):
     """Add the draws of each row to the counts.
 
     ``how``: whether in noise; filter of an echo's noise, as of :func:`echo_filter`; whether any
@@ -237,11 +240,14 @@ def _count(rows, ends, levels, chances, how, seen, mixing, counts):
     m): :func:`noise_levels`. ``chances`` (3, 3, m): those of a false alarm in bins that are not
     looked at one by one, and, of no meaning in noise, of a detection without and with one in the up
     segment. ``mixing`` (6, m): :meth:`sweep.model.detection.Fading.mixing`, or nothing.
+    ``quadratures``: rows (3, m) of the pseudo-variances near DC and Nyquist
+    (:class:`sweep.model.quadratures.SignalQuadratures`), these, and N/2.
     """
     noisy, weights, start, real_ends, any_two = how
     noise_of_bins = np.empty((4, weights.shape[0] + weights.shape[1]))
     words = np.empty((4, _AT_ONCE), np.uint64)
-    factors = np.ones((3, _AT_ONCE))
+    factors, amplitudes = np.ones((3, _AT_ONCE)), np.zeros((3, 2, _AT_ONCE))
+    along, across, nothing = np.ones(_AT_ONCE), np.zeros(_AT_ONCE), np.zeros(_AT_ONCE)
     hits, alarms = np.empty((2, 3, _AT_ONCE), np.bool_)
     for j in range(rows.point.size):
         threshold, under_lines = levels[0, j] * levels[0, j], levels[1, j]
@@ -251,19 +257,31 @@ def _count(rows, ends, levels, chances, how, seen, mixing, counts):
             address = rows.keys[j, 0], rows.keys[j, 1], first, number
             hits[:], alarms[:] = False, False
             for d in range(number if mixing.shape[0] > 0 else 0):
-                factors[:, d] = fading_factors(address[:2], first + d, 0, mixing[:, j])
+                one, other, last = fading_amplitudes(address[:2], first + d, 0, mixing[:, j])
+                for part in range(2):
+                    amplitudes[0, part, d], amplitudes[1, part, d] = one[part], other[part]
+                    amplitudes[2, part, d] = last[part]
+                for s in range(3):
+                    factors[s, d] = math.hypot(amplitudes[s, 0, d], amplitudes[s, 1, d])
             for s in (0, 2, 1):
                 stream, ratio, peak = STREAM_NOISE[s], seen.ratio[j, s], seen.peak[j, s]
+                row = quadratures[0][s, j]
+                shares = quadratures[1][row, : (quadratures[1].shape[1] if row > 0 else 0)]
                 if noisy and weights.size > 0:
                     _cross_any(
                         address, (j, s), seen, (weights, start, real_ends), levels[:, j],
-                        factors[s], noise_of_bins, hits[s],
+                        (factors[s], amplitudes[s], shares, quadratures[2]), noise_of_bins, hits[s],
                     )  # fmt: skip
                 elif noisy:
                     noise = under_lines, under_lines
                     if seen.real[j, s]:
                         noise = math.sqrt(2.0) * under_lines, 0.0
-                    line = ratio, noise, threshold, factors[s]
+                    along[:], across[:] = factors[s], 0.0
+                    if row > 0:
+                        share = bin_share(seen.low[j, s] + peak, quadratures[2], shares)
+                        along[:] = math.sqrt(1.0 + share) * amplitudes[s, 0]
+                        across[:] = math.sqrt(max(1.0 - share, 0.0)) * amplitudes[s, 1]
+                    line = ratio, noise, threshold, along, across
                     _cross(address, stream, peak, line, words, hits[s])
                 else:
                     either = chances[1, s, j], chances[2, s, j]
@@ -274,7 +292,7 @@ def _count(rows, ends, levels, chances, how, seen, mixing, counts):
                     chance = chances[0, s, j], chances[0, s, j]
                     _happen(address, largest, chance, hits[0], words, alarms[s])
                 for k in range(seen.stretch[j, s, 0], seen.stretch[j, s, 1]):
-                    line = seen.leaked[k], (1.0, 1.0), threshold, factors[s]
+                    line = seen.leaked[k], (1.0, 1.0), threshold, factors[s], nothing
                     _cross(address, stream, seen.aside[k], line, words, alarms[s])
             for d in range(number):
                 while first + d >= ends[batch + 1]:
@@ -291,7 +309,14 @@ def _count(rows, ends, levels, chances, how, seen, mixing, counts):
 
 @njit(cache=True, error_model="numpy")
 def fading_factors(key, draw, group, mixing):
-    """Factors of a draw on the magnitudes of a group in the three segments; their mean square is 1.
+    """Factors of a draw on a group's magnitudes in the three segments; their mean square is 1."""
+    one, other, last = fading_amplitudes(key, draw, group, mixing)
+    return math.hypot(one[0], one[1]), math.hypot(other[0], other[1]), math.hypot(last[0], last[1])
+
+
+@njit(cache=True, error_model="numpy")
+def fading_amplitudes(key, draw, group, mixing):
+    """Amplitudes of a draw of a group in the three segments, complex; their mean square is 1.
 
     Three standard normal amplitudes of the stream, those of the group's number, mixed.
     """
@@ -300,10 +325,10 @@ def fading_factors(key, draw, group, mixing):
     c, d = philox.normal_pair(key[0], key[1], draw, stream, 3 * group + 1)
     e, f = philox.normal_pair(key[0], key[1], draw, stream, 3 * group + 2)
     near, own, far, re, im, rest = mixing
-    second = math.hypot(near * a + own * c, near * b + own * d)
+    second = half * (near * a + own * c), half * (near * b + own * d)
     last_re = far * a + (re * c - im * d) + rest * e
     last_im = far * b + (re * d + im * c) + rest * f
-    return half * math.hypot(a, b), half * second, half * math.hypot(last_re, last_im)
+    return (half * a, half * b), second, (half * last_re, half * last_im)
 
 
 @njit(cache=True, error_model="numpy")
@@ -319,8 +344,12 @@ def _happen(address, stream, chances, given, words, found):
 
 
 @njit(cache=True, error_model="numpy")
-def _cross_any(address, at, seen, rule, levels, factors, room, found):
-    """Mark the draws in which any bin of an echo, with its noise, reaches the threshold."""
+def _cross_any(address, at, seen, rule, levels, fading, room, found):
+    """Mark the draws in which any bin of an echo, with its noise, reaches the threshold.
+
+    ``fading``: factors on the magnitudes (draws,), amplitudes (2, draws); pseudo-variances of bins
+    near DC or Nyquist, or nothing; N/2.
+    """
     begin, count = seen.start[at], seen.bins[at]
     ratios, echo = seen.ratios[begin : begin + count], seen.echo[begin : begin + count]
     if not echo.any():
@@ -331,12 +360,18 @@ def _cross_any(address, at, seen, rule, levels, factors, room, found):
     while not echo[last]:
         last -= 1
     threshold, under_lines = levels
+    factors, amplitudes, shares, half = fading
     for d in range(address[3]):
         draw = address[0], address[1], address[2] + d, STREAM_NOISE[at[1]]
         draw_noise(draw, ECHO, seen.low[at] + first, last - first + 1, rule, room)
         for i in range(first, last + 1):
             re, im = under_lines * room[0, i - first], under_lines * room[1, i - first]
-            re += ratios[i] * factors[d]
+            if shares.size > 0:
+                share = bin_share(seen.low[at] + i, half, shares)
+                re += ratios[i] * math.sqrt(1.0 + share) * amplitudes[0, d]
+                im += ratios[i] * math.sqrt(max(1.0 - share, 0.0)) * amplitudes[1, d]
+            else:
+                re += ratios[i] * factors[d]
             found[d] |= echo[i] and re * re + im * im >= threshold * threshold
 
 
@@ -374,14 +409,14 @@ def _cross(address, stream, index, line, words, found):
     """Mark the draws in which a bin, with its noise, reaches the threshold.
 
     ``index``: pair of the stream that the noise is. ``line``: |X| / sigma; the noise's deviations
-    in its phase and across; the threshold, a power; factors on |X|, draw by draw.
+    in its phase and across; the threshold, a power; factors on |X| in both, draw by draw.
     """
-    ratio, deviation, threshold, factors = line
+    ratio, deviation, threshold, along, across = line
     philox.fill_words(address[:3], stream, index >> 1, philox.BY_DRAW, address[3], words)
     lane = 2 * (index & 1)
     for d in range(address[3]):
         re, im = philox.to_normals(words[lane, d], words[lane + 1, d])
-        re, im = ratio * factors[d] + re * deviation[0], im * deviation[1]
+        re, im = ratio * along[d] + re * deviation[0], ratio * across[d] + im * deviation[1]
         found[d] |= re**2 + im**2 >= threshold
 
 

@@ -5,11 +5,19 @@ Compared with drawn records of scatterers, which share the mean echo power, nois
 
 import numpy as np
 import pytest
-from test_speckle_on_slopes import DRAWS, LANDER, drawn_detections, shots_of, with_threshold
+from test_speckle_on_slopes import (
+    DRAWS,
+    EFFECTS,
+    LANDER,
+    drawn_detections,
+    shots_of,
+    with_threshold,
+)
 
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.catalogue import DEFAULTS
 from sweep.model.hoyt import hoyt_pair
+from sweep.model.sampling import simulate
 from sweep.model.shot import find, statistics
 
 BIN_WIDTH = LANDER["instrument.processing.sample_rate"] / LANDER["instrument.processing.fft_size"]
@@ -142,3 +150,16 @@ def test_the_hoyt_law_is_the_mean_of_exponentials(share, level):
     exponent = level**2 / (1.7 * (1 + share * np.cos(t)))
     assert found == pytest.approx(np.exp(-exponent).mean(), rel=1e-9, abs=1e-300)
     assert missed == pytest.approx(-np.expm1(-exponent).mean(), rel=1e-5)
+
+
+@pytest.mark.parametrize("rule", ["peak_bin", "any_bin"])
+@pytest.mark.parametrize("place", [0.0, 0.42])
+def test_draws_in_noise_detect_slow_echoes_as_often(rule, place, table_4_1):
+    p = DEFAULTS | table_4_1() | HOVER | {"instrument.processing.detection": rule}
+    p = with_threshold(at_doppler(p, place * BIN_WIDTH), 1.6)
+    p["target.range"] = np.array([300.0])
+    keys, draws = np.array([[1, 2]], np.uint64), 20_000
+    counts = simulate(p, EFFECTS, keys=keys, batch_sizes=[draws], method="noise")
+    drawn = counts["n_detected_doppler"][0, 0] / draws
+    expected = float(statistics(shots_of(p))["pd_doppler"][0])
+    assert abs(drawn - expected) < 0.004 + 4 * np.sqrt(expected * (1 - expected) / draws)
