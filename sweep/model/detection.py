@@ -392,7 +392,7 @@ def any_faded(magnitude, echo, low, rule, levels, speckle):
     return found + missed * one[0], missed * one[1]
 
 
-_ORDER = 10
+_ORDER = 7
 _REACH = 4.5
 _Z_MAX = 6.0
 _RARE = 1e-6
