@@ -88,12 +88,13 @@ def count_in_noise(rows: Rows, ends: np.ndarray, shots: Shots, counts: np.ndarra
         _count(some, ends, *own, counts)
 
 
-def echo_filter(shots: Shots, seen: "Seen") -> tuple[np.ndarray, np.ndarray, int]:
+def echo_filter(shots: Shots, seen: "Seen", least: int = 0) -> tuple[np.ndarray, np.ndarray, int]:
     """Filter of the noise of an echo's bins, none where the largest alone detects; N or 0.
 
-    The last is N where noise at DC and Nyquist is real.
+    It has ``least`` bins where any detects, if that is more than there are. The last is N where
+    noise at DC and Nyquist is real.
     """
-    most = int(seen.bins.max(initial=1)) if shots.echo_rule[1] else 0
+    most = max(int(seen.bins.max(initial=1)), least) if shots.echo_rule[1] else 0
     bins = 1 << (most - 1).bit_length() if most else 0
     if shots.noise_bins == "independent":
         weights = np.zeros((bins, TAPS))
@@ -449,20 +450,3 @@ def gamma_exceeded(order, chance):
         else:
             high = x
     return 0.5 * (low + high)
-
-
-@njit(cache=True, error_model="numpy")
-def faded_ratio(ratio, levels, chances, looks, apart):
-    """|X| / sigma of a detected bin that fades: of some looks the root of their mean power.
-
-    ``ratio`` is |X| / sigma without noise; ``levels`` are the threshold and the noise of bins that
-    hold lines, over sigma.  ``chances`` the share of detections in which the power is as large,
-    uniform, and the probability of a detection. ``apart``: each look has its own speckle.
-    """
-    noise = 2.0 * levels[1] * levels[1]
-    if looks > 1 and apart:
-        sum_of_looks = gamma_exceeded(looks, chances[0] * chances[1])
-        return math.sqrt((noise + ratio * ratio) * sum_of_looks / looks)
-    # Powers above the threshold are exponential; of a common speckle where noise is behind it.
-    power = noise / looks + ratio * ratio
-    return math.sqrt(levels[0] * levels[0] - power * math.log(chances[0]))

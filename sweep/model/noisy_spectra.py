@@ -11,9 +11,10 @@ N - 1.
 The signal has the magnitudes that :func:`sweep.model.segments.spectrum` gives, with all
 effects. If beamlets add as powers these are root mean squares, and have no phases: the signal
 is then given those of a lone tone at its place, bin by bin. For footprints of less than a bin that
-is what the spectrum is; in wider ones estimators see a smoother peak than speckle would make. In
-developed speckle all bins of a draw fade together. If a shot of a flight has several echoes,
-each has the phases of a tone of its own, and its own fading.
+is what the spectrum is. In developed speckle the bins of an echo have the amplitudes that the lines
+of its footprint make in a draw (:mod:`sweep.model.speckle_lines`), and its leaked signal fades with
+the strongest of them. If a shot of a flight has several echoes, each has the phases of a tone of
+its own, and its own speckle.
 A phase common to all bins makes no difference to circular noise and is left out.
 
 The phase of a laser of Lorentzian line width walks randomly: of each draw a walk is taken, at every
@@ -33,17 +34,15 @@ and radial velocity.
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import fft
 
-from sweep.kernels import njit
-from sweep.model import philox, waveform
+from sweep.model import waveform
 from sweep.model.band import is_searched
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detectors import DETECTORS, Detector, Setting, main_lobe, taper
-from sweep.model.draws import fading_factors
 from sweep.model.effects.line_width import seen_line, walk_steps, walked_phase
 from sweep.model.effects.segment_motion import looks_of
 from sweep.model.estimators import (
@@ -62,6 +61,15 @@ from sweep.model.philox import STREAM_LASER_PHASE, STREAM_RECORD, normals, unifo
 from sweep.model.preparation import Parameters, Shots
 from sweep.model.segments import whole_spectrum
 from sweep.model.shot import fit
+from sweep.model.speckle_lines import (
+    NEXT_LOOK,
+    LineFan,
+    Peaks,
+    directions,
+    drawn_speckle,
+    line_fan,
+    place_errors,
+)
 from sweep.model.window import last_part
 
 VALUES = ("pfa_bin", "false_alarms", "range", "radial_velocity", "range_2", "radial_velocity_2")
@@ -97,6 +105,11 @@ class Signal(NamedTuple):
     """0 up, 1 Doppler, 2 down."""
     echo: np.ndarray | None = None
     """Number of the echo that each bin is nearest to, int64; None where all are one."""
+    others: tuple[np.ndarray, np.ndarray] | None = None
+    """Strongest bin of each of several echoes, and the place of a lone tone about it, as indices.
+    """
+    reach: int = 0
+    """Bins on either side of such an echo that it occupies."""
 
 
 def signal_of(
@@ -139,12 +152,13 @@ def signal_of(
         )
     if not is_searched(shots, segment, i, k - index_of_zero(shots)):
         first, end = 1, 0
-    echo = None
+    echo, others = None, None
     if len(echoes) > 1:
         apart = np.arange(magnitude.size)[:, None] - np.asarray(echoes)
         if shots.complex_record:
             apart -= shots.fft_size * np.rint(apart / shots.fft_size).astype(np.int64)
         echo = np.abs(apart).argmin(axis=1)
+        others = np.asarray(echoes), np.array([_between(shots, magnitude, int(k)) for k in echoes])
         for number, own in enumerate(echoes):
             if (own - first) % magnitude.size > end - first:
                 at = _between(shots, magnitude, int(own))
@@ -158,6 +172,8 @@ def signal_of(
         cnr=float(power / shots.noise_variance[i]),
         segment=segment,
         echo=echo,
+        others=others,
+        reach=beside,
     )
 
 
@@ -269,18 +285,53 @@ def noise_of(
     return np.array([transformed(shots, each) for each in record])
 
 
-def fading_of(
-    shots: Shots, i: int, *, key: np.ndarray, draws: np.ndarray, echo: int = 0
+def speckle_of(
+    shots: Shots,
+    i: int,
+    segment: int,
+    signal: Signal,
+    *,
+    key: np.ndarray,
+    draws: np.ndarray,
+    fan: LineFan | None = None,
 ) -> np.ndarray:
-    """Factors on an echo of point i by which it fades, (3, m) by segment; 1 where it does not."""
-    if shots.fading is None:
-        return np.ones((3, draws.size))
-    mixing = shots.fading.mixing()[:, i]
-    return np.array([fading_factors(tuple(key), draw, echo, mixing) for draw in draws]).T
+    """Complex factors on the bins of point i's segment in some draws, (m, bins); 1 without speckle.
 
-
-_LOOK = np.int64(1 << 48)
-"""Draws from one look's random numbers to the next one's."""
+    The bins that an echo occupies have those of the lines of its footprint, its other bins the one
+    of its strongest bin.
+    """
+    if shots.speckle_lines is None:
+        return np.ones((1, 1))
+    fan = line_fan(shots) if fan is None else fan
+    size, zero = signal.spectrum.size, index_of_zero(shots)
+    found = np.empty((draws.size, size), complex)
+    echoes = [(signal.strongest, signal.frequency + zero, signal.first, signal.last)]
+    if signal.echo is not None and signal.others is not None:
+        echoes = [
+            (int(own), place, int(own) - signal.reach, int(own) + signal.reach)
+            if (own - signal.first) % size > signal.last - signal.first
+            else (int(own), place, signal.first, signal.last)
+            for own, place in zip(*signal.others, strict=True)
+        ]
+    for number, (strongest, place, first, last) in enumerate(echoes):
+        first, last = min(first, strongest - 1), max(last, strongest + 1)
+        middle = np.full(3, np.nan)
+        middle[segment] = place
+        amplitudes = drawn_speckle(
+            fan, i, middle, (first, last - first + 1), key=key, draws=draws, group=number
+        )
+        own = slice(None) if signal.echo is None else signal.echo == number
+        found[:, own] = amplitudes[:, strongest - first, None]
+        bins = np.arange(first, last + 1)
+        there = (amplitudes != 0).any(axis=0)
+        if not shots.complex_record:
+            there &= (bins >= 0) & (bins < size)
+        if signal.echo is not None:
+            there &= signal.echo[bins % size] == number
+        found[:, bins[there] % size] = amplitudes[:, there]
+    if shots.real_ends:  # one part is left, which has all of the power
+        found[:, [0, -1]] = math.sqrt(2) * found[:, [0, -1]].real
+    return found
 
 
 def spectra_of(view: "View", segment: int, draws: np.ndarray) -> Iterator[np.ndarray]:
@@ -291,7 +342,7 @@ def spectra_of(view: "View", segment: int, draws: np.ndarray) -> Iterator[np.nda
     looks, total = view.shots.looks, np.zeros(1, complex)
     known: dict[int, Signal] = {}
     for k, shots in enumerate(view.looks):
-        numbers = draws + k * _LOOK
+        numbers = draws + k * NEXT_LOOK
         given = {"key": view.key, "draws": numbers}
         if id(shots) not in known:
             signal = view.signals[segment]
@@ -299,13 +350,7 @@ def spectra_of(view: "View", segment: int, draws: np.ndarray) -> Iterator[np.nda
                 signal = signal_of(shots, view.i, segment, view.echoes_of(segment))
             known[id(shots)] = signal
         signal = known[id(shots)]
-        factors = _fading_in_look(view, segment, k, draws)[:, None]
-        if signal.echo is not None:
-            each = (
-                _fading_in_look(view, segment, k, draws, echo=number)
-                for number in range(int(signal.echo.max()) + 1)
-            )
-            factors = np.stack(list(each), axis=1)[:, signal.echo]
+        factors = _speckle_in_look(view, shots, segment, k, draws, signal)
         spectra = drawn_of(shots, view.i, segment, signal, **given) * factors
         spectra = spectra + noise_of(shots, view.i, segment, **given)
         if looks.added == 1:
@@ -316,47 +361,27 @@ def spectra_of(view: "View", segment: int, draws: np.ndarray) -> Iterator[np.nda
         yield total / looks.added
 
 
-@njit(cache=True, error_model="numpy")
-def _complex_fading(key, draws, segment, group, mixing):
-    """Factors (m,) complex by which the amplitude of a group fades in a segment, draw by draw.
-
-    Their magnitudes are :func:`sweep.model.draws.fading_factors`.
-    """
-    near, own, far, re, im, rest = mixing
-    factors, stream = np.empty(draws.size, np.complex128), philox.STREAM_SPECKLE
-    for d in range(draws.size):
-        a, b = philox.normal_pair(key[0], key[1], draws[d], stream, 3 * group)
-        c, e = philox.normal_pair(key[0], key[1], draws[d], stream, 3 * group + 1)
-        f, g = philox.normal_pair(key[0], key[1], draws[d], stream, 3 * group + 2)
-        first, second, third = complex(a, b), complex(c, e), complex(f, g)
-        if segment == 1:
-            first = near * first + own * second
-        elif segment == 2:
-            first = far * first + complex(re, im) * second + rest * third
-        factors[d] = math.sqrt(0.5) * first
-    return factors
-
-
-def _fading_in_look(
-    view: "View", segment: int, look: int, draws: np.ndarray, echo: int = 0
+def _speckle_in_look(
+    view: "View", shots: Shots, segment: int, look: int, draws: np.ndarray, signal: Signal
 ) -> np.ndarray:
-    """Factors on an echo in a look of a segment, (m,): of one speckle, of its own, or of a part."""
-    shots, own = view.shots, draws
-    speckle = shots.look_speckle
-    if speckle is not None:
-        root = speckle.root(segment, view.i)[look]
-        # The mean power of the looks differs in the signal itself.
-        root = root / np.sqrt((np.abs(root) ** 2).sum())
-        assert shots.fading is not None
-        amplitude, mixing = np.zeros(draws.size, complex), shots.fading.mixing()[:, view.i]
-        for number, share in enumerate(root):
-            numbers = draws + number * _LOOK
-            fading = _complex_fading(view.key, numbers, segment, echo, mixing)
-            amplitude = amplitude + share * fading
-        return np.abs(amplitude)
-    if shots.looks.independent:
-        own = draws + look * _LOOK
-    return fading_of(shots, view.i, key=view.key, draws=own, echo=echo)[segment]
+    """Factors (m, bins) of a look by :func:`speckle_of`: of one speckle, its own, or shared ones.
+
+    Speckle that changes from look to look is a sum of independent ones.
+    """
+    given: dict[str, Any] = {"key": view.key, "fan": view.fan}
+    if shots.look_speckle is None:
+        own = draws + look * NEXT_LOOK if shots.looks.independent else draws
+        return speckle_of(shots, view.i, segment, signal, draws=own, **given)
+    root = shots.look_speckle.root(segment, view.i)[look]
+    # The mean power of the looks differs in the signal itself.
+    root = root / np.sqrt((np.abs(root) ** 2).sum())
+    return np.asarray(
+        sum(
+            share
+            * speckle_of(shots, view.i, segment, signal, draws=draws + number * NEXT_LOOK, **given)
+            for number, share in enumerate(root)
+        )
+    )
 
 
 class View(NamedTuple):
@@ -376,6 +401,8 @@ class View(NamedTuple):
     estimate: Estimator
     echoes: np.ndarray | None = None
     """(3, k) int64: strongest bins of the shot's echoes in each segment, -1 for none."""
+    fan: LineFan | None = None
+    """Lines of all shots' footprints in developed speckle."""
 
     def echoes_of(self, segment: int) -> np.ndarray:
         """Return indices of the echoes' strongest bins in a segment; none where echoes are one."""
@@ -394,11 +421,15 @@ class Found(NamedTuple):
     """Bins in them."""
     frequency: np.ndarray
     """[bins], with signs of a complex record."""
+    delta: np.ndarray
+    """Place past the strongest bin [bins]."""
+    power: np.ndarray
+    """|X|^2 of that bin [V^2]."""
 
 
 def view_of(
     shots: Shots, i: int, p: Parameters, key: np.ndarray, methods: Methods,
-    echoes: np.ndarray | None = None,
+    echoes: np.ndarray | None = None, fan: LineFan | None = None,
 ) -> View:  # fmt: skip
     """View of one of some shots, by the parameters p of its point, those of `DEFAULTS`."""
     training, rank = int(p[DETECTOR + "training"]), int(p[DETECTOR + "rank"])
@@ -419,6 +450,7 @@ def view_of(
         methods.detectors[str(p[DETECTOR + "kind"])],
         methods.estimators[str(p[ESTIMATOR + "kind"])],
         echoes,
+        line_fan(shots) if fan is None else fan,
     )  # fmt: skip
     signals = tuple(
         signal_of(shots, i, s, view.echoes_of(s)) if there else None
@@ -478,10 +510,11 @@ def look(spectra: Sequence[np.ndarray], signal: Signal, view: View) -> Found:
     first, beyond = np.ones((len(power), 1)), np.full((len(power), 1), half)
     first[row[own], 0], beyond[row[own], 0] = start[own], end[own]
     peak = np.where((first <= bins) & (bins < beyond), power, -1.0).argmax(axis=1)
-    if shots.complex_record:
-        peak = (peak - turn) % shots.fft_size
-    frequency = placed(spectra, peak, view) - index_of_zero(shots)
-    return Found(detected, alarms, bins_flagged, frequency)
+    strength = power[np.arange(len(power)), peak]
+    strongest_bin = (peak - turn) % shots.fft_size if shots.complex_record else peak
+    peak_place = placed(spectra, strongest_bin, view)
+    frequency = peak_place - index_of_zero(shots)
+    return Found(detected, alarms, bins_flagged, frequency, peak_place - strongest_bin, strength)
 
 
 def counted(view: View, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -490,7 +523,7 @@ def counted(view: View, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     By the names of DRAW_OUTPUTS and of VALUES, (names, m); nan where there is no value.
     """
     nothing = np.zeros(draws.size, np.int64)
-    found = [Found(nothing > 0, nothing, nothing, np.zeros(draws.size))] * 3
+    found = [Found(nothing > 0, nothing, nothing, *np.zeros((3, draws.size)))] * 3
     searched = 0
     for s, signal in enumerate(view.signals):
         if signal is not None:
@@ -510,7 +543,7 @@ def counted(view: View, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         up.detected, down.detected, doppler.detected, shot, *alarm, alarm[0] & alarm[1]
     ], np.int64)  # fmt: skip
     flagged, alarms = sum(f.flagged for f in found), sum(f.alarms for f in found)
-    squares = np.square(_bounds(view, detected))
+    squares = np.square(_bounds(view, detected)) + _wander(view, found, detected)
     if view.shots.any_two:  # they differ by what is detected
         squares = np.where(whole, squares, np.nan)
     errors = [np.where(whole, error, np.nan) for error in _errors(view, found, detected)]
@@ -526,6 +559,32 @@ def _bounds(view: View, detected: np.ndarray) -> np.ndarray:
             here = (detected == ~missed[:, None]).all(axis=0)
             bounds[:, here] = np.reshape(resolved_bound(view, ~missed), (2, 1))
     return bounds
+
+
+def _wander(view: View, found: Sequence[Found], detected: np.ndarray) -> np.ndarray:
+    """Mean square errors of range and velocity by speckle in draws, (2, m)."""
+    shots, i, m = view.shots, view.i, detected.shape[1]
+    if shots.speckle_lines is None:
+        return np.zeros((2, m))
+    point = np.full(m, i)
+    line = float(np.broadcast_to(shots.line_deviation, shots.size)[i])
+    signal = np.array([
+        np.nan if s is None else np.abs(s.spectrum[s.strongest]) ** 2 for s in view.signals
+    ])  # fmt: skip
+    mean = signal + 2 * line**2
+    power = np.where(detected, [each.power for each in found], np.nan).T / mean
+    delta = np.clip([each.delta for each in found], -1.0, 1.0).T
+    share = np.broadcast_to(signal / mean, power.shape)
+    peaks = Peaks(delta, directions(shots)[point], power, share)
+    common = place_errors(shots.speckle_lines.of(point), peaks, shots)
+    used = np.array([True, shots.slopes != waveform.SIGNS or shots.any_two, True])
+    carriers, rates = (values[:, point] for values in shots.beats_by_motion)
+    given = {"weights": 1.0 * (detected & used[:, None]), "carriers": carriers, "rates": rates}
+    width = view.setting.sample_rate / view.setting.fft_size
+    gains = np.array([
+        waveform.response(unit[:, None] + np.zeros(m), **given) for unit in width * np.eye(3)
+    ])  # fmt: skip
+    return np.einsum("iam,mij,jam->am", gains, common, gains)
 
 
 def resolved_bound(view: View, used: Sequence[bool] | np.ndarray | None = None) -> Deviation:

@@ -192,7 +192,8 @@ def _resolved(quantity: str, name: str, units: str) -> dict[str, Output]:
     found = "over draws in which every segment has a detection; nan with none"
     bound = (
         "Cramer-Rao bound for lone tones of the signal's power in the up- and the down-chirp "
-        "segment, of which it is resolved; rms over draws where random effects are simulated"
+        "segment, of which it is resolved, with what developed speckle adds on a slope; rms over "
+        "draws"
     )
     return {
         f"{quantity}_bias": Output(units, f"mean of reported less true {name}", found),

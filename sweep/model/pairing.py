@@ -10,9 +10,10 @@ among those the least sum of mismatches, a fold counting as
 surfaces with a common velocity share theirs.
 
 Up and down peaks that are left over are paired in the order in which they are listed (strongest
-first) and marked as unconfirmed. They take the reading that comes nearest to any Doppler peak, or,
-where there is none, **with the half sum as the Doppler frequency**, the order of a fast mover.
-PHYSICS section 2 leaves both open. Range and velocity are exchanged where that is wrong.
+first) and marked as unconfirmed. A Doppler peak that is nearer to one of their readings than a
+false one is, but once in a hundred times, still tells which to take. Else nothing does, and they
+take the reading that two beats have without a Doppler segment. PHYSICS section 2 leaves it open.
+Range and velocity are exchanged where that is wrong.
 
 An up (or down) peak in which two surfaces coincide serves one return only.
 
@@ -46,11 +47,11 @@ threshold as much again. A peak anywhere confirms one of the 16 readings at rand
 16 (2 TOLERANCE) / (N/2) or less: 1.5e-3 at N = 2^17.
 """
 
+NEAR_BY_CHANCE = 0.01
+"""Probability with which a false Doppler peak is as near to a reading as one that tells which."""
+
 _UNPAIRED = 1e9
 """Cost of an up peak without a down peak: more than any sum of mismatches."""
-
-ASSUMED = 0
-"""Reading without folds in which the half sum is the Doppler frequency."""
 
 TRUE, FALSE_ALARM, MISPAIRED, MISREAD, SIDELOBE, UNCONFIRMED = 1, 2, 4, 8, 16, 32
 FLAGS = {
@@ -76,13 +77,13 @@ FALSE, ABSENT = -1, -2
 
 
 @njit(cache=True, error_model="numpy")
-def pair_peaks(up, doppler, down, third, fft_size, signed, tolerance, pairs):
+def pair_peaks(up, doppler, down, third, fft_size, signed, assumed, tolerance, pairs):
     """Pairs of peaks, one to one: confirmed ones first, in the order of the up peaks.
 
     Peaks are positions [bins], strongest first, with signs if ``signed``; the rest as of
-    :func:`confirm`. ``pairs`` (>= min(ups, downs), 4) int64 takes the index of up, Doppler (-1
-    where unconfirmed) and down peak, and the reading. Returns the numbers of confirmed pairs, and
-    of all.
+    :func:`confirm`. ``assumed`` is the reading of pairs that are not confirmed. ``pairs`` (>=
+    min(ups, downs), 4) int64 takes the index of up, Doppler (-1 where unconfirmed) and down peak,
+    and the reading. Returns the numbers of confirmed pairs, and of all.
     """
     cost, via = np.empty((up.size, down.size)), np.empty((up.size, down.size, 2), np.int64)
     for i in range(up.size):
@@ -103,9 +104,11 @@ def pair_peaks(up, doppler, down, third, fft_size, signed, tolerance, pairs):
         while j < down.size and used[j]:
             j += 1
         if chosen[i] < 0 and j < down.size:
-            _, _, code = confirm(up[i], doppler, down[j], third, fft_size, signed, np.inf)
+            readings = 1 if signed else READINGS
+            near = NEAR_BY_CHANCE * fft_size / (4.0 * readings)
+            _, _, code = confirm(up[i], doppler, down[j], third, fft_size, signed, near)
             pairs[number, 0], pairs[number, 1], pairs[number, 2] = i, -1, j
-            pairs[number, 3] = code if doppler.size else SIGNED if signed else ASSUMED
+            pairs[number, 3] = code if code >= 0 else assumed
             number, j = number + 1, j + 1
     return confirmed, number
 

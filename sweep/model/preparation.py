@@ -30,6 +30,7 @@ from sweep.model.window import Window, canonical_name, window
 if TYPE_CHECKING:
     from sweep.model.detection import DetectionRule, Fading, SpeckleTable
     from sweep.model.look_speckle import LookSpeckle
+    from sweep.model.speckle_correlation import SpeckleLines
 
 Parameters = Mapping[str, float | int | str | np.ndarray]
 
@@ -197,6 +198,8 @@ class Shots:
     """Speckle of looks that share it in part; None where all have the same, or each its own."""
     line_spread: np.ndarray | float = 0.0
     """(segments, n): deviation of the lines of an echo in developed speckle [bins of fs/N]."""
+    speckle_lines: "SpeckleLines | None" = None
+    """Their footprints, over which speckle is drawn."""
     leak_amplitude: np.ndarray | None = None
     """Amplitude of the leaked light's beat [V], (n,) or scalar; None without one."""
     leak_delay: np.ndarray | float = 0.0

@@ -18,12 +18,17 @@ that slides under the beam: the instrument's own motion, where it is known, corr
 them as far as it can (:mod:`sweep.model.own_motion`). Of segments with slopes other than 1, 0 and
 -1 a return is the fit of all its peaks.
 
-Echoes in developed speckle fade: in noise by factors on each group's magnitudes in the three
-segments, which share what their speckles do. Against probabilities the down segment's probability
-follows from the up segment's draw, and a detected peak's power is drawn for each segment alone.
+Echoes in developed speckle have the amplitudes that the lines of their footprint make in a draw, in
+the bins about a group's strongest of all three segments (:mod:`sweep.model.speckle_lines`). Their
+places wander with it. By either method noise is added, and the peak is what the bins then show. Of
+``noise`` the bins detect by themselves; against ``probabilities`` the strongest bin's amplitude is
+held against the level that it exceeds with the group's probability. All three segments are so drawn
+together, by the same law as grids' closed forms. Draws of grids have other speckle.
 
 Standard errors are those of noise and, in quadrature, what the lines in a group make by their
-spread (:func:`interpolation.spread_error`).
+spread (:func:`interpolation.spread_error`), or of echoes in developed speckle by their speckle
+(:func:`sweep.model.speckle_lines.place_errors`). That moves the beats of both chirps with the range
+where both see the same speckle, and velocities little.
 
 Of noise alone a segment and draw has one false peak at most, the largest, in any of the bins
 searched outside the listed groups, uniformly. False peaks of leaked signal lie in their own bins,
@@ -50,8 +55,6 @@ from sweep.model.draws import (
     down_given_up,
     draw_noise,
     echo_filter,
-    faded_ratio,
-    fading_factors,
     largest_of,
     noise_levels,
     seen_spectra,
@@ -74,6 +77,7 @@ from sweep.model.leaked_peaks import (
     list_peak,
     peaks_in_noise,
 )
+from sweep.model.looks import BINARY
 from sweep.model.marcum import at_least_one
 from sweep.model.own_motion import OwnMotion
 from sweep.model.pairing import (
@@ -89,9 +93,22 @@ from sweep.model.pairing import (
 from sweep.model.preparation import Shots
 from sweep.model.search import beamlet_lines, columns
 from sweep.model.shot import fit
+from sweep.model.speckle_lines import (
+    ALL_PAIRS,
+    CHIRPS,
+    NEXT_LOOK,
+    LineFan,
+    Peaks,
+    directions,
+    draw_lines,
+    line_fan,
+    line_powers,
+    place_errors,
+)
 
 WHOLE, FINE, ERROR, RATIO = range(4)
-"""Fields of a peak: bin; position between bins and its standard error [bins]; |X| / sigma."""
+"""Fields of a peak: bin; position between bins and its standard error by noise [bins]; |X| / sigma.
+"""
 
 
 class Returns(NamedTuple):
@@ -146,11 +163,12 @@ def draw_returns(
     known, drawn = known_of(shots, found, motion), Drawn.nothing(found, draws)
     one = np.exp(shots.looks.log_alarm(known.levels[:, 1:2]))
     how, tables = How.of(shots, first_draw, noisy), interpolator(shots.window, shots.fft_size)
+    around = int(2 * known.fan.reach.max(initial=0) + 1)
     for part, seen, leaks in _spectra(shots, found, noisy):
-        of_part = Known(*(column[part] for column in known))
+        of_part = known.of(part)
         of_part = of_part._replace(alarm=at_least_one(one[part], seen.others))
         own = Drawn(*(column[part] for column in drawn))
-        rule = how._replace(rule=echo_filter(shots, seen))
+        rule = how._replace(rule=echo_filter(shots, seen, 0 if noisy else around))
         _draw(keys[part], rule, of_part, seen, leaks, tables, own)
         for column, values in zip(drawn, own, strict=True):
             column[part] = values
@@ -200,6 +218,9 @@ class How(NamedTuple):
     """Records whose powers are averaged."""
     apart: bool
     """Each has its own speckle."""
+    votes: int
+    """Of them that have to detect, 0 where their mean power does; -1 where they are held against
+    the probability, as speckle changes from one to the next."""
 
     @classmethod
     def of(cls, shots: Shots, first_draw: int, noisy: bool) -> "How":
@@ -208,10 +229,14 @@ class How(NamedTuple):
         signed = 0.0
         if shots.complex_record:
             alone, signed = waveform.SIGNED, math.copysign(1.0, 1.0 - shots.slopes[2])
+        votes = shots.looks.votes if shots.looks.combine == BINARY else 0
+        if shots.look_speckle is not None:
+            votes = -1
         return cls(
             int(first_draw), noisy, shots.incoherent, bool(shots.segments[1]), shots.fft_size // 2,
             signed, alone, shots.real_ends, shots.echo_rule[1], echo_filter(shots, Seen.nothing(0)),
             shots.looks.number if shots.looks.several else 1, shots.looks.independent,
+            votes,
         )  # fmt: skip
 
 
@@ -242,8 +267,21 @@ class Known(NamedTuple):
     number is missed, or detected."""
     searched: np.ndarray
     """(n, 3, 2) int64: first and last of the bins that false peaks may lie in."""
-    mixing: np.ndarray
-    """(n, 6), as of :meth:`sweep.model.detection.Fading.mixing`; or (n, 0)."""
+    fan: LineFan
+    """Lines of footprints in developed speckle, of n points; or of none."""
+    middle: np.ndarray
+    """(n, 3, most): middle of the lines in a group [bins]."""
+    share: np.ndarray
+    """(n, 3, most): share of the echo in the mean power by which a group is detected."""
+    wander: np.ndarray
+    """(n, 3, most): standard deviation of its place by speckle [bins], at |X| of one sigma; 0
+    without speckle."""
+
+    def of(self, part: np.ndarray) -> "Known":
+        """Knowledge of some points by their numbers."""
+        return Known(
+            *(v.of(part) if isinstance(v, LineFan) else v[part] for v in self)  # type: ignore[arg-type]
+        )
 
 
 class Drawn(NamedTuple):
@@ -291,14 +329,38 @@ def known_of(shots: Shots, found: Groups, motion: OwnMotion | None = None) -> Kn
     beside = down_given_up(up, down, both)
     mean = (weight * apart).sum(axis=-1) / total
     square = (weight * apart**2).sum(axis=-1) / total
+    spread = np.sqrt(np.maximum(square - mean**2, 0.0))
+    if shots.fading is not None:  # drawn lines have it
+        spread *= 0.0
     return Known(
-        bins, found.pd, found.neighbours, np.sqrt(np.maximum(square - mean**2, 0.0)), lines,
-        amplitude, np.stack([shots.bin_deviation, *noise_levels(shots)], axis=1),
+        bins, found.pd, found.neighbours, spread, lines, amplitude,
+        np.stack([shots.bin_deviation, *noise_levels(shots)], axis=1),
         np.zeros(found.leakage.shape),
         np.stack([np.broadcast_to(part, shots.size) for part in _third(shots, motion)], axis=1),
         np.ascontiguousarray(np.moveaxis(beside, 0, 1)), _searched(shots),
-        np.empty((shots.size, 0)) if shots.fading is None else shots.fading.mixing().T.copy(),
+        line_fan(shots), np.where(found.bin < 0, np.nan, found.bin + mean),
+        *_speckle_shares(shots, found),
     )  # fmt: skip
+
+
+def _speckle_shares(shots: Shots, found: Groups) -> tuple[np.ndarray, np.ndarray]:
+    """Share of the echo in the power that detects a group, and its wander, as of Known."""
+    sigma, line, level = (
+        np.broadcast_to(v, shots.size)[:, None, None]
+        for v in (shots.bin_deviation, shots.line_deviation, shots.threshold)
+    )
+    if shots.speckle_lines is None:
+        return np.zeros(found.pd.shape), np.zeros(found.pd.shape)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # As if one bin were detected as often: fading_together has the same share.
+        share = 1 + np.log(found.pd) * 2 * (line / level) ** 2
+        signal = np.square(found.magnitude / line)
+        at_end = np.isin(found.bin, (0, shots.real_ends // 2)) & (shots.real_ends > 0)
+        share = np.where(at_end, signal / (2 + signal), share)
+    widest = np.sqrt((shots.speckle_lines.spread**2).sum(axis=-1))
+    looks = shots.looks.number if shots.looks.several and shots.looks.independent else 1
+    wander = widest[..., None] * found.magnitude / sigma / math.sqrt(2 * looks)
+    return np.clip(np.nan_to_num(share), 0.0, 1.0), np.nan_to_num(wander)
 
 
 def _third(
@@ -374,10 +436,16 @@ def measured(
     """
     fitted = shots.slopes != waveform.SIGNS
     drawn = _with_drift(shots, drawn, motion)
+    wander = _wander(shots, known, drawn)
+    if wander is not None:
+        peaks = drawn.peaks.copy()
+        alone = np.diagonal(wander, axis1=-2, axis2=-1)
+        peaks[..., ERROR] = np.sqrt(peaks[..., ERROR] ** 2 + alone)
+        drawn = drawn._replace(peaks=peaks)
     read = _fitted if fitted else _read
     if from_three_bins and shots.first_sample is not None:
-        drawn = _with_late_echo(shots, drawn, read(shots, drawn))
-    told = read(shots, drawn)
+        drawn = _with_late_echo(shots, drawn, read(shots, drawn, wander))
+    told = read(shots, drawn, wander)
     point, group = np.arange(shots.size)[:, None, None], np.maximum(drawn.group, 0)
     sizes = (known.bins[:, :, LAST] - known.bins[:, :, FIRST])[
         point[..., None], np.arange(3), group
@@ -389,7 +457,7 @@ def measured(
     off = told.range[..., FINE] - told.pulled - deepest * (1 + offset[point, seen])
     right = abs(off) <= reach * told.metre
     right &= abs(told.velocity[..., FINE] - truth[point, seen]) <= reach * told.speed
-    signal = (drawn.group[..., 0] >= 0) & (drawn.group[..., 2] >= 0)
+    signal = (drawn.group[..., ::2] >= 0).all(axis=-1) & (drawn.group[..., 1] != FALSE)
     pd = known.pd[point, 0, group[..., 0]] * known.beside[point, 1, group[..., 2]]
     misread = (drawn.flags & TRUE > 0) & ~right
     uncorrected = told.range[..., FINE].copy(), told.velocity[..., FINE].copy()
@@ -416,6 +484,38 @@ def measured(
         np.maximum(drawn.group, FALSE),
         *(np.where(drawn.flags > 0, change, np.nan) for change in per_slip),
     )  # fmt: skip
+
+
+def _wander(shots: Shots, known: Known, drawn: Drawn) -> np.ndarray | None:
+    """Mean products [bins^2] of the errors of each return's peaks by speckle.
+
+    (n, draws, most, 3, 3) by segment, signed as the beats; None of shots that do not fade.
+    """
+    lines = shots.speckle_lines
+    if lines is None:
+        return None
+    found = np.zeros((*drawn.group.shape, 3))
+    point, draw, number = np.nonzero((drawn.group >= 0).any(axis=-1))
+    group, peaks = drawn.group[point, draw, number], drawn.peaks[point, draw, number]
+    segment, at = np.arange(3), point[:, None]
+    echo = np.where(group >= 0, 1.0, np.nan)
+    numbers = np.maximum(group, 0)
+    sigma, line = (
+        np.broadcast_to(v, shots.size)[at] for v in (shots.bin_deviation, shots.line_deviation)
+    )
+    signal = (known.magnitude[at, segment, numbers, 1] / sigma) ** 2
+    mean = signal + 2 * (line / sigma) ** 2
+    delta = peaks[..., FINE] - peaks[..., WHOLE]
+    if shots.detection == "peak_bin":  # placed by the bins about that one
+        moved = peaks[..., WHOLE] - known.bins[at, segment, BIN, numbers]
+        if shots.complex_record:
+            moved = moved - shots.fft_size * np.rint(moved / shots.fft_size)
+        delta = delta + np.where(np.abs(moved) <= 1, moved, 0.0)
+    power = echo * peaks[..., RATIO] ** 2 / mean
+    of_echoes = Peaks(delta, directions(shots)[point], power, signal / mean)
+    pairs = CHIRPS if shots.slopes == waveform.SIGNS else ALL_PAIRS
+    found[point, draw, number] = place_errors(lines.of(point), of_echoes, shots, pairs)
+    return found
 
 
 def _with_drift(shots: Shots, drawn: Drawn, motion: OwnMotion | None) -> Drawn:
@@ -527,8 +627,12 @@ def _beats_by_motion(shots: Shots) -> tuple[np.ndarray, np.ndarray]:
     return by_acceleration, -light * rates * (starts + within)
 
 
-def _read(shots: Shots, drawn: Drawn) -> Told:
-    """Tell range and velocity at mid-chirp by each return's reading of its up and down peak."""
+def _read(shots: Shots, drawn: Drawn, wander: np.ndarray | None) -> Told:
+    """Tell range and velocity at mid-chirp by each return's reading of its up and down peak.
+
+    Speckle that both see moves their beats against each other with the range, and along with each
+    other with the velocity.
+    """
     carrier, bandwidth, duration, rate = (
         columns(shots, column, 3)
         for column in (shots.carriers[0], shots.bandwidth, shots.duration, shots.sample_rate)
@@ -546,18 +650,28 @@ def _read(shots: Shots, drawn: Drawn) -> Told:
     metre = SPEED_OF_LIGHT / 4 * width / chirp_rate
     speed = SPEED_OF_LIGHT / 4 * width / (carrier + bandwidth / 2)
     variance = (drawn.peaks[..., ::2, ERROR] ** 2).sum(axis=-1)
-    error = np.sqrt(np.stack([variance + 1 / 6, variance], axis=-1))
+    together = 0.0 if wander is None else 2 * wander[..., 0, 2]
+    by_range, by_velocity = (np.maximum(variance + v, 0.0) for v in (-together, together))
+    range_error, velocity_error = (
+        np.sqrt(np.stack([value + 1 / 6, value], axis=-1)) for value in (by_range, by_velocity)
+    )
     # Up and down beat tell the range at the middle of their starts; acceleration adds to it.
     first, last = (columns(shots, shots.starts[s], 2) for s in (0, 2))
     pulled = (carrier / chirp_rate)[..., 0] * columns(shots, shots.acceleration, 2)
     pulled = 0.5 * (last - first) * pulled
     pulled -= 0.5 * (last + first) * columns(shots, shots.approach, 2)
     return Told(
-        distance, velocity, metre * error, speed * error, metre[..., 0], speed[..., 0], pulled
+        distance,
+        velocity,
+        metre * range_error,
+        speed * velocity_error,
+        metre[..., 0],
+        speed[..., 0],
+        pulled,
     )
 
 
-def _fitted(shots: Shots, drawn: Drawn) -> Told:
+def _fitted(shots: Shots, drawn: Drawn, wander: np.ndarray | None) -> Told:
     """Tell range and velocity at the shot's start by the fit of each return's peaks."""
     shape = drawn.flags.shape
     point = np.repeat(np.arange(shots.size), shape[1] * shape[2])
@@ -581,7 +695,11 @@ def _fitted(shots: Shots, drawn: Drawn) -> Told:
         errors = np.where(seen, peaks[..., ERROR], np.inf)
         errors = np.hypot(errors, math.sqrt(1 / 12) if kind == WHOLE else 0.0)
         found = fit(shots, peaks[..., kind] * width[point], 1 / errors**2, point)
-        columns_of.append((*found, *deviation(errors, point)))
+        spread = deviation(errors, point)
+        if wander is not None:
+            common = wander.reshape(point.size, 3, 3) * (width[point] ** 2)[:, None, None]
+            spread = _with_common_wander(shots, spread, common, 1 / errors**2, point)
+        columns_of.append((*found, *spread))
     there = (drawn.code >= 0)[..., None]
     distance, velocity, range_error, velocity_error = (
         np.where(there, np.stack(pair, axis=-1).reshape(*shape, 2), np.nan)
@@ -593,6 +711,28 @@ def _fitted(shots: Shots, drawn: Drawn) -> Told:
     return Told(distance, velocity, range_error, velocity_error, metre, speed, 0.0)
 
 
+def _with_common_wander(
+    shots: Shots, spread: Deviation, common: np.ndarray, weights: np.ndarray, point: np.ndarray
+) -> Deviation:
+    """Add to deviations of fits what the covariances of their beats (m, 3, 3) [Hz^2] make."""
+    carriers, rates = shots.beats_by_motion
+    gains = []
+    for unit in np.eye(3):
+        beats = unit[:, None] + np.zeros(point.size)
+        gains.append(
+            waveform.response(
+                beats, weights=weights, carriers=carriers[:, point], rates=rates[:, point]
+            )
+        )
+    by_beat = np.array(gains)  # by beat, range and velocity, return
+    found = []
+    for value, gain in zip(spread, by_beat.swapaxes(0, 1), strict=True):
+        both = sum(gain[i] * gain[j] * common[:, i, j] for i, j in ((0, 1), (0, 2), (1, 2)))
+        with np.errstate(invalid="ignore"):
+            found.append(np.sqrt(np.maximum(value**2 + 2 * both, 0.0)))
+    return Deviation(*found)
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def _draw(keys, how, known, seen, leaks, tables, out):
     """All draws of all points: peaks of the three segments, and which make returns."""
@@ -600,20 +740,95 @@ def _draw(keys, how, known, seen, leaks, tables, out):
     peaks, which = np.zeros((3, most + 1, 4)), np.empty((3, most + 1), np.int64)
     number, pairs = np.empty(3, np.int64), np.empty((most + 1, 4), np.int64)
     up, fading = np.zeros(most, np.bool_), np.ones((most, 3))
+    fades = known.fan.spread.shape[0] > 0
+    speckle = no_speckle(most)
     for i in range(n):
-        fades = known.mixing.shape[1] > 0 and (how.noisy or leaks.total[i].max() > 0.0)
+        if fades:
+            speckle = speckled_bins(i, how, known, seen)
         for d in range(draws):
             address = keys[i, 0], keys[i, 1], how.first_draw + d
             if fades:
-                for g in range(most):
-                    fading[g] = fading_factors(address[:2], address[2], g, known.mixing[i])
+                draw_speckle(address, i, known, speckle, fading)
             for s in range(3):
                 if s != 1 or how.doppler:
                     number[s] = draw_peaks(
-                        address, (i, s), how, known, seen, leaks, fading, tables, peaks[s],
-                        which[s], up,
+                        address, (i, s), how, known, seen, leaks, fading, speckle, tables,
+                        peaks[s], which[s], up,
                     )  # fmt: skip
             report((i, d), how, known, (peaks, which, number), pairs, out)
+
+
+class Speckle(NamedTuple):
+    """Bins of a point's groups by segment, and their speckle in a draw."""
+
+    first: np.ndarray
+    """(most, 3) int64: first bin."""
+    number: np.ndarray
+    """(most, 3) int64: number of bins, 0 where a segment lacks the group."""
+    power: np.ndarray
+    """(most, 3, bins): mean power by the lines of the footprint."""
+    drawn: np.ndarray
+    """(most, looks, 3, bins): complex amplitudes of a mean power of 1; of one look where all have
+    the same."""
+
+
+@njit(cache=True, error_model="numpy")
+def no_speckle(most):
+    """Return the record of a point whose echoes do not fade."""
+    bins = np.zeros((most, 3), np.int64)
+    return Speckle(bins, bins, np.zeros((most, 3, 0)), np.zeros((most, 1, 3, 0), np.complex128))
+
+
+@njit(cache=True, error_model="numpy")
+def speckled_bins(i, how, known, seen):
+    """List the bins of a point's groups that are looked at, and their mean powers."""
+    most, widest = known.bins.shape[3], 0
+    first, count = np.zeros((most, 3), np.int64), np.zeros((most, 3), np.int64)
+    for g in range(most):
+        for s in range(3):
+            centre = known.bins[i, s, BIN, g]
+            if centre < 0:
+                continue
+            if how.noisy and how.beside > 0:
+                low, start = seen.low[i, s], seen.start[i, s]
+                run = seen.ratios[start : start + seen.bins[i, s]]
+                ends = known.bins[i, s, FIRST, g] - low, known.bins[i, s, LAST, g] - low
+                begin, end = echo_of(run, ends[0], ends[1], known.levels[i, 1], how.beside)
+                first[g, s], count[g, s] = low + begin, end - begin + 1
+            else:
+                first[g, s] = centre - known.fan.reach[i]
+                count[g, s] = 2 * known.fan.reach[i] + 1
+            widest = max(widest, count[g, s])
+    power = np.zeros((most, 3, widest))
+    looks = how.looks if how.apart else 1
+    for g in range(most):
+        line_powers(known.fan, i, known.middle[i, :, g], first[g], power[g])
+    return Speckle(first, count, power, np.zeros((most, looks, 3, widest), np.complex128))
+
+
+@njit(cache=True, error_model="numpy")
+def draw_speckle(address, i, known, speckle, fading):
+    """Draw the speckle of a point's groups, and the factors (most, 3) by which they fade."""
+    for g in range(speckle.number.shape[0]):
+        for look in range(speckle.drawn.shape[1]):
+            own = address[0], address[1], address[2] + look * NEXT_LOOK
+            amplitudes = speckle.drawn[g, look]
+            draw_lines(
+                own, g, known.fan, i, known.middle[i, :, g], speckle.first[g], speckle.power[g],
+                amplitudes,
+            )  # fmt: skip
+        for s in range(3):
+            fading[g, s] = 1.0
+            if speckle.number[g, s] == 0:
+                continue
+            centre, total = known.bins[i, s, BIN, g] - speckle.first[g, s], 0.0
+            for look in range(speckle.drawn.shape[1]):
+                own = speckle.drawn[g, look, s]
+                for k in range(speckle.number[g, s]):
+                    if not speckle.power[g, s, k] > 0.0:  # beyond all lines
+                        own[k] = own[centre]
+                total += abs(own[centre]) ** 2
+            fading[g, s] = math.sqrt(total / speckle.drawn.shape[1])
 
 
 @njit(cache=True, error_model="numpy")
@@ -627,7 +842,7 @@ def report(at, how, known, found, pairs, out):
         confirmed, count = pair_peaks(
             peaks[0, : number[0], FINE], peaks[1, : number[1], FINE],
             peaks[2, : number[2], FINE], known.third[i], 2.0 * how.half,
-            how.signed, TOLERANCE, pairs,
+            how.signed, how.alone, TOLERANCE, pairs,
         )  # fmt: skip
     else:
         confirmed = count = min(number[0], number[2])
@@ -640,6 +855,9 @@ def report(at, how, known, found, pairs, out):
         centres[0], centres[2] = peaks[0, u, FINE], peaks[2, v, FINE]
         if k >= 0:
             group[1], centres[1] = which[1, k], peaks[1, k, FINE]
+        for s in range(3):
+            if group[s] >= 0 and known.fan.spread.shape[0] > 0:  # of the echo, not of its speckle
+                centres[s] = known.middle[i, s, group[s]]
         for s in range(3):  # groups of complex records may lie whole FFT lengths from their peaks
             if how.signed != 0.0 and group[s] >= 0:
                 apart = known.bins[i, s, BIN, group[s]] - centres[s]
@@ -655,12 +873,13 @@ def report(at, how, known, found, pairs, out):
 
 
 @njit(cache=True, error_model="numpy")
-def draw_peaks(address, at, how, known, seen, leaks, fading, tables, peaks, which, up):
+def draw_peaks(address, at, how, known, seen, leaks, fading, speckle, tables, peaks, which, up):
     """Peaks (most + 1, 4) of a segment in a draw and their groups; returns how many there are.
 
     ``address`` is the key of the point and the number of the draw, ``at`` point and segment.
-    ``fading`` (most, 3) are factors on the groups' magnitudes, by segment. ``up`` (most,) tells
-    which groups are detected in the up segment, which comes first.
+    ``fading`` (most, 3) are factors on the groups' magnitudes, by segment, and ``speckle`` has the
+    amplitudes of their bins. ``up`` (most,) tells which groups are detected in the up segment,
+    which comes first.
     """
     (a, b, draw), (i, s) = address, at
     sigma, beta, under_lines = known.levels[i]
@@ -669,9 +888,11 @@ def draw_peaks(address, at, how, known, seen, leaks, fading, tables, peaks, whic
         if bins[BIN, g] < 0:
             break
         if how.noisy and how.beside > 0:
-            there = look_at_all(address, at, g, how, known, seen, fading, tables, peaks[count])
+            there = look_at_all(address, at, g, how, known, seen, speckle, tables, peaks[count])
         elif how.noisy:
-            there = look(address, at, g, how, known, seen, fading, tables, peaks[count])
+            there = look(address, at, g, how, known, seen, speckle, tables, peaks[count])
+        elif speckle.number[g, s] > 0:
+            there = detect_faded(address, at, g, how, known, speckle, tables, peaks[count])
         else:
             chance = known.beside[i, 1 if up[g] else 0, g] if s == 2 else known.pd[i, s, g]
             uniform = philox.uniform(a, b, draw, philox.STREAM_DETECTION[s], g)
@@ -679,12 +900,9 @@ def draw_peaks(address, at, how, known, seen, leaks, fading, tables, peaks, whic
             if there:
                 m, spread = known.magnitude[i, s, g], known.spread[i, s, g]
                 delta, ratio = sub_bin(m[0], m[1], m[2], tables), m[1] / sigma
-                if known.mixing.shape[1]:
-                    chances, levels = (uniform / chance, known.pd[i, s, g]), (beta, under_lines)
-                    ratio = faded_ratio(ratio, levels, chances, how.looks, how.apart)
                 error = sub_bin_error(delta, ratio / under_lines, tables) / math.sqrt(how.looks)
-                if not known.mixing.shape[1]:  # with the pedestal that is under the lines
-                    ratio = math.sqrt(ratio * ratio + 2.0 * (under_lines * under_lines - 1.0))
+                # With the pedestal that is under the lines.
+                ratio = math.sqrt(ratio * ratio + 2.0 * (under_lines * under_lines - 1.0))
                 normal, _ = philox.normal_pair(a, b, draw, philox.STREAM_NOISE[s], g)
                 fine = bins[BIN, g] + delta + error * normal
                 put(peaks[count], bins[BIN, g], fine, error, ratio, spread, how, tables)
@@ -742,18 +960,20 @@ def list_noisy(address, at, seen, leaks, fading, level, bins, ratios):
 
 
 @njit(cache=True, error_model="numpy")
-def look(address, at, g, how, known, seen, fading, tables, peak):
+def look(address, at, g, how, known, seen, speckle, tables, peak):
     """Look at a group's strongest bin with its noise: True, and its peak, where it crosses."""
     (a, b, draw), (i, s) = address, at
     sigma, beta, under_lines = known.levels[i]
     centre, stream = known.bins[i, s, BIN, g], philox.STREAM_NOISE[s]
-    m = known.magnitude[i, s, g] / sigma * fading[g, s]
     k = centre - seen.low[i, s]
     re, im = philox.normal_pair(a, b, draw, stream, k)
-    if is_end(centre, how.ends):
+    real = is_end(centre, how.ends)
+    if real:
         re, im = math.sqrt(2.0) * re, 0.0
     re, im = re * under_lines, im * under_lines
-    if (m[1] + re) ** 2 + im**2 < beta * beta:
+    m = known.magnitude[i, s, g] / sigma
+    echo = speckled(m[1], speckle, g, s, 1, real)
+    if (echo.real + re) ** 2 + (echo.imag + im) ** 2 < beta * beta:
         return False
     # Neighbours are exempt from false alarms, so their bins' own numbers are free.
     re_below, im_below = philox.normal_pair(a, b, draw, stream, k - 1 if k > 0 else k + 2)
@@ -761,12 +981,15 @@ def look(address, at, g, how, known, seen, fading, tables, peak):
     re_below, im_below = re_below * under_lines, im_below * under_lines
     re_above, im_above = re_above * under_lines, im_above * under_lines
     near, rest, across, own = tables.mixing
+    low, high = speckled(m[0], speckle, g, s, 0, False), speckled(m[2], speckle, g, s, 2, False)
     below = math.hypot(
-        m[0] + (near * re + across * re_above + own * re_below),
-        near * im + across * im_above + own * im_below,
+        low.real + (near * re + across * re_above + own * re_below),
+        low.imag + (near * im + across * im_above + own * im_below),
     )
-    middle = math.hypot(m[1] + re, im)
-    above = math.hypot(m[2] + (near * re + rest * re_above), near * im + rest * im_above)
+    middle = math.hypot(echo.real + re, echo.imag + im)
+    above = math.hypot(
+        high.real + (near * re + rest * re_above), high.imag + (near * im + rest * im_above)
+    )
     delta = sub_bin(below, middle, above, tables)
     shift = 0
     if max(below, above) > middle:
@@ -777,7 +1000,103 @@ def look(address, at, g, how, known, seen, fading, tables, peak):
 
 
 @njit(cache=True, error_model="numpy")
-def look_at_all(address, at, g, how, known, seen, fading, tables, peak):
+def speckled(magnitude, speckle, g, s, k, real):
+    """Complex amplitude of bin k of a group in a draw, of a mean square magnitude.
+
+    The spectrum of a real record is ``real`` at its ends: of a faded echo one part is left, which
+    has all of its power.
+    """
+    if speckle.number[g, s] == 0:
+        return complex(magnitude, 0.0)
+    amplitude = magnitude * speckle.drawn[g, 0, s, k]
+    return complex(math.sqrt(2.0) * amplitude.real, 0.0) if real else amplitude
+
+
+@njit(cache=True, error_model="numpy")
+def detect_faded(address, at, g, how, known, speckle, tables, peak):
+    """Draw a group in developed speckle: True, and its peak, where it is detected.
+
+    Its amplitude, echo and noise, is normal, of the echo's share in the mean power. It is detected
+    where its power exceeds what it exceeds with the group's probability of detection. So segments
+    are detected together as two correlated Rayleigh magnitudes of their own probabilities are, by
+    :func:`sweep.model.detection.fading_together`. Several looks detect by their own powers.
+    """
+    (a, b, draw), (i, s) = address, at
+    sigma, beta, under_lines = known.levels[i]
+    centre, first = known.bins[i, s, BIN, g], speckle.first[g, s]
+    middle, count, chance = centre - first, speckle.number[g, s], known.pd[i, s, g]
+    real, share = is_end(centre, how.ends), known.share[i, s, g]
+    if not chance > 0.0:
+        return False
+    power, room = np.zeros(count), np.empty((4, count + how.rule[0].shape[1]))
+    scale, votes, total = known.magnitude[i, s, g] / sigma, 0, complex(0.0, 0.0)
+    for look in range(how.looks):
+        own = draw + look * NEXT_LOOK
+        if count == 3:
+            three_bins_of_noise((a, b, own, philox.STREAM_NOISE[s]), 3 * g, tables, room)
+        else:
+            numbers = ECHO * (1 + g)
+            draw_noise((a, b, own, philox.STREAM_NOISE[s]), numbers, first, count, how.rule, room)
+        echo = speckle.drawn[g, look if speckle.drawn.shape[1] > 1 else 0, s]
+        for k in range(count):
+            if abs(k - middle) <= 1:
+                size = scale[1 + k - middle]
+            else:
+                size = scale[1] * math.sqrt(speckle.power[g, s, k] / speckle.power[g, s, middle])
+            noise = complex(room[0, k], room[1, k])
+            amplitude = size * echo[k] + under_lines * noise
+            if k == middle and look == 0:
+                total = math.sqrt(share) * echo[k] + math.sqrt(0.5 * (1.0 - share)) * noise
+            if k == middle:
+                if real:
+                    amplitude = complex(math.sqrt(2.0) * amplitude.real, 0.0)
+                votes += abs(amplitude) >= beta
+            power[k] += abs(amplitude) ** 2 / how.looks
+    if how.looks > 1 and how.votes >= 0:
+        there = votes >= how.votes if how.votes > 0 else power[middle] >= beta * beta
+    elif real:
+        there = math.erfc(abs(total.real)) < chance
+    else:
+        there = math.exp(-(abs(total) ** 2)) < chance
+    if not there:
+        return False
+    best = middle
+    if count > 3:
+        for k in range(1, count - 1):
+            best = k if power[k] > power[best] else best
+    below, strongest, above = (
+        math.sqrt(power[best - 1]),
+        math.sqrt(power[best]),
+        math.sqrt(power[best + 1]),
+    )
+    delta, shift = sub_bin(below, strongest, above, tables), 0
+    if max(below, above) > strongest:
+        shift = 1 if above > below else -1
+    error = sub_bin_error(delta, strongest / under_lines, tables) / math.sqrt(how.looks)
+    ratio = max(below, strongest, above, beta)
+    put(peak, first + best + shift, first + best + delta, error, ratio, 0.0, how, tables)
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def three_bins_of_noise(address, number, tables, room):
+    """Noise of three adjacent bins over sigma, to rows 0 and 1 of ``room``.
+
+    ``address``: key, draw, stream; independent numbers count from ``number``.
+    """
+    near, rest, across, own = tables.mixing
+    a, b, draw, stream = address
+    re, im = philox.normal_pair(a, b, draw, stream, number)
+    re_above, im_above = philox.normal_pair(a, b, draw, stream, number + 1)
+    re_below, im_below = philox.normal_pair(a, b, draw, stream, number + 2)
+    room[0, 0] = near * re + across * re_above + own * re_below
+    room[1, 0] = near * im + across * im_above + own * im_below
+    room[0, 1], room[1, 1] = re, im
+    room[0, 2], room[1, 2] = near * re + rest * re_above, near * im + rest * im_above
+
+
+@njit(cache=True, error_model="numpy")
+def look_at_all(address, at, g, how, known, seen, speckle, tables, peak):
     """Look at all bins of a group's echo with their noise: True, and its peak, where any crosses.
 
     The peak is the largest of them.
@@ -789,12 +1108,13 @@ def look_at_all(address, at, g, how, known, seen, fading, tables, peak):
     first, last = known.bins[i, s, FIRST, g] - low, known.bins[i, s, LAST, g] - low
     first, last = echo_of(run, first, last, beta, how.beside)
     count, best = last - first + 1, 0
-    factor, room = fading[g, s], np.empty((4, count + how.rule[0].shape[1]))
+    room = np.empty((4, count + how.rule[0].shape[1]))
     numbers = ECHO * (1 + g)
     draw_noise((a, b, draw, philox.STREAM_NOISE[s]), numbers, low + first, count, how.rule, room)
     for k in range(count):
-        re = run[first + k] * factor + under_lines * room[0, k]
-        im = under_lines * room[1, k]
+        real = is_end(low + first + k, how.ends)
+        echo = speckled(run[first + k], speckle, g, s, k, real)
+        re, im = echo.real + under_lines * room[0, k], echo.imag + under_lines * room[1, k]
         room[0, k] = math.hypot(re, im)
         best = k if room[0, k] > room[0, best] else best
     middle, spread = room[0, best], known.spread[i, s, g]

@@ -45,12 +45,26 @@ NARROW = 0.01
 REACH = 6.0
 """Bins of fs/L on either side of a line within which its transform is integrated over."""
 
-_OVERSAMPLING = 64
+OVERSAMPLING = 64
+"""Steps of a window's tabulated transform for a bin of fs/L."""
 _NODES = 48
 _DEVIATIONS_MAX = 5.0
 """Standard deviations of the beam on either side that are integrated over, at the most."""
 _RESOLVED_PHASE_MAX = 40.0
 """Phase [rad] at the end of the integral up to which the nodes resolve its turning."""
+
+
+class SpeckleLines(NamedTuple):
+    """Footprints of n points by their standard deviations along the beam's two coordinates."""
+
+    spread: np.ndarray
+    """(n, 3, 2): shift of a segment's line for a standard deviation [bins], signed as its beat."""
+    turn: np.ndarray
+    """(n, 3, 2): phase that it gains against the up segment's [rad]."""
+
+    def of(self, part: np.ndarray) -> "SpeckleLines":
+        """Footprints of some points."""
+        return SpeckleLines(self.spread[part], self.turn[part])
 
 
 class LineSpread(NamedTuple):
@@ -124,22 +138,22 @@ def window_transform(window: Window, distance: np.ndarray) -> np.ndarray:
     >>> float(np.round(window_transform(window("hann", 1024), np.array([1.0]))[0], 3))
     0.5
     """
-    place, value = _transform_table(window)
+    place, value = transform_table(window)
     return np.interp(np.abs(distance), place, value, right=0.0)
 
 
 def _half_width(window: Window) -> float:
     """Distance at which a window's transform has fallen to 1/2, 2 REACH at most [bins of fs/L]."""
-    place, value = _transform_table(window)
+    place, value = transform_table(window)
     fallen = value < 0.5  # nowhere if all samples but one are 0, as of hann's two
     last = int(np.argmax(fallen)) if fallen.any() else value.size - 1
     return float(np.interp(-0.5, -value[: last + 1], place[: last + 1]))
 
 
 @lru_cache(maxsize=16)
-def _transform_table(window: Window) -> tuple[np.ndarray, np.ndarray]:
+def transform_table(window: Window) -> tuple[np.ndarray, np.ndarray]:
     """Distances [bins of fs/L] and the window's transform there."""
-    place = np.arange(int(2 * REACH * _OVERSAMPLING) + 1) / _OVERSAMPLING
+    place = np.arange(int(2 * REACH * OVERSAMPLING) + 1) / OVERSAMPLING
     w = samples(window.name, window.length)
     time = (np.arange(window.length) - window.length / 2) / window.length
     # Sums, not products of matrices, whose order depends on the number of threads.

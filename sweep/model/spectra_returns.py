@@ -65,7 +65,7 @@ def spectra_returns(
     zero, kept = index_of_zero(shots), 1 if shots.peaks == STRONGEST else most + 1
     rounded = math.sqrt(1 / 12) if str(p[ESTIMATOR + "kind"]) == PEAK_BIN else 0.0
     for i in range(shots.size):
-        view = view_of(shots, i, p, keys[i], methods, found.bin[i])
+        view = view_of(shots, i, p, keys[i], methods, found.bin[i], known.fan)
         sigma, _, under_lines = known.levels[i]
         echoes = [_bins_of(view, s, signal) for s, signal in enumerate(view.signals)]
         for d in range(draws):

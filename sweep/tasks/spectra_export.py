@@ -38,7 +38,7 @@ def spectra(
     Every effect is there that is not off and that the point has anything of. The draws begin at
     ``first``.
     """
-    from sweep.model.noisy_spectra import drawn_of, fading_of, noise_of, signal_of
+    from sweep.model.noisy_spectra import drawn_of, noise_of, signal_of, speckle_of
     from sweep.model.realisations import random_effects, realise
 
     if Looks.of(parameters).number > 1:
@@ -60,9 +60,9 @@ def spectra(
             there = list(map(int, np.flatnonzero(shots.segments)))
             signals = [signal_of(shots, i, s) for s in there]
             chosen = np.array([draw]) if random else numbers
-            factors = fading_of(shots, i, key=key[0], draws=chosen)
             drawn.append(np.stack([
-                drawn_of(shots, i, s, signal, key=key[0], draws=chosen) * factors[s][:, None]
+                drawn_of(shots, i, s, signal, key=key[0], draws=chosen)
+                * speckle_of(shots, i, s, signal, key=key[0], draws=chosen)
                 + noise_of(shots, i, s, key=key[0], draws=chosen)
                 for s, signal in zip(there, signals, strict=True)
             ], axis=1))  # fmt: skip

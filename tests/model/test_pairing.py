@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sweep.model import waveform
-from sweep.model.pairing import ASSUMED, TOLERANCE, confirm, pair_peaks
+from sweep.model.pairing import TOLERANCE, confirm, pair_peaks
 from sweep.model.returns import How, _third
 
 N, FS = 2**17, 600e6
@@ -35,12 +35,12 @@ def _beats(target_range, radial_velocity):
     return [waveform.fold(np.array(f), np.array(FS)) / WIDTH for f in signed]
 
 
-def _pair(up, doppler, down, tolerance=TOLERANCE):
+def _pair(up, doppler, down, tolerance=TOLERANCE, assumed=waveform.FAR):
     """(confirmed, [(up, doppler, down, code)])."""
     lists = [np.array(x, float).ravel() for x in (up, doppler, down)]
     room = max(lists[0].size, lists[2].size, 1)
     pairs = np.full((room, 4), -9)
-    confirmed, number = pair_peaks(*lists, AT_START, float(N), 0.0, tolerance, pairs)
+    confirmed, number = pair_peaks(*lists, AT_START, float(N), 0.0, assumed, tolerance, pairs)
     return confirmed, [tuple(map(int, p)) for p in pairs[:number]]
 
 
@@ -149,19 +149,29 @@ def test_a_false_peak_alone_leaves_the_true_pair_as_it_was():
     assert [p[:3] for p in pairs] == [(1, 0, 0)]
 
 
-def test_without_a_doppler_peak_the_half_sum_counts_as_the_doppler_frequency():
-    """Right for a fast mover; range and velocity are exchanged for a slow one."""
-    for target, right in (((500.0, 60.0), True), ((500.0, 2.0), False)):
-        up, _, down = _scene(target)
-        confirmed, pairs = _pair(up, [], down)
-        assert confirmed == 0
-        assert pairs == [(0, -1, 0, ASSUMED)]
-        assert _agrees(_reported(up[0], down[0], ASSUMED), target) == right
-        f_r = 2e12 * 2 * target[0] / 299792458.0
-        f_d = 2 * target[1] / 1550e-9
-        other = _reported(up[0], down[0], ASSUMED ^ 1 if right else ASSUMED)
-        assert other[1] == pytest.approx(f_r * 1550e-9 / 2, rel=1e-3)
-        assert other[0] == pytest.approx(f_d * 299792458.0 / 4e12, rel=1e-3)
+@pytest.mark.parametrize("assumed", [waveform.FAR, waveform.FAST])
+@pytest.mark.parametrize(
+    ("doppler", "target"),
+    [
+        ([], (500.0, 60.0)),
+        ([], (500.0, 2.0)),
+        ([41234.0], (500.0, 60.0)),
+        ([41234.0], (500.0, 2.0)),
+    ],
+)
+def test_without_a_doppler_peak_of_its_own_a_pair_is_read_as_assumed(assumed, doppler, target):
+    """Right for a far target, or a fast one; range and velocity are exchanged for another."""
+    up, _, down = _scene(target)
+    confirmed, pairs = _pair(up, doppler, down, assumed=assumed)
+    assert confirmed == 0
+    assert pairs == [(0, -1, 0, assumed)]
+    right = (target[1] == 60.0) == (assumed == waveform.FAST)
+    assert _agrees(_reported(up[0], down[0], assumed), target) == right
+    f_r = 2e12 * 2 * target[0] / 299792458.0
+    f_d = 2 * target[1] / 1550e-9
+    other = _reported(up[0], down[0], assumed ^ 1 if right else assumed)
+    assert other[1] == pytest.approx(f_r * 1550e-9 / 2, rel=1e-3)
+    assert other[0] == pytest.approx(f_d * 299792458.0 / 4e12, rel=1e-3)
 
 
 def test_a_doppler_peak_out_of_tolerance_still_decides_the_order():

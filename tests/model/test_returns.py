@@ -25,9 +25,11 @@ from sweep.model.returns import (
     free_bin,
     judge,
     largest_of,
+    no_speckle,
 )
 from sweep.model.sampling import simulate
 from sweep.model.shot import evaluate, find, prepare, report
+from sweep.model.speckle_lines import LineFan
 from sweep.model.window import samples, window
 
 METHODS = ["probabilities", "noise"]
@@ -259,15 +261,22 @@ def test_the_largest_of_many_noise_bins_has_its_order_statistic():
             assert -np.expm1(n * below) == pytest.approx(chance, rel=1e-9)
 
 
+NO_LINES = LineFan(
+    *np.zeros((2, 0, 3, 2)), np.zeros((0, 2), np.int64), np.zeros(0, np.int64), np.ones((1, 1)),
+    np.ones((1, 1)), np.ones(1, np.int64), np.ones(2), 1.0, 1.0,
+)  # fmt: skip
+"""Lines of points whose echoes do not fade."""
+
+
 def _up_in_noise(centre, magnitude, levels, tables, half, *, low=0, others=0.0, alarm=0.0):
     """Draws of the up-chirp segment of one point: from number to strongest peak, or None."""
     rule = np.empty((0, 17)), np.empty(0, np.int64), 0
-    how = How(0, True, True, True, half, 0.0, 0, 0, 0, rule, 1, False)
+    how = How(0, True, True, True, half, 0.0, 0, 0, 0, rule, 1, False, 0)
     known = Known(
         np.full((1, 3, 3, 1), centre), np.ones((1, 3, 1)), np.full((1, 3, 1, 3), magnitude),
         np.zeros((1, 3, 1)), np.zeros((1, 3, 1)), np.ones((1, 1)), np.array([levels]),
         np.full((1, 3), alarm), np.ones((1, 2)), np.ones((1, 2, 1)),
-        np.tile([1, half], (1, 3, 1)), np.empty((1, 0)),
+        np.tile([1, half], (1, 3, 1)), NO_LINES, *np.zeros((3, 1, 3, 1)),
     )  # fmt: skip
     seen = Seen.nothing(1)._replace(low=np.full((1, 3), low), others=np.full((1, 3), others))
     peaks, which = np.zeros((2, 4)), np.zeros(2, np.int64)
@@ -276,8 +285,8 @@ def _up_in_noise(centre, magnitude, levels, tables, half, *, low=0, others=0.0, 
     def drawn(number):
         address = key[0], key[1], number
         count = draw_peaks(
-            address, (0, 0), how, known, seen, LeakedPeaks.nothing(1), np.ones((1, 3)), tables,
-            peaks, which, np.zeros(1, bool),
+            address, (0, 0), how, known, seen, LeakedPeaks.nothing(1), np.ones((1, 3)),
+            no_speckle(1), tables, peaks, which, np.zeros(1, bool),
         )  # fmt: skip
         return peaks[0].copy() if count else None
 
@@ -455,10 +464,13 @@ def test_peaks_of_two_surfaces_make_a_mispaired_return(table_4_1):
     assert got.beamlet[0, 0, 0] == -1
 
 
-def test_a_slow_target_without_its_doppler_peak_is_misread(table_4_1):
-    """Range and velocity exchanged: flagged, and true again for a fast mover."""
-    for velocity, kind in ((2.0, MISREAD), (60.0, TRUE)):
+@pytest.mark.parametrize("two_beats", [waveform.FAR_TARGET, waveform.FAST_TARGET])
+def test_a_pair_without_its_doppler_peak_is_read_as_two_beats_are(table_4_1, two_beats):
+    """Range and velocity of the other target are exchanged, and flagged."""
+    for velocity, kind in ((2.0, waveform.FAR_TARGET), (60.0, waveform.FAST_TARGET)):
         shots = _surfaces(table_4_1, [400.0], [velocity])
+        shots = dataclasses.replace(shots, two_beats=two_beats)
+        kind = TRUE if kind == two_beats else MISREAD
         found = _only(_certain(groups(shots)), {(1, g): 0.0 for g in range(4)})
         got = _drawn(shots, found)
         assert got.flags[0, 0, 0] == kind | UNCONFIRMED

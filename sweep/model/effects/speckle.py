@@ -48,6 +48,7 @@ from sweep.model.speckle_correlation import (
     NARROW,
     SEGMENT_PAIRS,
     LineSpread,
+    SpeckleLines,
     bin_correlation,
     window_transform,
 )
@@ -193,7 +194,10 @@ def fade(shots: Shots, scene: Scene) -> Shots:
         ground.correlation(shots, pair, phase)
         for pair, phase in zip(SEGMENT_PAIRS, segment_phases(shots), strict=True)
     ]
-    shots = replace(shots, fading=Fading(*correlations), line_spread=spread)
+    drawn_lines = _speckle_lines(shots, scene.ground)
+    shots = replace(
+        shots, fading=Fading(*correlations), line_spread=spread, speckle_lines=drawn_lines
+    )
     return shots if shots.looks.number == 1 else _fade_in_looks(shots, ground)
 
 
@@ -315,6 +319,32 @@ def _ground_spread(shots: Shots, ground: Ground) -> GroundSpread:
     return GroundSpread(_cast_slopes(moments), None, moments)
 
 
+def _speckle_lines(shots: Shots, ground: Plane | Cast) -> SpeckleLines:
+    """Return the spread of bins and phases over the beam, along the slope and across it.
+
+    Across it only Doppler ratios change. All of the ground counts, also where its effects are too
+    small to change probabilities: places wander with them.
+    """
+    if isinstance(ground, Plane):
+        slopes, across = ground.slopes, np.zeros(shots.size)
+    else:
+        row, offset, doppler, echo = ground.beamlets
+        moments = _moments_by_surface(echo, np.array([doppler, offset]), ground.beside, row)
+        slopes = _cast_slopes(moments)
+        left = moments.covariance[0, 0] - slopes.beta**2
+        across = np.sqrt(np.maximum(left, 0.0))
+    width = shots.sample_rate / shots.fft_size
+    spread = np.zeros((3, 2, shots.size))
+    for s, segment in enumerate(shots.waveform):
+        delay = 2 / SPEED_OF_LIGHT * (shots.range - segment.nearer)
+        moved = segment.carrier * slopes.beta - segment.chirp_rate * delay * slopes.range
+        spread[s] = moved / width, segment.carrier * across / width
+    turn = np.zeros((3, 2, shots.size))
+    for (_, second), phase in zip(SEGMENT_PAIRS[:2], segment_phases(shots)[:2], strict=True):
+        turn[second] = phase.along(slopes), 2 * np.pi * phase.turn * across
+    return SpeckleLines(np.moveaxis(spread, -1, 0), np.moveaxis(turn, -1, 0))
+
+
 class PhaseDifference(NamedTuple):
     """Phase by which scatterers' echoes differ between two segments, (n,) each."""
 
@@ -398,20 +428,25 @@ def _beamlet_moments(shots: Shots, ground: Ground) -> BeamletMoments:
     Surfaces at different ranges, as a roof and the ground below, are echoes of their own, each of
     which fades as a whole.
     """
-    power = shots.amplitude**2
-    share = power / np.maximum(power.sum(axis=1), _SMALLEST)[:, None]
     values = np.array([shots.doppler, shots.offset])
+    return _moments_by_surface(shots.amplitude**2, values, ground.beside, shots.row)
+
+
+def _moments_by_surface(
+    power: np.ndarray, values: np.ndarray, beside: np.ndarray | None, row: np.ndarray
+) -> BeamletMoments:
+    """Return the moments of values (2, rows, beamlets) by power, for points of these rows."""
+    share = power / np.maximum(power.sum(axis=1), _SMALLEST)[:, None]
     mean = (share * values).sum(axis=-1)
     centred = values - mean[:, :, None]
-    apart = ground.beside if isinstance(ground, Cast) else None
-    if apart is not None and apart.any():
-        for surface in (apart, ~apart):
+    if beside is not None and beside.any():
+        for surface in (beside, ~beside):
             weight = np.where(surface, share, 0.0)
             whole = np.maximum(weight.sum(axis=1), _SMALLEST)
             own_mean = (weight * values).sum(axis=-1) / whole
             centred = np.where(surface, values - own_mean[:, :, None], centred)
     covariance = (share * centred[:, None] * centred[None]).sum(axis=-1)
-    return BeamletMoments(mean[:, shots.row], covariance[:, :, shots.row])
+    return BeamletMoments(mean[:, row], covariance[:, :, row])
 
 
 def _phase_moments(

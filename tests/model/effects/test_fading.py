@@ -225,7 +225,9 @@ def test_grid_and_flight_count_the_detections_that_the_closed_form_tells(sloping
     method = "noise" if noisy else "probabilities"
     drawn = draw_returns(shots, groups(shots), keys=key, draws=number, method=method)
     paired = ((drawn.group[0, :, :, 0] == 0) & (drawn.group[0, :, :, 2] == 0)).any(axis=1)
-    assert paired.sum() == counts[3, 0, 0]
+    # Flights draw the lines of footprints, which grids do not.
+    spread = np.sqrt(2 * told[2] * (1 - told[2]) / number)
+    assert abs(paired.mean() - counts[3, 0, 0] / number) < 5 * spread
 
 
 @pytest.mark.parametrize("noisy", [False, True])
@@ -233,7 +235,12 @@ def test_powers_of_detected_peaks_are_exponential_above_the_threshold(sloping, n
     number, key = 10_000, philox.point_keys(np.zeros((1, 1)), domain="tests", seed=9)
     shots = prepared(sloping | {"target.range": 8000.0})
     apart = np.zeros(1, complex)
-    shots = replace(shots, fading=Fading(apart, apart, apart))
+    turn = np.array([0.0, 20.0, 40.0])[:, None] + np.zeros((1, 3, 2))
+    shots = replace(
+        shots,
+        fading=Fading(apart, apart, apart),
+        speckle_lines=shots.speckle_lines._replace(turn=turn),
+    )
     method = "noise" if noisy else "probabilities"
     found = groups(shots)
     drawn = draw_returns(shots, found, keys=key, draws=number, method=method)

@@ -1,0 +1,431 @@
+"""Developed speckle of a footprint, drawn: complex amplitudes of bins in the segments of a shot.
+
+The footprint is a grid of lines over the two coordinates of a Gaussian beam, in its standard
+deviations. A line at (y, x) has the weight a^2 of a Gaussian rule and a circular complex Gaussian
+amplitude z, which all segments of a shot see. In segment s it lies b_s . (y, x) bins off the middle
+of the echo, and its phase is t_s . (y, x) against the first segment, by equation (1) of
+:mod:`sweep.model.speckle_correlation`. A bin k then has
+
+    A_s,k = sum a z e^(i t_s . (y, x)) G(k - middle_s - b_s . (y, x))                            (1)
+
+with the window's transform G. Bins of all segments are jointly circular Gaussian, as sums of such
+numbers are. Their covariances are the Gaussian means that the rule integrates, so that the peak
+bins of two segments have the correlation mu of that module. Amplitudes are returned over their root
+mean squares: whoever draws gives a bin the mean power that the spectrum has there.
+
+Places wander with speckle. If the footprint spreads over less than a bin, (1) is to first order in
+b the bin of a lone tone that lies
+
+    w_s = b_s . Re(Y_s / A_s),    Y_s = sum a z e^(i t_s . (y, x)) (y, x)                        (2)
+
+off the middle. A_s and Y_s are independent, as y and x have the mean 0. Of a peak with the power
+q^2 in units of its mean, noise included, of which the echo has the share v, w_s is normal:
+
+    var w_s = |b_s|^2 v / (2 q^2)                                                                (3)
+
+This is the law of a ratio of two Gaussian numbers [Goodman, Speckle Phenomena in Optics, 2007,
+ch. 2; of angles in radar it is known as glint: Kanter, IEEE Trans. AES-13, 1977]. Without the
+threshold, which keeps q away from 0, it has no variance. :func:`wander_covariance` has the
+covariance of two segments.
+
+In footprints of half a bin and more the place is bounded by the bins that are looked at.
+:func:`wander_reduction` holds the ratio of the drawn deviation to that by (3).
+"""
+
+import math
+from functools import lru_cache
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from scipy import special
+
+from sweep.kernels import njit
+from sweep.model import philox
+from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.footprint import gaussian_rule
+from sweep.model.interpolation import interpolator, lone_tone, sub_bin
+from sweep.model.speckle_correlation import OVERSAMPLING, REACH, SpeckleLines, transform_table
+from sweep.model.window import Window
+
+if TYPE_CHECKING:
+    from sweep.model.preparation import Shots
+
+NODES = np.array([1, 3, 7, 15, 31, 63, 127, 255, 511])
+"""Lines along one coordinate."""
+
+_RESOLVED = np.array([0.02, 0.6, 1.9, 3.8, 9.4, 23.0, 52.0, 109.0, np.inf])
+"""Phase [rad for a standard deviation] up to which so many nodes integrate it to 1e-3."""
+
+_LEAST_WEIGHT = 1e-6
+"""Share of the power below which a line is left out."""
+
+FIRST_LINE = 1 << 24
+"""Number of the amplitude of a group's first line, over one more than the number of the group."""
+
+NEXT_LOOK = np.int64(1 << 48)
+"""Draws from one look's random numbers to the next one's."""
+
+
+class LineFan(NamedTuple):
+    """Lines of n points as compiled code takes them."""
+
+    spread: np.ndarray
+    """(n, 3, 2): as of :class:`SpeckleLines`, in the direction in which bins are numbered."""
+    turn: np.ndarray
+    """(n, 3, 2)"""
+    rule: np.ndarray
+    """(n, 2) int64: index into :data:`NODES` for each coordinate."""
+    reach: np.ndarray
+    """(n,) int64: bins on either side of the strongest among which a peak may lie."""
+    node: np.ndarray
+    """(rules, nodes): of the Gaussian rules."""
+    weight: np.ndarray
+    """(rules, nodes): shares of power."""
+    number: np.ndarray
+    """(rules,) int64: nodes of each."""
+    transform: np.ndarray
+    """Window's transform at even steps from 0 on."""
+    steps: float
+    """Of these for a bin."""
+    size: float
+    """Bins on either side of a line that see it."""
+
+    def of(self, part: np.ndarray) -> "LineFan":
+        """Lines of some points by their numbers."""
+        if not self.spread.shape[0]:
+            return self
+        return self._replace(
+            spread=self.spread[part], turn=self.turn[part], rule=self.rule[part],
+            reach=self.reach[part],
+        )  # fmt: skip
+
+
+@lru_cache(maxsize=1)
+def _rules() -> tuple[np.ndarray, np.ndarray]:
+    """Nodes and weights of the Gaussian rules, (rules, nodes), padded with zeros."""
+    node, weight = np.zeros((2, NODES.size, NODES[-1]))
+    for row, number in enumerate(NODES.tolist()):
+        node[row, :number], weight[row, :number] = gaussian_rule(number)
+    return node, weight
+
+
+def line_fan(shots: "Shots") -> LineFan:
+    """Lines of shots in developed speckle; none of shots without it."""
+    lines = shots.speckle_lines
+    value = transform_table(shots.window)[1]
+    node, weight = _rules()
+    size = 0 if lines is None else shots.size
+    spread, turn = np.zeros((2, size, 3, 2)) if lines is None else lines
+    padding = shots.fft_size / shots.window.length
+    # Two bins' transforms together turn by 2 pi at the most for each bin of fs/L.
+    phases = np.abs(turn[:, :, None] - turn[:, None]).max(axis=(1, 2))
+    phases = phases + np.pi * np.abs(spread).max(axis=1) / padding
+    rule = np.searchsorted(_RESOLVED, phases)
+    widest = np.sqrt((spread**2).sum(axis=-1)).max(axis=1)
+    reach = np.ones(size, np.int64)
+    if shots.detection == "any_bin":
+        wide = widest > 0.02 * padding
+        reach = np.where(wide, 1 + np.ceil(2.5 * widest), 1).astype(np.int64)
+    return LineFan(
+        np.ascontiguousarray(spread * directions(shots)[..., None][:size]),
+        np.ascontiguousarray(turn), rule.astype(np.int64), reach, node, weight, NODES,
+        value, OVERSAMPLING / padding, REACH * padding,
+    )  # fmt: skip
+
+
+def directions(shots: "Shots") -> np.ndarray:
+    """Return (n, 3) by segment: -1 where the beat of the axis's line is folded to fall, else 1."""
+    found = np.ones((shots.size, 3))
+    if shots.complex_record:
+        return found
+    for s, segment in enumerate(shots.waveform):
+        delay = 2 / SPEED_OF_LIGHT * (shots.range - segment.nearer)
+        beat = segment.carrier * segment.beta - segment.chirp_rate * delay * (1 + segment.beta)
+        turns = beat / shots.sample_rate
+        found[:, s] = np.where(turns - np.floor(turns + 0.5) < 0, -1.0, 1.0)
+    return found
+
+
+@njit(cache=True, error_model="numpy")
+def transform_at(distance, fan):
+    """Window's transform at a distance [bins]."""
+    place = abs(distance) * fan.steps
+    k = int(place)
+    if k >= fan.transform.size - 1:
+        return 0.0
+    return fan.transform[k] + (place - k) * (fan.transform[k + 1] - fan.transform[k])
+
+
+@njit(cache=True, error_model="numpy")
+def line_powers(fan, i, middle, first, power):
+    """Mean powers (3, bins) of bins by lines of a total power of 1, into ``power``.
+
+    ``middle`` (3,) is the echo's middle in each segment, nan for none, and ``first`` (3,) the first
+    of the bins, in the same numbers.
+    """
+    power[:] = 0.0
+    along, across = fan.rule[i]
+    for s in range(3):
+        if np.isnan(middle[s]):
+            continue
+        for a in range(fan.number[along]):
+            for c in range(fan.number[across]):
+                weight = fan.weight[along, a] * fan.weight[across, c]
+                if weight < _LEAST_WEIGHT:
+                    continue
+                place = middle[s] + fan.spread[i, s, 0] * fan.node[along, a]
+                place += fan.spread[i, s, 1] * fan.node[across, c] - first[s]
+                low = max(0, math.ceil(place - fan.size))
+                for k in range(low, min(power.shape[1], math.floor(place + fan.size) + 1)):
+                    at = transform_at(k - place, fan)
+                    power[s, k] += weight * at * at
+
+
+@njit(cache=True, error_model="numpy")
+def draw_lines(address, group, fan, i, middle, first, power, out):
+    """Draw complex amplitudes (3, bins) of bins, of mean power 1, into ``out``.
+
+    ``address``: key of the point and number of the draw; ``group``: number of the echo; ``power``:
+    :func:`line_powers` of the same bins.
+    """
+    out[:] = 0.0
+    along, across = fan.rule[i]
+    half, number = math.sqrt(0.5), FIRST_LINE * (1 + group)
+    for a in range(fan.number[along]):
+        for c in range(fan.number[across]):
+            weight = fan.weight[along, a] * fan.weight[across, c]
+            if weight < _LEAST_WEIGHT:
+                continue
+            re, im = philox.normal_pair(
+                address[0], address[1], address[2], philox.STREAM_SPECKLE, number
+            )
+            number += 1
+            drawn = complex(re, im) * (half * math.sqrt(weight))
+            y, x = fan.node[along, a], fan.node[across, c]
+            for s in range(3):
+                if np.isnan(middle[s]):
+                    continue
+                phase = fan.turn[i, s, 0] * y + fan.turn[i, s, 1] * x
+                turned = drawn
+                if phase != 0.0:
+                    turned = drawn * complex(math.cos(phase), math.sin(phase))
+                place = middle[s] + fan.spread[i, s, 0] * y + fan.spread[i, s, 1] * x - first[s]
+                low = max(0, math.ceil(place - fan.size))
+                for k in range(low, min(out.shape[1], math.floor(place + fan.size) + 1)):
+                    out[s, k] += turned * transform_at(k - place, fan)
+    for s in range(3):
+        for k in range(out.shape[1]):
+            if power[s, k] > 0.0:
+                out[s, k] /= math.sqrt(power[s, k])
+
+
+def drawn_speckle(
+    fan: LineFan,
+    i: int,
+    middle: np.ndarray,
+    bins: tuple[int, int],
+    *,
+    key: np.ndarray,
+    draws: np.ndarray,
+    group: int = 0,
+) -> np.ndarray:
+    """Complex amplitudes of adjacent bins of point i in some draws, of a mean power of 1.
+
+    Parameters
+    ----------
+    middle
+        (3,): middle of the echo in the segment that is asked for [bins], nan in the others.
+    bins
+        First bin, and their number.
+
+    Returns
+    -------
+    numpy.ndarray
+        (m, bins)
+    """
+    (segment,) = np.flatnonzero(np.isfinite(middle))
+    first = np.full(3, bins[0])
+    power = np.empty((3, bins[1]))
+    line_powers(fan, i, middle, first, power)
+    out = np.zeros((3, bins[1]), complex)
+    found = np.empty((draws.size, bins[1]), complex)
+    for row, draw in enumerate(draws):
+        draw_lines((key[0], key[1], draw), group, fan, i, middle, first, power, out)
+        found[row] = out[segment]
+    return found
+
+
+def wander_covariance(
+    lines: SpeckleLines, pair: tuple[int, int], power: np.ndarray, share: np.ndarray
+) -> np.ndarray:
+    """Covariance [bins^2] of the places of two segments' peaks by speckle, of m peaks of points.
+
+    Parameters
+    ----------
+    lines
+        Footprints of the m peaks.
+    pair
+        Numbers of the two segments.
+    power
+        (2, m): power q^2 of the two peaks in units of its mean, noise included.
+    share
+        (2, m): share of the echo in that mean.
+
+    Returns
+    -------
+    numpy.ndarray
+        (m,), signed as the beats.
+
+    Notes
+    -----
+    With t the difference of the two turns and rho = exp(-t.t / 2) (v_1 v_2)^(1/2) the correlation
+    of the amplitudes A_1 and A_2, the means of Y_1 and Y_2 given both amplitudes are
+
+        E[Y_1] = -i t rho k (A_2 - rho A_1),   E[Y_2] = i t rho k (A_1 - rho A_2),
+        k = 1 / (1 - rho^2),
+
+    and what is left has the covariance rho (1 - k t t'). An instrument knows the amplitudes' sizes.
+    Given these their phases differ by an angle of von Mises' distribution of the concentration
+    K = 2 k rho q_1 q_2, with the means I_1(K) / I_0(K) of its cosine and I_1(K) / (K I_0(K)) of its
+    squared sine. Hence
+
+        (b_1.t) (b_2.t) (rho k)^2 E[sin^2] + rho (b_1.b_2 - k (b_1.t) (b_2.t)) E[cos] / (2 q_1 q_2).
+    """
+    first, second = pair
+    b, c = lines.spread[:, first], lines.spread[:, second]
+    t = lines.turn[:, second] - lines.turn[:, first]
+    square = (t * t).sum(axis=-1)
+    rho = np.exp(-0.5 * square) * np.sqrt(share[0] * share[1])
+    left = np.maximum(1 - rho * rho, 1e-12)
+    size = np.sqrt(power[0] * power[1])
+    # The ratio is that of its limits beyond, to float64.
+    concentration = np.clip(2 * rho * size / left, 1e-12, 1e7)
+    cosine = special.i1e(concentration) / special.i0e(concentration)
+    along = (b * t).sum(axis=-1) * (c * t).sum(axis=-1) / left
+    common = (b * c).sum(axis=-1) - along
+    squared_sine = cosine / np.maximum(2 * rho * size / left, 1e-12)
+    return np.asarray(along * rho * rho / left * squared_sine + rho * common * cosine / (2 * size))
+
+
+class Peaks(NamedTuple):
+    """Peaks of m echoes in developed speckle by segment, (m, 3) each; nan where there is none."""
+
+    delta: np.ndarray
+    """Place past the bin about which it was estimated [bins]."""
+    direction: np.ndarray
+    """-1 where the beat is folded to fall, else 1."""
+    power: np.ndarray
+    """Power q^2 in units of its mean, noise included."""
+    share: np.ndarray
+    """Share of the echo in that mean."""
+
+
+FARTHEST = 1.5
+"""Distance [bins] from the strongest bin that bounds the places of peaks where it alone detects."""
+
+
+ALL_PAIRS = (0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)
+"""Pairs of segments, of one and the same too."""
+CHIRPS = (0, 0), (0, 2), (2, 2)
+"""Those of the up and the down segment."""
+
+
+def place_errors(
+    lines: SpeckleLines,
+    peaks: Peaks,
+    shots: "Shots",
+    pairs: tuple[tuple[int, int], ...] = ALL_PAIRS,
+) -> np.ndarray:
+    """Mean products [bins^2] of the errors of places by speckle, signed as the beats.
+
+    Parameters
+    ----------
+    lines
+        Footprints of the m echoes.
+    pairs
+        Pairs of segments whose products are asked for.
+
+    Returns
+    -------
+    numpy.ndarray
+        (m, 3, 3) by segment; 0 where a segment has no peak, or is not asked for.
+
+    Notes
+    -----
+    The wander by equation (3) and :func:`wander_covariance`; and errors by the shape of the peak
+    (:class:`ShapeErrors`). Re V has the mean b^2 and, with q^2 / v the power of the echo's share,
+    the variance b^4 (v / q^2 + v^2 / q^4).
+    """
+    spread = (lines.spread**2).sum(axis=-1)
+    there = np.isfinite(peaks.power) & np.isfinite(peaks.delta)
+    power = np.where(there, np.maximum(peaks.power, 1e-12), 1.0)
+    share = np.where(there, peaks.share, 0.0)
+    variance = spread * share / (2 * power)
+    shape = ShapeErrors.at(np.where(there, peaks.delta, 0.0), variance, shots)
+    widening = peaks.direction * shape.widening * spread * (share > 0)
+    mean = peaks.direction * shape.twist + widening
+    further = np.sqrt((share / power) * (1 + share / power)) * widening
+    bound = np.ones(variance.shape)
+    if shots.detection == "peak_bin":
+        bound = 1 / np.sqrt(1 + variance / FARTHEST**2)
+    looks = shots.looks.number if shots.looks.several and shots.looks.independent else 1
+    found = np.zeros((*power.shape, 3))
+    for first, second in pairs:
+        both = there[:, first] & there[:, second]
+        if first == second:
+            value, alike = variance[:, first], 1.0
+        else:
+            pair = [first, second]
+            value = wander_covariance(lines, (first, second), power[:, pair].T, share[:, pair].T)
+            turn = lines.turn[:, second] - lines.turn[:, first]
+            alike = np.exp(-0.5 * (turn * turn).sum(axis=-1))
+        value = value + further[:, first] * further[:, second] * alike
+        value = value * bound[:, first] * bound[:, second] / looks
+        value = np.where(both, value + mean[:, first] * mean[:, second], 0.0)
+        found[:, first, second] = found[:, second, first] = value
+    return found
+
+
+_STEP = 0.05
+"""Imaginary shift, and root of a variance, [bins] at which the estimate of a place is tried."""
+
+
+class ShapeErrors(NamedTuple):
+    """Errors of a peak's place because speckle changes the shape of the peak."""
+
+    twist: np.ndarray
+    """[bins] by the imaginary part of the complex shift of a tone."""
+    widening: np.ndarray
+    """[bins] by a complex variance V of the lines of 1 bin^2."""
+
+    @classmethod
+    def at(cls, delta: np.ndarray, variance: np.ndarray, shots: "Shots") -> "ShapeErrors":
+        """Errors at places ``delta`` past the strongest bin.
+
+        To second order in the spread b a bin is A (G - x G' + (V + x^2) G'' / 2), with the complex
+        shift x, of whose real and imaginary part this is the ``variance``, and
+
+            V = sum a z b^2 y^2 / A - x^2.
+
+        The real part of x is the wander. The imaginary part, and V, make the magnitudes of three
+        bins those of no tone: the estimate errs by a multiple of (Im x)^2, and of Re V.
+        """
+        place, twist, widening = _shape_table(shots.window, shots.fft_size)
+        side, past = np.sign(delta), np.abs(delta)
+        return cls(
+            side * np.interp(past, place, twist) * variance, side * np.interp(past, place, widening)
+        )
+
+
+@lru_cache(maxsize=16)
+def _shape_table(window: Window, fft_size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Places past a bin; errors there over the square of an imaginary shift, and over Re V."""
+    tables, tone = interpolator(window, fft_size), lone_tone(window, fft_size)
+    place = np.linspace(0.0, 1.0, 65)
+    bins = np.array([[-1.0], [0.0], [1.0]]) - place
+    twisted, widened = tone(bins - 1j * _STEP), 0.5 * (tone(bins + _STEP) + tone(bins - _STEP))
+    errors = [
+        (np.array([sub_bin(*three, tables) for three in np.abs(values).T]) - place) / _STEP**2
+        for values in (twisted, widened)
+    ]
+    return place, errors[0], errors[1]

@@ -1,0 +1,306 @@
+"""Speckle drawn over footprints: detections together, places that wander, and what errors state.
+
+Points of flights by all methods, and a Monte Carlo simulation of scatterers that shares the mean
+echo power, the noise and the threshold with the model, and the interpolation between three bins.
+"""
+
+import numpy as np
+import pytest
+from engine import every, keys
+from scatterers import draw_spectra
+from small_scenes import flight, observed
+from test_speckle_on_slopes import EFFECTS, LANDER, facet_of, shots_of, with_threshold
+
+from sweep.model import beam, link, speckle_lines
+from sweep.model.clouds import cloud
+from sweep.model.detectors import main_lobe
+from sweep.model.effects.catalogue import DEFAULTS
+from sweep.model.geometry.mesh import Surface
+from sweep.model.interpolation import interpolator, sub_bin
+from sweep.model.pairing import UNCONFIRMED
+from sweep.model.speckle_correlation import LineSpread, bin_correlation
+from sweep.model.waveform import FAR, measured, reading
+from sweep.model.window import window
+
+PROCESSING = "instrument.processing."
+ESTIMATOR = {PROCESSING + "estimator.kind": "maximum_likelihood"}
+
+
+def slope(table_4_1, angle, *, ratio, **changes):
+    """Parameters of a shot on a slope whose up-chirp has so many times the threshold."""
+    own = {
+        "target.range": 300.0, "target.grazing_angle": np.radians(angle),
+        "target.radial_velocity": 6.0, "target.reflectance_law": "thesis",
+        PROCESSING + "window": "hann", PROCESSING + "tnr": 10.0,
+    }  # fmt: skip
+    return with_threshold(DEFAULTS | table_4_1() | LANDER | own | changes, ratio)
+
+
+def flown(p, method, draws):
+    """Points of a shot that meets a level plane as the facet of the parameters is met."""
+    angle, distance = p["target.grazing_angle"], p["target.range"]
+    along = np.array([np.cos(angle), 0.0, -np.sin(angle)])
+    nearer = np.array([-np.sin(angle), 0.0, -np.cos(angle)])  # towards the facet's near side
+    velocity = p["target.radial_velocity"] * along + p["target.transverse_velocity"] * nearer
+    seen = observed(
+        flight(position=tuple(-distance * along), velocity=tuple(velocity)),
+        beams=along[None],
+        angles=lambda far: beam.angles(p, np.where(np.isfinite(far), far, 1.0)),
+    )
+    instrument = {path: value for path, value in p.items() if not path.startswith("target.")}
+    sun = "target.solar_irradiance"
+    return cloud(
+        seen,
+        parameters=DEFAULTS | instrument | {sun: p[sun], "footprint.speckle": "developed"},
+        surfaces=[Surface("ground", p["target.reflectance"], p["target.reflectance_law"])],
+        keys=keys(1),
+        draws=draws,
+        method=method,
+        effects=EFFECTS,
+        returns=1,
+    )
+
+
+def scatterers_reported(p, draws, seed):
+    """Detection of all segments of drawn shots of scatterers, and range and velocity reported."""
+    shots = shots_of(p)
+    facet, tables = facet_of(p, shots), interpolator(shots.window, shots.fft_size)
+    poles = {
+        "detector_bandwidth": shots.detector_bandwidth,
+        "amplifier_bandwidth": shots.amplifier_bandwidth,
+    }
+    beat = np.array(2 * facet.range / 299792458.0 * float(np.ravel(shots.chirp_rate)[0]))
+    gain = np.abs(link.transfer(beat, **poles))
+    amplitude = shots.beat_scale * np.sqrt(shots.relative_echo) * gain
+    batches = list(
+        draw_spectra(
+            facet,
+            amplitude=float(np.ravel(amplitude)[0]),
+            noise_deviation=float(np.sqrt(shots.noise_variance[0])),
+            draws=draws,
+            seed=seed,
+        )
+    )
+    noise = 2 * float(shots.bin_deviation[0]) ** 2
+    half = int(np.ceil(main_lobe(shots.window) * shots.fft_size / shots.window.length))
+    places, detected = {}, np.ones(draws, bool)
+    for segment in facet.segments:
+        magnitude = np.abs(np.concatenate([batch.values[segment] for batch in batches]))
+        power = np.maximum((magnitude**2).mean(axis=0) - noise, 0.0)
+        best = np.full(draws, power.argmax())
+        if shots.detection == "any_bin":
+            strong = np.flatnonzero(power >= power.max() / 4)
+            low, high = max(strong[0] - half, 1), min(strong[-1] + half, power.size - 2)
+            best = low + magnitude[:, low : high + 1].argmax(axis=1)
+        row = np.arange(draws)
+        detected &= magnitude[row, best] >= float(shots.threshold[0])
+        three = np.stack([magnitude[row, best + k] for k in (-1, 0, 1)], axis=1)
+        delta = np.array([sub_bin(below, middle, above, tables) for below, middle, above in three])
+        places[segment] = batches[0].bins[segment][best] + delta
+    width = float(np.ravel(shots.sample_rate)[0]) / shots.fft_size
+    up, down = (places[segment] * width for segment in ("up", "down"))
+    beats = reading(FAR, up, down, 200e6)
+    carrier = 299792458.0 / p["instrument.laser.wavelength"]
+    chirp = (p["instrument.chirp.bandwidth"], p["instrument.chirp.duration"])
+    distance, velocity = measured(*beats, carrier, *chirp)
+    return detected, distance[detected], velocity[detected]
+
+
+# Amplitudes of bins
+
+
+def fan_of(spread, turn, shape="hann"):
+    """Lines of one footprint, and the window, of records as long as their FFT."""
+    size = 1024
+    transform = speckle_lines.transform_table(window(shape, size))[1]
+    node, weight = speckle_lines._rules()
+    rule = np.array([[3, 3]])  # of 15 lines along either coordinate
+    return speckle_lines.LineFan(
+        np.array([spread]), np.array([turn]), rule, np.ones(1, np.int64), node, weight,
+        speckle_lines.NODES, transform, float(speckle_lines.OVERSAMPLING), 6.0,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("shape", ["hann", "rectangular", "blackman"])
+@pytest.mark.parametrize(
+    ("spread", "turn"), [((0.3, -0.3), 0.0), ((0.5, -0.4), 1.2), ((0.0, 0.0), 0.8)]
+)
+def test_drawn_bins_have_the_mean_power_and_the_correlation_of_the_closed_form(shape, spread, turn):
+    number, distance = 20_000, (0.3, -0.2)
+    a, b = spread
+    fan = fan_of([(a, 0.0), (0.0, 0.0), (b, 0.0)], [(0.0, 0.0), (0.0, 0.0), (turn, 0.0)], shape)
+    drawn = []
+    for segment, off in ((0, distance[0]), (2, distance[1])):
+        middle = np.full(3, np.nan)
+        middle[segment] = -off
+        drawn.append(
+            speckle_lines.drawn_speckle(
+                fan, 0, middle, (0, 1), key=keys(1)[0], draws=np.arange(number)
+            )[:, 0]
+        )
+    one, other = drawn
+    for amplitude in drawn:
+        assert np.mean(np.abs(amplitude) ** 2) == pytest.approx(1.0, abs=5 / np.sqrt(number))
+    lines = LineSpread(
+        tuple(np.array([d]) for d in distance), tuple(np.array([s]) for s in spread),
+        np.array([turn]), np.zeros(1),
+    )  # fmt: skip
+    expected = bin_correlation(window(shape, 1024), lines)[0]
+    assert abs(np.mean(one * other.conj()).conj() - expected) < 5 / np.sqrt(number)
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.4, 1.5])
+@pytest.mark.parametrize("share", [1.0, 0.6])
+def test_places_of_two_segments_wander_together_as_their_closed_form_says(turn, share):
+    """Mean products of drawn ratios over those that are stated by amplitudes' sizes."""
+    rng, number, level = np.random.default_rng(7), 400_000, 0.2
+    lines, weight = np.polynomial.hermite_e.hermegauss(21)
+    weight = np.sqrt(weight / weight.sum())
+    b = np.array([0.1, -0.07])
+
+    def normal(*shape):
+        return (rng.normal(size=shape) + 1j * rng.normal(size=shape)) / np.sqrt(2)
+
+    amplitude = normal(number, 21) * weight
+    phases = np.exp(1j * np.array([0.0, turn])[:, None] * lines)
+    echo = np.sqrt(share) * (amplitude @ phases.T)
+    moment = np.sqrt(share) * (amplitude @ (phases * lines).T)
+    total = echo + np.sqrt(1 - share) * normal(number, 2)
+    power = np.abs(total) ** 2
+    there = (power > level).all(axis=1)
+    wander = (b * (moment / total).real)[there]
+    footprints = speckle_lines.SpeckleLines(
+        np.tile([[b[0], 0.0], [0.0, 0.0], [b[1], 0.0]], (there.sum(), 1, 1)),
+        np.tile([[0.0, 0.0], [0.0, 0.0], [turn, 0.0]], (there.sum(), 1, 1)),
+    )
+    shares = np.full((2, there.sum()), share)
+    stated = speckle_lines.wander_covariance(footprints, (0, 2), power[there].T, shares)
+    product = wander[:, 0] * wander[:, 1]
+    error = product.std() / np.sqrt(product.size)
+    assert abs(product.mean() - stated.mean()) < 5 * error
+    for k in range(2):  # of one segment alone, whatever the other's amplitude
+        own = power[:, k] > level
+        seen = b[k] * (moment[own, k] / total[own, k]).real
+        stated_alone = b[k] ** 2 * share / (2 * power[own, k])
+        assert (seen**2).mean() == pytest.approx(stated_alone.mean(), rel=0.02)
+
+
+# Points
+
+
+CASES = {
+    "steep": (5, {}),
+    "slope": (10, {}),
+    "half way": (30, {}),
+    "sliding": (30, {"target.transverse_velocity": 30.0}),
+    "from above, sliding": (90, {"target.transverse_velocity": 60.0}),
+}
+
+
+@pytest.mark.parametrize(("case", "rule"), every(3, CASES, ["peak_bin", "any_bin"]))
+def test_places_wander_as_those_of_scatterers(case, rule, table_4_1):
+    angle, changes = CASES[case]
+    p = slope(table_4_1, angle, ratio=10.0, **{PROCESSING + "detection": rule}, **changes)
+    draws = 2000
+    _, *truth = scatterers_reported(p, draws, seed=angle)
+    for method in ("probabilities", "noise"):
+        got = flown(p, method, draws)
+        true = got["flags"][0, :, 0] == 1
+        for name, drawn in zip(("range", "radial_velocity"), truth, strict=True):
+            points = got[f"{name}_interpolated"][0, true, 0]
+            # Of middle halves, which few large excursions do not move.
+            one, other = (np.subtract(*np.quantile(x, [0.84, 0.16])) for x in (points, drawn))
+            assert one / other == pytest.approx(1.0, abs=0.12), (method, name)
+            assert abs(np.median(points) - np.median(drawn)) < 0.15 * abs(other)
+
+
+@pytest.mark.parametrize(
+    ("angle", "rule", "method"),
+    every(5, [5, 7, 10, 20, 30, 60, 90], ["peak_bin", "any_bin"], ["probabilities", "noise"]),
+)
+def test_points_on_slopes_are_as_good_as_they_say(angle, rule, method, table_4_1):
+    """Standard deviations of scores over draws of detected, confirmed points."""
+    p = slope(table_4_1, angle, ratio=10.0, **{PROCESSING + "detection": rule})
+    got = flown(p, method, 3000)
+    true = got["flags"][0, :, 0] == 1
+    for name, most in (("range", 0.1), ("radial_velocity", 0.13)):
+        error = (got[f"{name}_interpolated"] - got[f"true_{name}"])[0, true, 0]
+        scores = error / got[f"{name}_interpolated_standard_error"][0, true, 0]
+        assert scores.std() == pytest.approx(1.0, abs=most), name
+
+
+def test_errors_of_whole_spectra_on_slopes_are_those_of_the_other_methods(table_4_1):
+    """By three bins' error; an estimator that sees all samples is better without a slope."""
+    p = slope(table_4_1, 10, ratio=10.0, **ESTIMATOR, **{PROCESSING + "detection": "any_bin"})
+    got = flown(p, "spectra", 500)
+    true = got["flags"][0, :, 0] == 1
+    error = (got["range_interpolated"] - got["true_range"])[0, true, 0]
+    scores = error / got["range_interpolated_standard_error"][0, true, 0]
+    assert scores.std() == pytest.approx(1.0, abs=0.1 + 5 / np.sqrt(2 * true.sum()))
+
+
+def test_three_segments_of_a_shot_are_detected_together(table_4_1):
+    """Up and down without Doppler are rare, as all see much the same speckle."""
+    p = slope(table_4_1, 60, ratio=1.3, **{PROCESSING + "tnr": 10.0})
+    shots, draws = shots_of(p), 8000
+    detected, _, _ = scatterers_reported(p, draws, seed=3)
+    error = np.sqrt(detected.mean() * (1 - detected.mean()) / draws)
+    assert shots.detection == "peak_bin"
+    for method in ("probabilities", "noise"):
+        got = flown(p, method, draws)
+        flags = got["flags"][0, :, 0]
+        confirmed = (flags > 0) & (flags & UNCONFIRMED == 0)
+        assert abs(confirmed.mean() - detected.mean()) < 4 * np.sqrt(2) * error
+        unconfirmed = (flags > 0) & (flags & UNCONFIRMED > 0)
+        pair = float(got["pd_shot"][0])
+        assert abs((confirmed | unconfirmed).mean() - pair) < 4 * np.sqrt(pair * (1 - pair) / draws)
+        assert unconfirmed.mean() < 0.3 * (pair * (1 - float(got["pd_doppler"][0])))
+        # Read as a far target, and not as a fast one.
+        assert np.nanmax(np.abs(got["range_interpolated"][0, :, 0] - 300.0)) < 1.0
+
+
+def shot_at_random(table_4_1, number):
+    rng = np.random.default_rng(1000 + number)
+    changes = {
+        PROCESSING + "window": str(rng.choice(["hann", "hamming", "blackman"])),
+        PROCESSING + "detection": str(rng.choice(["peak_bin", "any_bin"])),
+        "target.range": float(rng.uniform(100, 500)),
+        "target.radial_velocity": float(rng.uniform(4, 12)),
+        "target.transverse_velocity": float(rng.uniform(-20, 20)),
+        "instrument.chirp.bandwidth": float(rng.uniform(0.5e9, 2e9)),
+        PROCESSING + "tnr": float(rng.uniform(7, 12)),
+        **(
+            {"instrument.looks.number": int(rng.choice([2, 4])),
+             "instrument.looks.speckle": str(rng.choice(["common", "independent"]))}
+            if number % 4 == 3 else {}
+        ),
+    }  # fmt: skip
+    return slope(table_4_1, rng.uniform(12, 90), ratio=float(rng.uniform(0.8, 3.0)), **changes)
+
+
+@pytest.mark.parametrize("number", every(5, range(24)))
+def test_methods_agree_on_how_often_what_is_detected(number, table_4_1):
+    p, draws = shot_at_random(table_4_1, number), 6000
+    shares = {}
+    methods = ["probabilities", "noise", "spectra"]
+    several = p.get("instrument.looks.number", 1) > 1
+    for method in methods:
+        if (several and method == "noise") or (method == "spectra" and number % 3):
+            continue
+        got = flown(p, method, draws if method != "spectra" else 400)
+        flags = got["flags"][0, :, 0]
+        there = flags > 0
+        confirmed = there & (flags & UNCONFIRMED == 0)
+        shares[method] = np.array([there.mean(), confirmed.mean(), (flags == 1).mean()])
+        pair, count = float(got["pd_shot"][0]), there.size
+        # any_bin has no closed form of both chirps; spectra find a neighbour of the peak as well.
+        slack = 0.012 if p[PROCESSING + "detection"] == "any_bin" else 0.0
+        slack = max(slack, 0.03) if method == "spectra" else slack
+        alarms = float(got["pfa_up"][0] + got["pfa_down"][0])
+        assert abs(there.mean() - pair) < 5 * np.sqrt(pair * (1 - pair) / count) + slack + alarms
+    one = shares["probabilities"]
+    for method, other in shares.items():
+        count = draws if method != "spectra" else 400
+        allowed = 5 * np.sqrt(one * (1 - one) * (1 / draws + 1 / count) + 1e-9)
+        slack = 0.012 if method != "spectra" else 0.03
+        assert (np.abs(one - other) < allowed + slack).all(), (method, one, other)
