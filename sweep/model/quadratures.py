@@ -79,7 +79,8 @@ def signal_quadratures(shots: Any) -> SignalQuadratures:
         of_bins = both[..., None] * (1 + rows[-1][..., None] * COSINES)
         peak = np.take_along_axis(of_bins, both.argmax(axis=1)[:, None, None], axis=1)[:, 0]
         factor = peak if shots.detection == "peak_bin" else of_bins.max(axis=1)
-        factors.append(factor / both.max(axis=1)[:, None])
+        largest = both.max(axis=1)[:, None]
+        factors.append(np.where(largest > 0, factor / np.maximum(largest, 1e-300), 1.0))
     return SignalQuadratures(row, np.concatenate(rows), np.concatenate(factors))
 
 
