@@ -16,6 +16,7 @@ from shared import put, table
 import sweep
 from sweep.model import beam, shot
 from sweep.spec import Spec
+from sweep.spec.axes import without_fields_on_axes
 from sweep.spec.reading import library, read_document
 
 LIGHT = 299792458.0
@@ -35,7 +36,7 @@ def study(instrument: Any, target: Values, **sections: Any) -> Spec:
     """A study of an instrument straight before a target."""
     mapping = {"title": "Published numbers", "instrument": instrument,
                "target": {"grazing_angle": "90 deg"} | dict(target)}  # fmt: skip
-    return Spec.from_mapping(mapping | sections)
+    return Spec.from_mapping(without_fields_on_axes(mapping | sections))
 
 
 def computed(spec: Spec) -> Any:

@@ -14,11 +14,12 @@ TABLE_4_1 = EXPERIMENTS / "instruments" / "table_4_1.yaml"
 def experiment(name: str, **changes: Any) -> Any:
     """An experiment with sections put in the place of its own, and no figures."""
     from sweep.spec import SceneSpec, Spec
+    from sweep.spec.axes import without_fields_on_axes
     from sweep.spec.reading import read_document
 
     mapping = read_document(EXPERIMENTS / f"{name}.yaml").value | {"figures": []} | changes
     kind = SceneSpec if "scene" in mapping else Spec
-    return kind.from_mapping(mapping, base=EXPERIMENTS)
+    return kind.from_mapping(without_fields_on_axes(mapping), base=EXPERIMENTS)
 
 
 def plain(folder: Path, name: str) -> dict[str, Any]:

@@ -489,15 +489,17 @@ def _mean_over_mode(steady, echo, low, ends):
             if steady[0, k] > wide:
                 last = min(last, (steady[1, k] + _REACH) / (steady[0, k] - wide))
     last = min(last, math.sqrt(middle * middle + 10.0))  # what is beyond is 5e-5 of it all
+    ends_of_pieces = (first, last, last)
+    if steady[3].max() > 0.0:
+        # Where a pedestal fades they rise about the middle, or slowly all the way.
+        last = max(first, min(last, 4.5))  # what is beyond is 2e-9
+        half_way = middle if first < middle < last else 0.5 * (first + last)
+        ends_of_pieces = (first, half_way, last)
     found, missed = math.exp(-last * last), 0.0
     if first > 0.0:
         weight = -math.expm1(-first * first)
         one = _any_steady(steady, 0.6 * first, echo, low, ends)
         found, missed = found + weight * one[0], weight * one[1]
-    # Probabilities rise about the middle, of a fading pedestal as far as it goes.
-    ends_of_pieces = (first, last, last)
-    if steady[3].max() > 0.0 and first < middle < last:
-        ends_of_pieces = (first, middle, last)
     for piece in range(2):
         half = 0.5 * (ends_of_pieces[piece + 1] - ends_of_pieces[piece])
         for j in range(_ORDER if half > 0.0 else 0):

@@ -31,20 +31,16 @@ Q_N is that of scipy's noncentral chi square, whose error is 1e-11 of either tai
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy import special
 
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.look_speckle import (
-    NODES,
-    LookSpeckle,
-    correlated_magnitudes,
-    independent_speckles,
-    mean_power_tails,
-    votes_given_speckle,
-)
+
+# Kernels are imported where they are called: the rules of specs read this module without them.
+if TYPE_CHECKING:
+    from sweep.model.look_speckle import LookSpeckle
 
 POWER, BINARY, COHERENT = COMBINED = ("power", "binary", "coherent")
 MOTION, COMMON, INDEPENDENT = SPECKLES = ("motion", "common", "independent")
@@ -151,7 +147,7 @@ class Looks(NamedTuple):
         return found, missed
 
     def faded(
-        self, signal: np.ndarray, level: np.ndarray, speckle: LookSpeckle | None = None
+        self, signal: np.ndarray, level: np.ndarray, speckle: "LookSpeckle | None" = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Compute :meth:`steady` for a signal in developed speckle, of mean power signal^2.
 
@@ -187,9 +183,11 @@ class Looks(NamedTuple):
         return found, np.maximum(-np.expm1(log_rest) - first, 0.0)
 
     def _faded_in_part(
-        self, signal: np.ndarray, level: np.ndarray, speckle: LookSpeckle
+        self, signal: np.ndarray, level: np.ndarray, speckle: "LookSpeckle"
     ) -> tuple[np.ndarray, np.ndarray]:
         """Compute :meth:`faded` for looks that share their speckle in part."""
+        from sweep.model.look_speckle import mean_power_tails, votes_given_speckle
+
         if self.combine == POWER:
             snr, threshold = 0.5 * np.square(signal), 0.5 * self.number * np.square(level)
             return mean_power_tails(speckle, self.number, snr, threshold)
@@ -212,16 +210,20 @@ class Looks(NamedTuple):
         return found, 1 - found
 
     def _lattice(self) -> np.ndarray:
-        """Magnitudes (NODES, N) of independent speckles."""
+        """Magnitudes (nodes, N) of independent speckles."""
+        from sweep.model.look_speckle import independent_speckles
+
         return np.abs(independent_speckles(self.number))
 
-    def _speckle_nodes(self, speckle: LookSpeckle, segment: int, point: int) -> np.ndarray:
-        """Magnitudes (NODES, N) of the speckle of a segment's looks."""
+    def _speckle_nodes(self, speckle: "LookSpeckle", segment: int, point: int) -> np.ndarray:
+        """Magnitudes (nodes, N) of the speckle of a segment's looks."""
+        from sweep.model.look_speckle import correlated_magnitudes, independent_speckles
+
         root = speckle.root(segment, point)
         return correlated_magnitudes(independent_speckles(root.shape[1]), root)
 
     def given_speckle(
-        self, signals: Sequence[np.ndarray], level: np.ndarray, speckle: LookSpeckle | None
+        self, signals: Sequence[np.ndarray], level: np.ndarray, speckle: "LookSpeckle | None"
     ) -> tuple[list[np.ndarray], np.ndarray]:
         """Compute detection given the speckle of all looks, if segments share all of it.
 
@@ -237,6 +239,8 @@ class Looks(NamedTuple):
             magnitude, weight = self.speckle_nodes(level, *signals, shape=shape)
             given = [self.steady(v[..., None] * magnitude, level[..., None])[0] for v in signals]
             return given, weight
+        from sweep.model.look_speckle import NODES, votes_given_speckle
+
         given = [np.empty((*level.shape, NODES)) for _ in signals]
         for at in np.ndindex(level.shape):
             magnitude = (
@@ -248,7 +252,7 @@ class Looks(NamedTuple):
 
     def faded_together(
         self, one: np.ndarray, other: np.ndarray, level: np.ndarray, alike: np.ndarray,
-        speckle: LookSpeckle | None = None,
+        speckle: "LookSpeckle | None" = None,
     ) -> np.ndarray:  # fmt: skip
         """Probability that up and down segment in developed speckle are both detected.
 
@@ -304,7 +308,7 @@ class Looks(NamedTuple):
         )
 
     def _shared_part(
-        self, p: np.ndarray, q: np.ndarray, alike: np.ndarray, speckle: LookSpeckle | None
+        self, p: np.ndarray, q: np.ndarray, alike: np.ndarray, speckle: "LookSpeckle | None"
     ) -> np.ndarray:
         """Part that two segments have of the covariance which they would have in one speckle."""
         from sweep.model.detection import fading_together
@@ -317,7 +321,7 @@ class Looks(NamedTuple):
         lone = 1 / self._effective_number(speckle)
         return np.asarray(lone * part + (1 - lone) * np.square(alike))
 
-    def _effective_number(self, speckle: LookSpeckle | None) -> np.ndarray | float:
+    def _effective_number(self, speckle: "LookSpeckle | None") -> np.ndarray | float:
         """Return M, the number of looks of independent speckle that these are worth."""
         if speckle is not None:
             return np.asarray(speckle.shape.mean(axis=0))
@@ -325,7 +329,7 @@ class Looks(NamedTuple):
 
     def faded_any_two(
         self, signals: np.ndarray, level: np.ndarray, alike: np.ndarray, pd: np.ndarray,
-        speckle: LookSpeckle | None = None,
+        speckle: "LookSpeckle | None" = None,
     ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
         """Probabilities that at least two of three segments are detected, and that they are not.
 

@@ -5,9 +5,11 @@ The ``axes`` section of a spec is read here as a whole.
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
@@ -128,6 +130,27 @@ def paths_on_axes(written: object) -> dict[str, object]:
         for path, values in _items(str(key), value):
             first.setdefault(path, _first_written(values))
     return {path: value for path, value in first.items() if path in parameter_rules()}
+
+
+def without_fields_on_axes(written: Mapping[str, Any]) -> dict[str, Any]:
+    """Copy of a written study in whose sections no field is that an axis of it sets.
+
+    A field and its axis may not contradict each other: this gives a study of plain data an axis
+    in the place of a field.
+
+    >>> study = {"target": {"range": "2 km", "reflectance": 0.1}}
+    >>> without_fields_on_axes({**study, "axes": {"target.range": ["1 km", "3 km"]}})
+    {'target': {'reflectance': 0.1}, 'axes': {'target.range': ['1 km', '3 km']}}
+    """
+    copied = copy.deepcopy(dict(written))
+    for path in paths_on_axes(copied.get("axes")):
+        *parents, name = path.split(".")
+        section: Any = copied
+        for parent in parents:
+            section = section.get(parent) if isinstance(section, dict) else None
+        if isinstance(section, dict):
+            section.pop(name, None)
+    return copied
 
 
 def _items(key: str, written: object) -> list[tuple[str, object]]:

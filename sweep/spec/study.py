@@ -26,7 +26,15 @@ from sweep.model.outputs import STRONGEST_OUTPUTS
 from sweep.model.resolution import BEAMLETS, is_open, rays_needed
 from sweep.model.threshold import WAYS
 from sweep.model.waveform import ENDS
-from sweep.spec.axes import Axis, Member, axis_identity, in_units, paths_on_axes, read_axes
+from sweep.spec.axes import (
+    Axis,
+    Member,
+    axis_identity,
+    in_units,
+    paths_on_axes,
+    read_axes,
+    without_fields_on_axes,
+)
 from sweep.spec.figures import (
     LEAST_BEAMS,
     Figure,
@@ -334,19 +342,11 @@ class Study(Part):
 
     def _completed(self, written: dict[str, Any]) -> dict[str, Any]:
         """Return the spec with its defaults, without its execution and without what axes set."""
-        on_axes = {member.path for axis in self.axes for member in axis.members}
-        mapping = {key: value for key, value in written.items() if key != "execution"}
-        mapping = copy.deepcopy(mapping)
+        mapping = copy.deepcopy({k: value for k, value in written.items() if k != "execution"})
         for path, rule, value in leaves(self):
             if path[0] not in _UNSTORED:
                 fill(mapping, list(path), rule.written(value))
-        for dotted_path in on_axes:
-            *parents, name = dotted_path.split(".")
-            section = mapping
-            for parent in parents:
-                section = section[parent]
-            section.pop(name, None)
-        return mapping
+        return without_fields_on_axes(mapping)
 
     def to_json(self) -> str:
         """Return the spec as JSON text, for a store to hold, with the digests of its files."""

@@ -5,10 +5,10 @@ import shutil
 import numpy as np
 import rasterio
 from drawn_studies import INSTRUMENT
-from typed_specs import without_axes
 
 from sweep.model.outputs import CYCLES, SHOTS
 from sweep.spec import SceneSpec
+from sweep.spec.axes import without_fields_on_axes
 from sweep.tasks import driver
 
 FAR = (500_000.0, 4_000_000.0, 1200.0)
@@ -75,7 +75,7 @@ def scene(directory, **sections) -> SceneSpec:
         directory / "slope.tif", "w", driver="GTiff", crs="EPSG:32633", transform=corner, **shape
     ) as raster:
         raster.write(heights)
-    return SceneSpec.from_mapping(without_axes(MAPPING | sections), base=directory)
+    return SceneSpec.from_mapping(without_fields_on_axes(MAPPING | sections), base=directory)
 
 
 def flown(directory, **sections):

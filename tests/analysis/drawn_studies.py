@@ -1,8 +1,7 @@
 """Small studies in stores, to look at."""
 
-from typed_specs import without_axes
-
 from sweep.spec import Spec
+from sweep.spec.axes import without_fields_on_axes
 from sweep.tasks import driver
 
 INSTRUMENT = {
@@ -59,7 +58,7 @@ def study(axes, **sections) -> Spec:
         "footprint": {"beamlets": 9, "speckle": "none"},
         "axes": axes,
     }
-    return Spec.from_mapping(without_axes(mapping | sections))
+    return Spec.from_mapping(without_fields_on_axes(mapping | sections))
 
 
 def stored(directory, axes, **sections):

@@ -66,7 +66,8 @@ def test_shares_of_draws_agree_within_both_intervals(scene_store, slower):
     # 3 of 3 draws hold a share of 0.025^(1/3) and more with 95 %, 20 of 20 one of 0.025^(1/20)
     always = (1 - 0.025 ** (1 / 3)) + (1 - 0.025 ** (1 / 20))
     beyond = found.detected_allowed.values[0] - always
-    assert np.isclose(beyond, 0, atol=2e-3).any()
+    # effects and beamlets of both studies may each be off by the tolerance of 0.001
+    assert ((beyond >= 0) & (beyond <= 4e-3)).any()
 
 
 def test_more_light_is_told_with_the_shot_that_gains_most(slower):

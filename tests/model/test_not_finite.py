@@ -27,8 +27,8 @@ def test_lists_of_groups_end_wherever_a_magnitude_is_not_finite(value, level):
         magnitude[place] = value
         bins = np.full((3, 4), -1)
         peak = int(np.nanargmax(magnitude))
-        assert _list_groups(magnitude, peak, level, bins) <= 4
         exempt = np.zeros(6, np.bool_)
+        assert _list_groups(magnitude, exempt, peak, level, bins) <= 4
         _keep_echoes(magnitude, exempt, 0, level, 0, (np.array([0, 6]), 0), np.array([2.0]))
 
 

@@ -46,8 +46,9 @@ def _parameters(table_4_1, changes, speckle, power):
 def test_pd_follows_from_the_ratio_by_swerlings_law_or_marcums(table_4_1, case, speckle, power):
     """exp(-y / (1 + SNR)), or a noncentral chi square; n periodograms have 2 n degrees of freedom.
 
-    A pedestal is noise that comes with the light, so that a steady line on it has neither law; one
-    that is all pedestal is circular, as speckle is.
+    A pedestal is noise that comes with the light, so that a line on it has neither law: steady, or
+    developed but for 1e-3, as its pedestal is weak here. One that is all pedestal is circular, and
+    fades with the light: the mean of exp(-y / (1 + SNR e)) over an exponential e.
     """
     changes = CHANGES[case]
     out = evaluate(_parameters(table_4_1, changes, speckle, 10 ** (power / 10)), EFFECTS)
@@ -58,13 +59,18 @@ def test_pd_follows_from_the_ratio_by_swerlings_law_or_marcums(table_4_1, case, 
         if speckle == "developed" and number > 1:
             speckles = stats.expon.ppf((np.arange(4000) + 0.5) / 4000)
             expected = stats.ncx2.sf(2 * y, 2 * number, 2 * number * snr * speckles).mean()
+        elif speckle == "developed" and changes is WIDE:
+            node, weight = np.polynomial.laguerre.laggauss(60)
+            expected = (weight * np.exp(-y / (1 + snr * node))).sum()
         elif speckle == "developed" or changes is WIDE:
             expected = np.exp(-y / (1 + snr))
         elif changes is NARROW:
             continue
         else:
             expected = stats.ncx2.sf(2 * y, 2 * number, 2 * number * snr)
-        assert pd == pytest.approx(expected, rel=1e-6, abs=3e-4 if number > 1 else 1e-12)
+        rough = speckle == "developed" and changes in (NARROW, WIDE)
+        loose = 1e-3 if rough else 3e-4 if number > 1 else 1e-12
+        assert pd == pytest.approx(expected, rel=1e-6, abs=loose)
 
 
 @pytest.mark.parametrize("width", [2e4, 1e5, 3e6])

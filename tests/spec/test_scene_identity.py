@@ -9,11 +9,11 @@ import shutil
 import numpy as np
 import pytest
 import trimesh
-from typed_specs import without_axes
 from written_scenes import BOULDERS, RELIEF, RICH, with_object, written
 
 from sweep.scenes.files import SceneError
 from sweep.spec import SceneSpec, difference, from_stored
+from sweep.spec.axes import without_fields_on_axes
 from sweep.spec.grounds import OPTICAL
 from sweep.spec.identity import ROOTS, field_rules
 from sweep.spec.parts import all_parts, fields_of, leaves, rule_of
@@ -32,7 +32,7 @@ def changed(path, value):
         part = part.setdefault(parent, {})
     part[name] = value
     mapping["instrument"]["laser"].setdefault("power", "0.1 W")  # where it is on no axis any more
-    return spec_of(without_axes(mapping))
+    return spec_of(without_fields_on_axes(mapping))
 
 
 OTHER_GEOMETRY = {

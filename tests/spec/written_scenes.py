@@ -3,8 +3,9 @@
 import copy
 from typing import Any
 
-from typed_specs import without_axes
 from written_specs import BASE as GRID
+
+from sweep.spec.axes import without_fields_on_axes
 
 PLANE: dict[str, Any] = {"kind": "plane", "size": "2 km", "reflectance": 0.1}
 SCENE: dict[str, Any] = {
@@ -80,7 +81,7 @@ def written(changes: dict[str, Any] | None = None, **sections: Any) -> dict[str,
             part.pop(name)
         else:
             part[name] = copy.deepcopy(value)
-    return without_axes(mapping)
+    return without_fields_on_axes(mapping)
 
 
 def with_object(thing: dict[str, Any], name: str = "thing", **more: Any) -> dict[str, Any]:

@@ -4,7 +4,8 @@ import copy
 from typing import Any
 
 import numpy as np
-from typed_specs import without_axes
+
+from sweep.spec.axes import without_fields_on_axes
 
 BASE: dict[str, Any] = {
     "title": "A study",
@@ -40,7 +41,7 @@ def written(changes: dict[str, Any] | None = None, **sections: Any) -> dict[str,
             part.pop(name)
         else:
             part[name] = value
-    return without_axes(mapping)
+    return without_fields_on_axes(mapping)
 
 
 def content(member: Any) -> tuple[Any, ...]:

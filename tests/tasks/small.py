@@ -8,9 +8,8 @@ import time
 from contextlib import contextmanager
 from pathlib import Path
 
-from typed_specs import without_axes
-
 from sweep.spec import Spec
+from sweep.spec.axes import without_fields_on_axes
 from sweep.tasks.driver import run
 from sweep.tasks.progress import Progress
 
@@ -51,7 +50,7 @@ STUDY = {
 
 def small_file(**changes) -> dict[str, object]:
     """The small study as a file has it."""
-    return without_axes({**STUDY, **changes})
+    return without_fields_on_axes({**STUDY, **changes})
 
 
 def small(**changes) -> Spec:

@@ -3,9 +3,9 @@
 from pathlib import Path
 
 from small import STUDY
-from typed_specs import without_axes
 
 from sweep.spec import SceneSpec
+from sweep.spec.axes import without_fields_on_axes
 
 SCENE = {
     "title": "Small scene",
@@ -48,4 +48,4 @@ SCENE = {
 
 def small_scene(**changes) -> SceneSpec:
     """The small study of a scene with some of its sections replaced."""
-    return SceneSpec.from_mapping(without_axes({**SCENE, **changes}), base=Path("."))
+    return SceneSpec.from_mapping(without_fields_on_axes({**SCENE, **changes}), base=Path("."))

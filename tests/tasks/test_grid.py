@@ -185,5 +185,5 @@ def test_the_dearest_value_of_an_axis_decides_how_large_blocks_are():
 def test_what_runs_along_each_dimension_is_known_as_a_grid_is_made():
     """Threads share a grid: what filled in later could be seen half filled."""
     for grid in FlightStudy(small_scene(), located("none.zarr")).grids:
-        sizes = [len(next(iter(values.values()))) for values in vars(grid)["values"]]
+        sizes = [len(next(iter(values.values()))) for values in grid.values_along()]
         assert sizes == list(grid.shape)

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from small import Said, quiet, small
 from small_flights import SCENE, small_scene
-from typed_specs import without_axes
 
 import sweep
+from sweep.spec.axes import without_fields_on_axes
 from sweep.tasks import plan as planned
 from sweep.tasks import user_code
 from sweep.tasks.plan import plan
@@ -83,7 +83,9 @@ def study(detector="fixed", estimator="peak_bin", **changes):
     mapping = given.to_yaml_mapping()
     mapping["instrument"]["processing"] |= processing
     mapping["axes"] = {"target.range": {"linear": ["500 m", "4 km"], "number": 3}} | changes
-    return type(given).from_mapping(without_axes(mapping | {"storage": {"block_points": 2}}))
+    return type(given).from_mapping(
+        without_fields_on_axes(mapping | {"storage": {"block_points": 2}})
+    )
 
 
 def runs(name, tmp_path):

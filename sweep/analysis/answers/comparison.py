@@ -11,7 +11,7 @@ import xarray as xr
 
 from sweep.analysis import labels
 from sweep.analysis.answers import provenance
-from sweep.analysis.answers.physical import STUDY_ID, parameter, si, study_of
+from sweep.analysis.answers.physical import STUDY_ID, markers, parameter, si, study_of
 from sweep.analysis.charts import LOG, Axis, Chart, Line, Panel
 from sweep.model.accuracy import clopper_pearson
 from sweep.model.accuracy import half_width as half_width_of
@@ -105,7 +105,8 @@ def _matched(ours: xr.Dataset, other: xr.Dataset) -> tuple[xr.Dataset, xr.Datase
         other = other.drop_vars([n for n, c in other.coords.items() if dim in c.dims])
         other = other.assign_coords({n: c for n, c in ours.coords.items() if c.dims == (dim,)})
     scalars = [n for n, c in other.coords.items() if not c.dims]
-    return ours.drop_vars(STUDY_ID, errors="ignore"), other.drop_vars(scalars)
+    ours = ours.drop_vars([STUDY_ID, *markers(ours)], errors="ignore")
+    return ours, other.drop_vars(scalars)
 
 
 def _at_fixed(dataset: xr.Dataset, reference: xr.Dataset) -> xr.Dataset:
