@@ -42,7 +42,6 @@ from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.effect import Effect, Parameter, Realisation, Scene, Size
 from sweep.model.effects.points import Points
 from sweep.model.ground import Cast, Ground, Plane, Slopes
-from sweep.model.look_speckle import LookSpeckle
 from sweep.model.preparation import Shots
 from sweep.model.speckle_correlation import (
     NARROW,
@@ -258,6 +257,8 @@ def _fade_in_looks(shots: Shots, ground: "GroundSpread") -> Shots:
             of_lag = np.abs(ground.correlation(shots, pair, turned)) ** 2
             shared = shared + (number - abs(lag)) * of_lag
         between[k] = np.sqrt(shared) / (strength[pair[0]] * strength[pair[1]]) ** 0.25
+    from sweep.model.look_speckle import LookSpeckle  # kernels, which specs need not
+
     speckle = LookSpeckle.of(by_lag, power, np.minimum(between, 1.0))
     return replace(shots, look_speckle=speckle)
 
