@@ -29,7 +29,6 @@ from sweep.storage.locations import (
 from sweep.storage.opening import read_attributes, study_id
 from sweep.tasks import studies
 from sweep.tasks.coverage import refuse_blind
-from sweep.tasks.doubts import warn_of_doubts
 from sweep.tasks.eyepoint_study import EyepointStudy, world_of
 from sweep.tasks.flight_study import FlightStudy
 from sweep.tasks.grid_study import GridStudy
@@ -124,6 +123,8 @@ def run(
         with working("building the scene", pool.told):
             refuse_too_large_scene(spec, pool.memory)
     if not is_command():  # which has printed them
+        from sweep.tasks.doubts import warn_of_doubts  # the model's kernels
+
         warn_of_doubts(study)
     return _into(path, spec, pool, replace=overwrite, anew=True)
 
