@@ -24,7 +24,7 @@ IDS = {
     "beam_coupling": "eb1b5768",
     "beam_divergence": "21bbe9d5",
     "cfar": "6efb925f",
-    "descent": "28e67a41 3353ee53",
+    "descent": "0d7a44dd 3353ee53",
     "estimators": "b289a368",
     "expanded_pattern": "4368acf2 96bd30ac",
     "fft_size": "3b8b27cc",
