@@ -14,6 +14,7 @@ import argparse
 import contextlib
 import sys
 import tempfile
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -27,11 +28,12 @@ EXPERIMENTS = Path(sweep.__file__).parents[1] / "experiments"
 """Those of the version that runs: each names the laws of the thesis as that version does."""
 TOLERANCE = 1e-9
 SEED = 2029
-OTHER = ("effects", "effects_error", "pfa_shot", "log10_pfa_shot")
-"""Variables with another meaning since: more effects, and alarms of all segments of a shot."""
+OTHER = ("effects", "effects_error", "pfa_shot", "log10_pfa_shot", "beamlets_error")
+"""Variables with another meaning since: more effects, alarms of all segments of a shot, and a
+number of beamlets given by hand, whose error was 0 and is nan (not checked)."""
 ALLOWED = 1e-6
 """Difference beyond which a point is counted."""
-CHANGED = ("doppler_spread", "segment_motion", "lag", "fading")
+CHANGED = ("doppler_spread", "segment_motion", "lag", "fading", "overlap")
 """Effects whose laws are others since, or that are new: left out."""
 WINDOWS = ("rectangular", "hann", "hamming", "blackman", "kaiser(8)")
 NEAR = 40.0
@@ -68,6 +70,8 @@ def experiments(points: int) -> Iterator[tuple[str, dict[str, Any]]]:
     for file in sorted(EXPERIMENTS.glob("*.yaml")):
         written = plain(EXPERIMENTS, file.stem)
         if "draws" in written or "scene" in written:  # other random numbers and footprints since
+            continue
+        if "file" not in written["instrument"]:  # an instrument that the earlier version lacks
             continue
         written["accuracy"] = {"tolerance": TOLERANCE}
         written["effects"] = written.get("effects", {}) | left_out()
@@ -134,7 +138,9 @@ def answers(name: str, written: dict[str, Any]) -> dict[str, np.ndarray]:
     """Every number that a study's store has, and that means the same in both versions."""
     with tempfile.TemporaryDirectory() as folder:
         store = Path(folder) / "frozen.zarr"
-        outcome = sweep.run(loaded(written), store=str(store), scheduler="none", progress=False)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # effects are off, and random instruments fold
+            outcome = sweep.run(loaded(written), store=str(store), scheduler="none", progress=False)
         if not outcome.complete:
             sys.exit(f"{name}: {outcome.stopped or outcome.failures}")
         return {
@@ -190,9 +196,17 @@ def main() -> int:
         np.savez_compressed(asked.file, **found)
         print(f"{len(found)} arrays, {sum(values.size for values in found.values())} numbers")
         return 0
-    frozen = dict(np.load(asked.file))
+    frozen = {
+        key: values
+        for key, values in np.load(asked.file).items()
+        if key.rpartition("/")[2] not in OTHER
+    }
     if asked.studies:
         frozen = {key: v for key, v in frozen.items() if key.partition("/")[0] in asked.studies}
+    frozen_studies = {key.partition("/")[0] for key in frozen}
+    for study in sorted(frozen_studies - {key.partition("/")[0] for key in found}):
+        print(f"{study}: not compared, as it is another study since")
+        frozen = {key: v for key, v in frozen.items() if key.partition("/")[0] != study}
     differing = compare(frozen, found)
     print(f"{len(frozen)} arrays held against {asked.file.name}: {differing} differ")
     return int(differing > 0)

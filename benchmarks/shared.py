@@ -23,9 +23,10 @@ def experiment(name: str, **changes: Any) -> Any:
 
 
 def plain(folder: Path, name: str) -> dict[str, Any]:
-    """An experiment of a check-out as plain data without figures, its instrument's path absolute.
+    """Read an experiment of a check-out as plain data, without figures.
 
-    YAML reads some keys (`on`) as true: they are as they were written.
+    The path of an instrument's file is absolute. YAML reads some keys (`on`) as true: they are as
+    they were written.
     """
     import yaml
 
@@ -39,17 +40,25 @@ def plain(folder: Path, name: str) -> dict[str, Any]:
     written = named(yaml.safe_load((folder / f"{name}.yaml").read_text()))
     instrument = written["instrument"]
     instrument = {"file": instrument} if isinstance(instrument, str) else instrument
-    written["instrument"] = instrument | {"file": str(folder / instrument["file"])}
+    if "file" in instrument:
+        instrument = instrument | {"file": str(folder / instrument["file"])}
+    written["instrument"] = instrument
     written.pop("figures", None)
     return written
 
 
 def loaded(written: dict[str, Any]) -> Any:
-    """A study from plain data."""
+    """Load a study from plain data; an axis replaces the field of its name, in any version."""
+    import contextlib
+
     import yaml
 
     import sweep
 
+    with contextlib.suppress(ImportError):  # versions that take both have no such function
+        from sweep.spec.axes import without_fields_on_axes
+
+        written = without_fields_on_axes(written)
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "study.yaml"
         file.write_text(yaml.safe_dump(written, sort_keys=False))
