@@ -378,3 +378,9 @@ NAVIGATION: dict[str, Output] = _over(("cycle", "draw"), {
     "altitude_beams": Output("1", "beams in the altitude's solution", dtype="int16"),
 })  # fmt: skip
 """Navigation from each measurement cycle and draw; only where a cycle has three shots or more."""
+
+GRID_VARIABLES = frozenset().union(
+    OUTPUTS, STRONGEST_OUTPUTS, DRAW_OUTPUTS, ERROR_OUTPUTS, ACCURACY_OUTPUTS, RUNNING_OUTPUTS,
+    SPECTRA_OUTPUTS, SIMULATED,
+)  # fmt: skip
+"""Names of all variables that the store of a grid may have."""

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from sweep.model.outputs import GRID_VARIABLES
 from sweep.spec.rules import (
     Finding,
     Findings,
@@ -326,12 +327,17 @@ def _named(axes: list[Axis]) -> list[Axis]:
 
 
 def _coordinate_name(path: str, paths: list[str]) -> str:
-    """Shortest dotted tail of a path that no other path ends with, joined by underscores."""
+    """Return the shortest dotted tail of a path that names it alone, joined by underscores.
+
+    No other path ends with it, and no variable of a store is called so.
+    """
     own, *others = (p.removesuffix(".kind").split(".") for p in (path, *set(paths) - {path}))
     for length in range(1, len(own) + 1):
-        if not any(other[-length:] == own[-length:] for other in others):
+        name = "_".join(own[-length:])
+        is_shared = any(other[-length:] == own[-length:] for other in others)
+        if not is_shared and name not in GRID_VARIABLES:
             break
-    return "_".join(own[-length:])
+    return name
 
 
 def _paths_set_twice(written: dict[Any, Any]) -> list[Finding]:
@@ -348,13 +354,16 @@ def _paths_set_twice(written: dict[Any, Any]) -> list[Finding]:
 
 
 def _name_clashes(axes: list[Axis]) -> list[Finding]:
-    """Zipped axes that bear the name of another axis's coordinate."""
+    """List zipped axes that bear the name of another axis's coordinate, or of a variable."""
     findings = []
     for axis in axes:
         others = {m.name for other in axes if other is not axis for m in other.members}
         own = {m.name for m in axis.members} if len(axis.members) > 1 else set()
         if axis.zipped and axis.name in others | own:
             findings.append(Finding(("axes", axis.name), "bears the name of a coordinate", _REMEDY))
+        elif axis.zipped and axis.name in GRID_VARIABLES:
+            rule = "bears the name of a variable of the store"
+            findings.append(Finding(("axes", axis.name), rule, _REMEDY))
     return findings
 
 

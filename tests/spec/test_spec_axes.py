@@ -224,3 +224,12 @@ def test_a_field_and_its_axis_must_agree_and_a_store_keeps_the_axis_alone():
     agreeing = {**mapping, "target": {**mapping["target"], "range": "3000 m"}}
     assert Spec.from_mapping(agreeing).to_json() == Spec.from_mapping(mapping).to_json()
     assert "range" not in Spec.from_mapping(agreeing).to_yaml_mapping()["target"]
+
+
+def test_no_coordinate_bears_the_name_of_a_variable(tmp_path):
+    beamlets = member("footprint.beamlets", [19, 37])
+    assert beamlets.name == "footprint_beamlets"
+    pieces = [{"target.range": f"{r} km", "target.grazing_angle": "45 deg"} for r in (1, 2)]
+    for name in ("pd_shot", "range_error", "effects", "n_draws", "range_bias"):
+        with pytest.raises(SpecError, match=f"axes.{name}: bears the name of a variable"):
+            Spec.from_mapping(written(axes={name: {"zip": pieces}}))
