@@ -304,3 +304,27 @@ def test_studies_whose_intervals_one_lacks_keep_their_own_variables(tmp_path, st
         np.testing.assert_array_equal(pd[name].sel(design="drawn"), alone[name])
     assert (pd.low == pd.pd).sel(design="small").all()
     assert joined.n_draws.dtype.kind == "i" and (joined.n_draws.sel(design="small") == -1).all()
+
+
+@pytest.mark.parametrize("reduction", ["max", "min"])
+def test_extremes_of_detection_and_of_misses_are_no_study(small, reduction):
+    reduced = getattr(small, reduction)("power", keep_attrs=True)
+    with pytest.raises(ValueError, match="reduce the answer instead"):
+        reduced.sweep.maximum_range(pd=0.5).compute()
+    answer = small.sweep.maximum_range(pd=0.5).unbroken
+    assert float(answer.max("power")) == float(answer.isel(power=1))
+
+
+@pytest.mark.parametrize(
+    ("answer", "kept", "missing"),
+    [
+        ("range_error", ["pd_shot", "snr_up"], "snr_doppler, snr_down, effects, range_error"),
+        ("roc", ["pd_shot"], "snr_up, pd_up"),
+        ("maximum_range", ["pd_up"], "pd_shot"),
+        ("detection_probability", ["snr_up"], "pd_shot"),
+        ("false_alarms_per_second", ["pd_shot"], "pfa_both_chirps"),
+    ],
+)
+def test_variables_left_out_are_named(small, answer, kept, missing):
+    with pytest.raises(ValueError, match=f"the dataset lacks {missing}"):
+        getattr(small[kept].sweep, answer)()

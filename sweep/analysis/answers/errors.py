@@ -9,7 +9,7 @@ import pandas
 import xarray as xr
 from scipy.interpolate import CubicSpline
 
-from sweep.analysis.answers.physical import parameter, spec_of
+from sweep.analysis.answers.physical import parameter, require_variables, spec_of
 from sweep.model import estimators, waveform
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.catalogue import NAMES
@@ -61,6 +61,8 @@ def _errors(dataset: xr.Dataset, quantity: str) -> xr.Dataset:
         kinds = {kind: dataset[f"{quantity}_{kind}"] for kind in ("bias", "rmse", "bound")}
         return xr.Dataset(kinds).assign_attrs(dataset.attrs)
     spec = spec_of(dataset)
+    snr_names = [f"snr_{name}" for name in _SEGMENTS]
+    require_variables(dataset, *snr_names, "effects", f"{quantity}_error")
     values = {n: parameter(dataset, _INSTRUMENT + p, spec) for n, p in _PARAMETERS.items()}
     values |= {
         name: parameter(dataset, f"target.{name}", spec) for name in ("range", "radial_velocity")
@@ -68,7 +70,7 @@ def _errors(dataset: xr.Dataset, quantity: str) -> xr.Dataset:
     marks = {"walks": "range_walk", "moves": "segment_motion", "late": "overlap"}
     for name, effect in marks.items():
         values[name] = (dataset["effects"] & (1 << NAMES.index(effect))) > 0
-    snr = [dataset[f"snr_{name}"] for name in _SEGMENTS]
+    snr = [dataset[name] for name in snr_names]
 
     def bound(*arrays: np.ndarray) -> np.ndarray:
         names = dict(zip(values, arrays[3:], strict=True))

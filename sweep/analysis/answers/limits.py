@@ -12,21 +12,33 @@ import xarray as xr
 from contourpy import contour_generator
 from scipy.special import ndtri
 
-from sweep.analysis.answers.physical import coordinate
+from sweep.analysis.answers.physical import coordinate, require_variables
 from sweep.analysis.answers.probability import confidence, half_width, named
 
 FOUND, NEVER, ALWAYS, NOT_COMPUTED = range(4)
 REASONS = "found never_reached never_lost not_computed"
+
+_COMPLEMENT_ERROR_MAX = 1e-6
+"""Largest difference of pd + miss from 1 that rounding and means leave."""
 
 _FARTHEST = 38.0
 """Normal deviate of the least positive float, in place of those of 0 and 1."""
 
 
 def deviate(pd: xr.DataArray, miss: xr.DataArray | None = None) -> xr.DataArray:
-    """Return normal deviate z of pd = Phi(z), from the probability of a miss above one half."""
+    """Return the normal deviate z of pd = Phi(z), from the probability of a miss above one half.
+
+    ValueError where the two probabilities do not add to 1 [when the result is computed].
+    """
     lost = 1 - pd if miss is None else miss
 
     def of(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+        if (np.abs(p + q - 1) > _COMPLEMENT_ERROR_MAX).any():
+            raise ValueError(
+                "the probabilities of detection and of a miss do not add to 1, as after a maximum "
+                "or minimum of the dataset: reduce the answer instead, "
+                "ds.sweep.maximum_range().max('power')"
+            )
         z = np.where(p < 0.5, p, q)
         ndtri(z, out=z)
         np.negative(z, out=z, where=p >= 0.5)
@@ -81,6 +93,7 @@ def limit(
         raise ValueError(f"a level of pd lies between 0 and 1, and {pd!r} does not")
     x = coordinate(dataset, along)
     name = named("pd", segment)
+    require_variables(dataset, name)
     ordered, dim = _ordered(dataset, x, from_highest)
     lost = ordered.get(named("miss", segment))
     found = _answers(ordered[name], lost, ordered[x.name], dim, pd)
@@ -228,7 +241,9 @@ def contour(
     if not 0 < pd < 1:
         raise ValueError(f"a level of pd lies between 0 and 1, and {pd!r} does not")
     across, up = coordinate(dataset, x), coordinate(dataset, y)
-    array = dataset[named("pd", segment)]
+    name = named("pd", segment)
+    require_variables(dataset, name)
+    array = dataset[name]
     if set(array.dims) != {across.name, up.name}:
         others = ", ".join(str(d) for d in array.dims if d not in (across.name, up.name))
         raise ValueError(

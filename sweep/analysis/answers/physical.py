@@ -109,6 +109,15 @@ def spec_of(dataset: xr.Dataset) -> Spec:
     return study
 
 
+def require_variables(dataset: xr.Dataset, *names: str) -> None:
+    """Refuse a dataset that lacks variables which an answer needs."""
+    if missing := [name for name in names if name not in dataset]:
+        raise ValueError(
+            f"the dataset lacks {', '.join(missing)}, which this answer needs: take all variables "
+            "that sweep.open gives, or add these to the selection"
+        )
+
+
 def quantity(written: object, *, si_unit: str, name: str) -> float:
     """SI value of ``"20 Hz"``, or of a number, which is SI already; ValueError for others."""
     if isinstance(written, int | float) and not isinstance(written, bool):

@@ -11,7 +11,13 @@ import numpy as np
 import xarray as xr
 
 from sweep.analysis import noise_only
-from sweep.analysis.answers.physical import parameter, quantity, si, spec_of
+from sweep.analysis.answers.physical import (
+    parameter,
+    quantity,
+    require_variables,
+    si,
+    spec_of,
+)
 from sweep.model import waveform
 from sweep.model.effects.catalogue import EFFECTS, names_of
 from sweep.model.looks import COMBINE, NUMBER, VOTES, Looks
@@ -52,6 +58,7 @@ def detection_probability(dataset: xr.Dataset, segment: str = "shot") -> xr.Data
         it is. Without draws pd is a closed form, and the interval has no width. The change that
         skipped effects may make is apart, in `effects_error`.
     """
+    require_variables(dataset, named("pd", segment))
     pd = dataset[named("pd", segment)]
     reach = half_width(dataset, segment)
     low, high = (pd, pd) if reach is None else ((pd - reach).clip(0, 1), (pd + reach).clip(0, 1))
@@ -164,10 +171,13 @@ def of_a_shot(dataset: xr.Dataset, leakage: bool) -> xr.DataArray:
     """Probability of a false alarm in both chirp segments; where spectra are drawn their number."""
     if "pfa_both_chirps" not in dataset:
         # whole spectra were drawn: counted false alarms of all segments, leaked signal's as well
+        drawn = spec_of(dataset).draws.whole_spectra
+        require_variables(dataset, "false_alarms" if drawn else "pfa_both_chirps")
         return dataset["false_alarms"]
     noise = dataset["pfa_both_chirps"]
     if not leakage:
         return noise
+    require_variables(dataset, "pfa_segment", "p_leakage_up", "p_leakage_down")
     segments = (dataset["p_leakage_up"], dataset["p_leakage_down"])
     return noise_only.shot_with_leakage(dataset["pfa_segment"], noise, *segments)
 
@@ -274,7 +284,7 @@ def roc(
         Too many points, a probability that is none, a study of whole spectra, or one whose looks
         vary.
     """
-    if "log10_pfa_bin" not in dataset:
+    if spec_of(dataset).draws.whole_spectra:
         raise ValueError(
             "a study that draws whole spectra has no closed form: put the detector's threshold or "
             "design pfa on an axis, and read pd over pfa_bin"
@@ -282,6 +292,9 @@ def roc(
     chances = np.logspace(-16, -1, 61) if pfa is None else np.atleast_1d(np.asarray(pfa, float))
     if not ((chances > 0) & (chances < 1)).all():
         raise ValueError("probabilities of a false alarm lie between 0 and 1")
+    needed = [f"{kind}_{s}" for s in _SEGMENTS[segment] for kind in ("snr", "pd")]
+    needed += [named("pd", segment), "log10_pfa_bin", "effects"]
+    require_variables(dataset, *needed)
     number = dataset[named("pd", segment)].size
     if number > MOST_POINTS:
         raise ValueError(
@@ -292,8 +305,6 @@ def roc(
         parameter(dataset, path, spec_of(dataset))
         for path in (waveform.SHOT_DETECTION, waveform.PEAKS)
     )
-    needed = [f"{kind}_{s}" for s in _SEGMENTS[segment] for kind in ("snr", "pd")]
-    needed += [named("pd", segment), "log10_pfa_bin", "effects"]
     dataset = dataset[list(dict.fromkeys(needed))].compute()
     level = xr.DataArray(looks.level(np.log(chances)), dims=["pfa_bin"])
     pd, exact = _closed(dataset, segment, level, looks)
