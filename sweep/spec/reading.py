@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -80,8 +80,8 @@ class Document:
     """A spec as written: values, their places and what is already known to be wrong."""
 
     value: dict[str, Any]
-    places: dict[Location, tuple[str, int]] = field(default_factory=dict)
-    """File and line of each location."""
+    places: dict[Location, tuple[str, int | None]] = field(default_factory=dict)
+    """File and line of each location; no file and no line if it was not read from one."""
     findings: list[Finding] = field(default_factory=list)
     """Mistakes found on reading."""
     file: str = ""
@@ -90,6 +90,11 @@ class Document:
     """YAML's nodes read, each as often as an alias repeats it."""
     open_nodes: list[yaml.Node] = field(default_factory=list)
     """Mappings being read, each within the one before."""
+
+    @classmethod
+    def from_plain(cls, value: dict[str, Any]) -> Document:
+        """Make a document of plain data, which is in no file."""
+        return cls(value, dict.fromkeys(_iter_locations(value, ()), ("", None)))
 
     def read(self, node: yaml.Node, location: Location) -> Any:
         """Value of one of YAML's nodes, whose places and mistakes are noted."""
@@ -210,6 +215,17 @@ class Document:
         """Return findings as they stand in the file, each once; those in other files come last."""
         mistakes = dict.fromkeys(self.mistake(finding) for finding in findings)
         return sorted(mistakes, key=lambda m: (m.file != self.file, m.file, m.line or 0))
+
+
+def _iter_locations(value: Any, location: Location) -> Iterator[Location]:
+    """Yield the locations of a value in plain data and of all that is in it."""
+    yield location
+    if isinstance(value, dict):
+        for key, inside in value.items():
+            yield from _iter_locations(inside, (*location, key))
+    elif isinstance(value, list):
+        for i, inside in enumerate(value):
+            yield from _iter_locations(inside, (*location, i))
 
 
 def _scalar(node: yaml.Node) -> Any:

@@ -144,7 +144,8 @@ class Study(Part):
         """
         if not isinstance(mapping, Mapping):
             raise SpecError([Mistake("", "must be a mapping", shown(mapping))])
-        return cls.from_document(Document(without_extensions(plain(mapping))), Path(base))
+        document = Document.from_plain(without_extensions(plain(mapping)))
+        return cls.from_document(document, Path(base))
 
     @classmethod
     def from_stored(cls, text: str, base: Path | str | None = None) -> Self:

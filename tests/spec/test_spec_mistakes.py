@@ -164,7 +164,10 @@ def test_what_a_field_sets_off_in_the_library_s_instrument_is_told_at_the_field(
 def test_in_plain_data_no_file_of_the_library_is_told():
     mapping = written({"instrument": {"like": "rogers_2021", "processing": {"tnr": -1}}})
     mapping["target"]["range"] = "900 km"
-    assert {(mistake.file, mistake.line) for mistake in mistakes_of(mapping)} == {("", None)}
+    mistakes = mistakes_of(mapping)
+    assert {(mistake.file, mistake.line) for mistake in mistakes} == {("", None)}
+    (threshold,) = (mistake for mistake in mistakes if mistake.path.endswith("tnr"))
+    assert threshold.value == "-1" and "rogers_2021" not in str(threshold)
 
 
 def test_a_filter_before_the_adc_shapes_noise_that_is_to_be_white():
