@@ -18,6 +18,7 @@ from sweep.analysis.selection import GRAZING_ANGLE
 from sweep.analysis.tables import Block, Page
 from sweep.model import shot as model
 from sweep.model import waveform, window
+from sweep.model.beam import DIVERGENCE, WAIST
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.catalogue import CORE, EFFECTS
 from sweep.model.eyepoints import Eyepoints
@@ -25,7 +26,8 @@ from sweep.model.returns import beamlet_lines
 from sweep.model.segments import whole_spectrum
 from sweep.model.shot import prepare
 from sweep.model.threshold import WAYS
-from sweep.spec import Spec
+from sweep.spec import Spec, SpecError
+from sweep.spec.rules import Mistake
 from sweep.spec.sections import parameter_rules
 from sweep.units import percent
 
@@ -439,8 +441,7 @@ MOST_SHOTS = 3
 _TOLD = (
     "target.range", "target.grazing_angle", "target.radial_velocity", "target.reflectance",
     "target.reflectance_law", "instrument.laser.power", "instrument.telescope.aperture",
-    "instrument.laser.beam_divergence", "instrument.processing.fft_size",
-    "instrument.processing.window", *WAYS,
+    DIVERGENCE, WAIST, "instrument.processing.fft_size", "instrument.processing.window", *WAYS,
 )  # fmt: skip
 
 
@@ -480,6 +481,13 @@ def chosen(spec: Spec, at: Mapping[str, str]) -> list[tuple[str, Parameters]]:
     """Parameters of the shots to draw, each with its label."""
     members = [member for axis in spec.axes for member in axis.members]
     paths, rules = {m.name: m.path for m in members}, parameter_rules()
+    names_by_path: dict[str, str] = {}
+    for name in at:
+        path = paths.get(name, name)
+        if path in names_by_path:
+            rule = f"is given twice, as {names_by_path[path]} and as {name}"
+            raise SpecError([Mistake(path, rule, suggestion="keep one of them")])
+        names_by_path[path] = name
     several = not at and len(spec.axes) == 1 and spec.axes[0].size <= MOST_SHOTS
     found: list[tuple[str, Parameters]] = []
     for i in range(spec.axes[0].size if several else 1):
@@ -498,6 +506,8 @@ def _told(shot: Shot, paths: tuple[str, ...]) -> list[tuple[str, str]]:
     for path in paths:
         value = shot.parameters.get(path)
         if value is None:  # the threshold is set otherwise
+            continue
+        if path in (DIVERGENCE, WAIST) and value == 0:  # the beam is stated by the other one
             continue
         if isinstance(value, str):
             text = value

@@ -180,3 +180,16 @@ def test_direct_detection_has_no_doppler_segment(tmp_path):
     spec = study({}, instrument=INSTRUMENT | {"receiver": receiver}, target=TARGET)
     text, _ = shot_figure.report(spec, {"range": "20 m"}, tmp_path)
     assert "Doppler" not in text and "thermal" in text
+
+
+def test_a_parameter_set_by_name_and_by_path_is_refused():
+    with pytest.raises(SpecError, match="given twice, as range and as target.range"):
+        shot_figure.chosen(study(SURFACE), {"range": "3 km", "target.range": "2 km"})
+
+
+def test_a_beam_stated_by_its_waist_shows_the_waist(tmp_path):
+    instrument = study(SURFACE).to_yaml_mapping()["instrument"]
+    laser = {k: v for k, v in instrument["laser"].items() if k != "beam_divergence"}
+    spec = study(SURFACE, instrument=instrument | {"laser": laser | {"beam_waist": "20 mm"}})
+    text, _ = shot_figure.report(spec, {}, tmp_path)
+    assert "beam waist" in text and "beam divergence" not in text
