@@ -160,6 +160,9 @@ def _without_unit(value: Fraction, unit: str) -> str:
         if powers == amplitudes:
             return f"write {powers}"
         return f"write {powers} for a ratio of powers, {amplitudes} for one of amplitudes"
+    if unit in _PREFIXED["rad"].split():
+        angle = read_unit(unit, si_unit="rad", example="1 deg").to_si(value)
+        return f"write {math.tan(angle):.4g}, the tangent of that angle, if a slope is meant"
     if quotient := re.fullmatch(r"/\s*(\d+)", unit):
         divisor = int(quotient[1])
         return f"write {_show(value / divisor)}" if divisor else ""

@@ -231,3 +231,11 @@ def test_shares_and_numbers_of_nothing_are_none():
     assert units.percent(0.256, ".1f") == "25.6 %"
     assert units.percent(math.nan) == units.number_text(math.nan) == "none"
     assert units.number_text(0.5) == "0.5"
+
+
+@pytest.mark.parametrize(
+    ("written", "slope"), [("10 deg", "0.1763"), ("10°", "0.1763"), ("200 mrad", "0.2027")]
+)
+def test_an_angle_where_a_slope_is_meant_is_told_as_its_tangent(written, slope):
+    with pytest.raises(QuantityError, match=f"write {slope}, the tangent of that angle"):
+        read_number(written)

@@ -183,7 +183,7 @@ def test_direct_detection_has_no_doppler_segment(tmp_path):
 
 
 def test_a_parameter_set_by_name_and_by_path_is_refused():
-    with pytest.raises(SpecError, match="given twice, as range and as target.range"):
+    with pytest.raises(SpecError, match=r"given twice, as range and as target\.range"):
         shot_figure.chosen(study(SURFACE), {"range": "3 km", "target.range": "2 km"})
 
 
