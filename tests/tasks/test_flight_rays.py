@@ -1,6 +1,7 @@
 """Flights whose tolerance says how many rays they cast: their stores, and what they leave."""
 
 import json
+import math
 from functools import partial
 
 import numpy as np
@@ -10,16 +11,17 @@ from click.testing import CliRunner
 from small import quiet, tree
 from small_flights import SCENE
 
+import sweep
 from sweep.analysis.answers.comparison import compare_flights as compare
 from sweep.analysis.opening import open_scene
 from sweep.cli import main
 from sweep.model.accuracy import Accuracy
 from sweep.model.resolution import rays_needed
 from sweep.report.writing import accuracy
-from sweep.spec import SceneSpec
+from sweep.spec import SceneSpec, Spec
 from sweep.storage.locations import eyepoints_path
 from sweep.tasks import eyepoint_study
-from sweep.tasks.driver import extend
+from sweep.tasks.driver import extend, run
 from sweep.tasks.progress import StoreError
 from sweep.tasks.summary import rays_table
 
@@ -209,3 +211,40 @@ def test_a_report_says_so_too(flown):
     assert f"More beamlets would change one by {worst:.2g} at the most." in told
     by_hand = " ".join(accuracy(shots(flown["by hand"]), facets(1e-4, 8017)))
     assert "What more beamlets would change is not checked." in by_hand
+
+
+def test_a_flight_has_the_probabilities_of_the_grid_where_footprints_are_wide(tmp_path):
+    """Rays that end at three deviations of the beam lose half a per cent of a wide footprint's bin.
+
+    The grid integrates over the whole Gaussian. At 5 degrees grazing lines spread over 1.5 bins.
+    """
+    instrument = {
+        "like": "lander_ndl", "laser": {"power": "0.1 W"}, "processing": {"fft_size": "2^18"},
+    }  # fmt: skip
+    common = {"title": "Wide", "instrument": instrument, "footprint": {"speckle": "none"}}
+    distance, sine, cosine = 1600.0, math.sin(math.radians(5)), math.cos(math.radians(5))
+    height = distance * sine
+    grid = Spec.from_mapping(common | {
+        "target": {"reflectance": 0.1, "radial_velocity": "50 m/s", "grazing_angle": "5 deg",
+                   "range": f"{distance} m"},
+    })  # fmt: skip
+    flight = SceneSpec.from_mapping(common | {
+        "scene": {"objects": {"ground": {"kind": "plane", "size": "50 km", "reflectance": 0.1}}},
+        "platform": {
+            "path": {"kind": "straight", "from": ["0 m", "0 m", f"{height!r} m"],
+                     "to": [f"{10 * cosine!r} m", "0 m", f"{height - 10 * sine!r} m"],
+                     "initial_speed": "50 m/s"},
+            "attitude": {"kind": "nadir"},
+        },
+        "scanners": {"beam": {"kind": "fixed", "beams": [[cosine, 0, -sine]],
+                              "rate": "50 Hz"}},
+        "draws": {"number": 1},
+    })  # fmt: skip
+    for study, name in ((grid, "grid"), (flight, "flight")):
+        run(study, store=tmp_path / name, scheduler="none", progress=False)
+    point = sweep.open(tmp_path / "grid")
+    shot = open_scene(tmp_path / "flight")["beam"].to_dataset().isel(shot=0)
+    for variable in ("pd_up", "pd_doppler", "pd_down"):
+        told = float(shot.beamlets_error) + float(shot.effects_error)
+        assert abs(float(shot[variable]) - float(point[variable])) < min(told, 1e-3)
+    assert float(shot.snr_up) == pytest.approx(float(point.snr_up), rel=1e-4)
