@@ -55,6 +55,31 @@ class DetectionRule(NamedTuple):
     """(bins,): pseudo-variance of the noise over its power, by bins from DC or Nyquist."""
     modes: ModeTable
     """Modes of echoes that any bin detects."""
+    correlation: float = 0.0
+    """Correlation of the noise of neighbours."""
+
+
+class PedestalShape(NamedTuple):
+    """Shape of the pedestal of phase noise about the lines of an echo.
+
+    Of light that is mixed with itself after a delay tau, whose phase has a line width dnu: with
+    Gamma = 2 pi dnu, at a frequency omega from the line
+
+        [1 - e^(-Gamma tau) (cos omega tau + Gamma / omega sin omega tau)] / (1 + omega^2 / Gamma^2)
+
+    over its value under the line [Richter et al., IEEE J. Quantum Electron. 22, 2070, 1986].
+    """
+
+    reach: float
+    """Bins on either side of lines that the echo has by its pedestal: up to the last in which this
+    has at least the power of the noise. 0 where these are no more than it has by its lines."""
+    width: float
+    """Line width dnu of the laser [bins of fs/N]."""
+    delay: float
+    """Delay tau, or the record's duration if that is shorter [N/fs]."""
+
+
+NO_PEDESTAL = PedestalShape(0.0, 0.0, 0.0)
 
 
 class BinLevels(NamedTuple):
@@ -67,6 +92,7 @@ class BinLevels(NamedTuple):
     """Noise per quadrature without the pedestal."""
     beside: float
     """Noise per quadrature in bins beside the lines, with all of the pedestal."""
+    pedestal: PedestalShape = NO_PEDESTAL
 
 
 class BinSpeckle(NamedTuple):
@@ -103,8 +129,68 @@ class SpeckleTable(NamedTuple):
 
 @njit(cache=True, error_model="numpy")
 def levels_of(table, i):
-    """:class:`BinLevels` of a point, from a table (4, n) of them."""
-    return BinLevels(table[0, i], table[1, i], table[2, i], table[3, i])
+    """:class:`BinLevels` of a point, from a table (7, n) of them."""
+    shape = PedestalShape(table[4, i], table[5, i], table[6, i])
+    return BinLevels(table[0, i], table[1, i], table[2, i], table[3, i], shape)
+
+
+@njit(cache=True, error_model="numpy")
+def pedestal_density(shape, bins):
+    """Power of a pedestal so many bins from its line over that under the line."""
+    gamma, delay = 2.0 * math.pi * shape.width, shape.delay
+    lost, omega = math.exp(-gamma * delay), 2.0 * math.pi * bins
+    if not bins > 0.0 or not gamma * delay > 1e-5:
+        return 1.0
+    ripple = math.cos(omega * delay) + gamma / omega * math.sin(omega * delay)
+    under_line = 1.0 - lost * (1.0 + gamma * delay)
+    return (1.0 - lost * ripple) / (under_line * (1.0 + (omega / gamma) ** 2))
+
+
+@njit(cache=True, error_model="numpy")
+def pedestal_reaches(ratio, width, delay, most):
+    """Last bin beside a line in which its pedestal has at least the power of the noise, (n,).
+
+    ``ratio`` (n,) is the power of the pedestal under the line over that of the noise; ``width`` and
+    ``delay`` (n,) are those of :class:`PedestalShape`. No result exceeds ``most``.
+    """
+    reaches = np.zeros(ratio.size)
+    for i in range(ratio.size):
+        gamma = 2.0 * math.pi * width[i]
+        if not ratio[i] >= 1.0 or not gamma * delay[i] > 1e-5:
+            continue
+        shape = PedestalShape(0.0, width[i], delay[i])
+        lost = math.exp(-gamma * delay[i])
+        # From omega = Gamma on the ripple is at most sqrt(2).
+        peak = ratio[i] * (1.0 + 1.5 * lost) / (1.0 - lost * (1.0 + gamma * delay[i]))
+        k = math.ceil(min(width[i] * max(math.sqrt(peak), 1.0), float(most)))
+        while k > 0 and ratio[i] * pedestal_density(shape, float(k)) < 1.0:
+            k -= 1
+        reaches[i] = k
+    return reaches
+
+
+@njit(cache=True, error_model="numpy")
+def pedestal_of_bins(magnitude, echo, levels, pedestal):
+    """Put the power of the pedestal in bins of an echo, over that of the noise, to ``pedestal``.
+
+    Bins of half the largest magnitude hold lines; of the pedestal in others all counts as noise.
+    """
+    largest, noise = 0.0, levels.quiet * levels.quiet
+    for i in range(magnitude.size):
+        largest = max(largest, magnitude[i] if echo[i] else 0.0)
+    under_lines = levels.line * levels.line / noise - 1.0
+    beside = levels.beside * levels.beside / noise - 1.0
+    apart = float(magnitude.size)
+    for i in range(magnitude.size):
+        apart = 0.0 if echo[i] and magnitude[i] >= 0.5 * largest else apart + 1.0
+        pedestal[i] = apart
+    for i in range(magnitude.size - 1, -1, -1):
+        apart = min(pedestal[i], apart + 1.0)
+        pedestal[i] = under_lines
+        if apart > 0.0:
+            pedestal[i] = beside
+            if levels.pedestal.reach > 0.0:
+                pedestal[i] *= pedestal_density(levels.pedestal, apart)
 
 
 @njit(cache=True, error_model="numpy")
@@ -262,6 +348,8 @@ def found_pair(magnitude, echo, peak, low, rule, levels, speckle):
             share /= signal + noise
         return hoyt_pair(signal + noise, share, level)
     if rule.beside > 0:
+        if levels.pedestal.reach > 0.0:
+            return _any_on_pedestal(magnitude, echo, low, rule, levels)
         return any_pair(magnitude, echo, low, rule.ends, levels, rule.pairs)
     real = is_end(low + peak, rule.ends)
     return crossing_pair(magnitude[peak] / deviation, level / deviation, real)
@@ -307,6 +395,19 @@ def any_pair(magnitude, echo, low, ends, levels, pairs):
         missed *= rest
         before, t_before = stays, t
     return (found if found < 0.5 else 1.0 - missed), missed
+
+
+@njit(cache=True, error_model="numpy")
+def _any_on_pedestal(magnitude, echo, low, rule, levels):
+    """:func:`any_pair` of an echo whose pedestal detects too."""
+    bins = magnitude.size
+    pedestal, steady = np.empty(bins), np.empty((4, bins))
+    pedestal_of_bins(magnitude, echo, levels, pedestal)
+    for k in range(bins):
+        deviation = levels.quiet * math.sqrt(1.0 + pedestal[k])
+        steady[0, k], steady[1, k] = magnitude[k] / deviation, levels.threshold / deviation
+        steady[2, k], steady[3, k] = rule.correlation, 0.0
+    return _any_steady(steady, 1.0, echo, low, rule.ends)
 
 
 @njit(cache=True, error_model="numpy")
@@ -420,12 +521,14 @@ def _stretch_faded(magnitude, echo, bounds, low, rule, levels, speckle):
     # that fades with the mode, as a power.
     steady, bins = np.empty((6, end - begin)), end - begin
     share_before = 0.0
+    pedestals = np.empty(bins)
+    pedestal_of_bins(magnitude[begin:end], echo[begin:end], levels, pedestals)
     for k in range(bins):
         i = begin + k
-        power = magnitude[i] * magnitude[i]
-        share = interpolated(modes.share, at, i - nearest)
-        deviation = levels.line if magnitude[i] >= 0.5 * magnitude[nearest] else levels.beside
-        pedestal = 2.0 * deviation * deviation - noise
+        power, pedestal = magnitude[i] * magnitude[i], noise * pedestals[k]
+        # A pedestal has the light of all lines, as the bins amid them.
+        is_near = abs(i - nearest) <= rule.beside or not levels.pedestal.reach > 0.0
+        share = interpolated(modes.share, at, i - nearest if is_near else 0)
         other = (1.0 - share) * (power + pedestal) + noise
         scale = math.sqrt(2.0 / other)
         steady[3, k] = share * pedestal / other
@@ -610,7 +713,7 @@ def detect_rows(magnitude, first, bins, rule, levels, speckle, out):
 
     Its rows are those of :data:`sweep.model.segments.SEGMENT_FIELDS`; no leakage. ``bins`` are the
     last bin of the spectrum and the bin width [Hz]; bins outside 0..N/2 are passed over.
-    ``levels`` (4, m) are those of :class:`BinLevels`; ``speckle`` is a :class:`SpeckleTable`,
+    ``levels`` (7, m) are those of :class:`BinLevels`; ``speckle`` is a :class:`SpeckleTable`,
     (1, m).
     """
     half, width = bins
@@ -619,7 +722,8 @@ def detect_rows(magnitude, first, bins, rule, levels, speckle, out):
         low = max(-first[i], 0)
         high = min(half + 1 - first[i], magnitude.shape[1])
         run = magnitude[i, low:high]
-        peak, exempted = mark(run, run.size, levels[1, i], exempt, rule.beside)
+        beside = max(rule.beside, int(levels[4, i]))
+        peak, exempted = mark(run, run.size, levels[1, i], exempt, beside)
         found, missed = found_pair(
             run, exempt[: run.size], peak, first[i] + low, rule, levels_of(levels, i),
             speckle_of(speckle, 0, i),

@@ -20,6 +20,7 @@ import numpy as np
 from sweep.kernels import njit
 from sweep.model import philox
 from sweep.model.alarms import TAPS, noise_filter
+from sweep.model.detection import levels_of, pedestal_of_bins
 from sweep.model.hoyt import bin_share
 from sweep.model.marcum import at_least_one
 from sweep.model.philox import (
@@ -64,7 +65,8 @@ def count_by_chance(
     none = False, *rule, np.isfinite(outputs.get(BOTH, np.full(size, np.nan)))
     nothing = Seen.nothing(size), np.empty((0, size))
     circular = np.zeros((3, size), np.int64), np.zeros((1, 0)), 0
-    _count(rows, ends, np.zeros((2, size)), chances, none, *nothing, circular, counts)
+    levels = np.zeros((2, size)), np.zeros((7, size))
+    _count(rows, ends, *levels, chances, none, *nothing, circular, counts)
 
 
 def count_in_noise(rows: Rows, ends: np.ndarray, shots: Shots, counts: np.ndarray) -> None:
@@ -79,6 +81,7 @@ def count_in_noise(rows: Rows, ends: np.ndarray, shots: Shots, counts: np.ndarra
         rule = echo_filter(shots, seen)
         own = (
             levels[:, part].copy(),
+            shots.bin_levels[:, part].copy(),
             chances,
             (True, *rule, np.full(part.size, shots.any_two)),
             seen,
@@ -233,14 +236,16 @@ def seen_spectra(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _count(rows, ends, levels, chances, how, seen, mixing, quadratures, counts):
+def _count(rows, ends, levels, of_bins, chances, how, seen, mixing, quadratures, counts):
     """Add the draws of each row to the counts.
 
     ``how``: whether in noise; filter of an echo's noise, as of :func:`echo_filter`; whether any
     two segments detect a shot. ``levels`` (2,
-    m): :func:`noise_levels`. ``chances`` (3, 3, m): those of a false alarm in bins that are not
-    looked at one by one, and, of no meaning in noise, of a detection without and with one in the up
-    segment. ``mixing`` (6, m): :meth:`sweep.model.detection.Fading.mixing`, or nothing.
+    m): :func:`noise_levels`; ``of_bins`` (7, m) the levels of bins of which any detects
+    (:class:`sweep.model.detection.BinLevels`). ``chances`` (3, 3, m): those of a false alarm in
+    bins that are not looked at one by one, and, of no meaning in noise, of a detection without and
+    with one in the up segment. ``mixing`` (6, m): :meth:`sweep.model.detection.Fading.mixing`, or
+    nothing.
     ``quadratures``: rows (3, m) of the pseudo-variances near DC and Nyquist
     (:class:`sweep.model.quadratures.SignalQuadratures`), these, and N/2.
     """
@@ -270,7 +275,7 @@ def _count(rows, ends, levels, chances, how, seen, mixing, quadratures, counts):
                 shares = quadratures[1][row, : (quadratures[1].shape[1] if row > 0 else 0)]
                 if noisy and weights.size > 0:
                     _cross_any(
-                        address, (j, s), seen, (weights, start, real_ends), levels[:, j],
+                        address, (j, s), seen, (weights, start, real_ends), levels_of(of_bins, j),
                         (factors[s], amplitudes[s], shares, quadratures[2]), noise_of_bins, hits[s],
                     )  # fmt: skip
                 elif noisy:
@@ -348,8 +353,9 @@ def _happen(address, stream, chances, given, words, found):
 def _cross_any(address, at, seen, rule, levels, fading, room, found):
     """Mark the draws in which any bin of an echo, with its noise, reaches the threshold.
 
-    ``fading``: factors on the magnitudes (draws,), amplitudes (2, draws); pseudo-variances of bins
-    near DC or Nyquist, or nothing; N/2.
+    ``levels`` are the :class:`sweep.model.detection.BinLevels` of the point. ``fading``: factors on
+    the magnitudes (draws,), amplitudes (2, draws); pseudo-variances of bins near DC or Nyquist, or
+    nothing; N/2. A pedestal fades as the lines do.
     """
     begin, count = seen.start[at], seen.bins[at]
     ratios, echo = seen.ratios[begin : begin + count], seen.echo[begin : begin + count]
@@ -360,13 +366,17 @@ def _cross_any(address, at, seen, rule, levels, fading, room, found):
         first += 1
     while not echo[last]:
         last -= 1
-    threshold, under_lines = levels
+    threshold = levels.threshold / levels.quiet
+    pedestal = np.zeros(count)
+    if levels.beside > levels.quiet or levels.line > levels.quiet:
+        pedestal_of_bins(ratios, echo, levels, pedestal)
     factors, amplitudes, shares, half = fading
     for d in range(address[3]):
         draw = address[0], address[1], address[2] + d, STREAM_NOISE[at[1]]
         draw_noise(draw, ECHO, seen.low[at] + first, last - first + 1, rule, room)
         for i in range(first, last + 1):
-            re, im = under_lines * room[0, i - first], under_lines * room[1, i - first]
+            deviation = math.sqrt(1.0 + pedestal[i] * factors[d] * factors[d])
+            re, im = deviation * room[0, i - first], deviation * room[1, i - first]
             if shares.size > 0:
                 share = bin_share(seen.low[at] + i, half, shares)
                 re += ratios[i] * math.sqrt(1.0 + share) * amplitudes[0, d]

@@ -105,8 +105,9 @@ def _find_groups(part, runs, of_bins, levels, how, bins, neighbours, pd):
             found = _list_groups(magnitude, exempt, peak[s, j], level, bins[:, i, s])
             for g in range(found):
                 k = bins[BIN, i, s, g]
+                beside = max(rule.beside, int(levels[4, i]))
                 first, last = echo_of(
-                    magnitude, bins[FIRST, i, s, g], bins[LAST, i, s, g], level, rule.beside
+                    magnitude, bins[FIRST, i, s, g], bins[LAST, i, s, g], level, beside
                 )
                 echo = np.ones(last - first + 1, np.bool_)
                 pd[i, s, g] = found_pair(

@@ -105,6 +105,8 @@ def inspect(origin, lines, noise, table, form, sizes, tangent, room, exempt, ser
     dark = 1.0 / math.sqrt(loudest)
     bright = sigma * dark, level * dark, tolerance
     half, beside, afar = sizes[0] // 2, sizes[6], total
+    if sizes[8] > beside // 2:  # an echo whose pedestal reaches far
+        beside += sizes[8]
     place = seen(origin, lowest, highest, sizes)
     mirror = max(min(place[0], half - place[1]), 0.0) if sizes[7] == IMAGED else math.inf
     least = crossing = max(stays_below(bright[1], total, place, form, sizes), float(beside))

@@ -53,7 +53,7 @@ _X, _EVEN, _ODD, _RE, _IM, _LANES = (BLOCK_SIZE * k for k in range(6))
 LEAST_WIDTH = 6 * BLOCK_SIZE
 """Of scratch."""
 
-COMMON = 18
+COMMON = 21
 """Numbers of a point that its segments share; of each segment OWN follow."""
 
 OWN = 6

@@ -68,8 +68,8 @@ from sweep.model.speckle_lines import (
     directions,
     drawn_speckle,
     line_fan,
-    place_errors,
 )
+from sweep.model.wander import resolved_wander
 from sweep.model.window import last_part
 
 VALUES = ("pfa_bin", "false_alarms", "range", "radial_velocity", "range_2", "radial_velocity_2")
@@ -140,7 +140,8 @@ def signal_of(
     if not shots.complex_record:  # and as much at negative frequencies
         total = 2 * total - magnitude[0] ** 2 - magnitude[-1] ** 2
     power = total / (shots.fft_size * max(float(shots.echo_energy(segment)[i]), 1e-300))
-    first, end = int(high[0]) - beside, int(high[-1]) + beside
+    aside = max(beside, int(shots.bin_levels[4, i]))  # where its pedestal is above the noise
+    first, end = int(high[0]) - aside, int(high[-1]) + aside
     if not shots.complex_record:
         first, end = max(first, least), min(end, last - least)
     begun = 0 if shots.first_sample is None else int(shots.first_sample[segment, i])
@@ -576,15 +577,7 @@ def _wander(view: View, found: Sequence[Found], detected: np.ndarray) -> np.ndar
     delta = np.clip([each.delta for each in found], -1.0, 1.0).T
     share = np.broadcast_to(signal / mean, power.shape)
     peaks = Peaks(delta, directions(shots)[point], power, share)
-    common = place_errors(shots.speckle_lines.of(point), peaks, shots)
-    used = np.array([True, shots.slopes != waveform.SIGNS or shots.any_two, True])
-    carriers, rates = (values[:, point] for values in shots.beats_by_motion)
-    given = {"weights": 1.0 * (detected & used[:, None]), "carriers": carriers, "rates": rates}
-    width = view.setting.sample_rate / view.setting.fft_size
-    gains = np.array([
-        waveform.response(unit[:, None] + np.zeros(m), **given) for unit in width * np.eye(3)
-    ])  # fmt: skip
-    return np.einsum("iam,mij,jam->am", gains, common, gains)
+    return resolved_wander(shots, point, peaks, detected)
 
 
 def resolved_bound(view: View, used: Sequence[bool] | np.ndarray | None = None) -> Deviation:

@@ -348,10 +348,32 @@ class Shots:
 
     @cached_property
     def bin_levels(self) -> np.ndarray:
-        """Levels of a point's bins, (4, n): :class:`sweep.model.detection.BinLevels`."""
+        """Levels of a point's bins, (7, n): :class:`sweep.model.detection.BinLevels`.
+
+        The last three rows are those of its :class:`sweep.model.detection.PedestalShape`.
+        """
         beside = self._deviation(self.noise_variance + self.pedestal_beside)
         levels = self.line_deviation, self.threshold, self.bin_deviation, beside
-        return in_rows(levels, (self.size,))
+        return in_rows((*levels, *self._pedestal_shape), (self.size,))
+
+    @property
+    def _pedestal_shape(self) -> np.ndarray:
+        """Shape of the pedestal of phase noise where bins beside the lines detect by it, (3, n)."""
+        shape = np.zeros((3, self.size))
+        if self.detection == "peak_bin" or self.looks.several or not np.any(self.laser_width):
+            return shape
+        from sweep.model.detection import pedestal_reaches
+
+        width = self.laser_width * self.fft_size / self.sample_rate
+        delay = np.minimum(2 * self.range / SPEED_OF_LIGHT, self.record_duration)
+        delay = delay * self.sample_rate / self.fft_size
+        ratio = self.pedestal_beside / self.noise_variance
+        ratio, *shape[1:] = (np.broadcast_to(v, self.size) for v in (ratio, width, delay))
+        reach = pedestal_reaches(
+            np.ascontiguousarray(ratio), shape[1], shape[2], self.fft_size // 2
+        )
+        shape[0] = np.where(reach > self.echo_rule.beside, reach, 0.0)
+        return shape
 
     def snr(self, magnitude: np.ndarray) -> np.ndarray:
         """Mean power of a bin's signal over the mean power of its noise, (..., n).
@@ -583,7 +605,7 @@ class Shots:
             self.amplifier_bandwidth, self.sample_rate, self.acquisition_delay, self.carriers[0],
             self.carriers[2], self.bin_deviation, self.threshold, self.floor,
             self.line_deviation, self.leakage_tolerance, self.line_tolerance, self.image_gain,
-            self.bin_levels[3],
+            *self.bin_levels[3:],
         )  # fmt: skip
         further = (
             x
@@ -625,10 +647,14 @@ class Shots:
                 noise = noise_quadratures(self.window, self.fft_size)
         pairs = alarms.pair_nodes(self.correlation)
         if self.detection == "peak_bin":
-            return DetectionRule(self.real_ends, 0, pairs, fades, half, noise, NO_MODES)
+            return DetectionRule(
+                self.real_ends, 0, pairs, fades, half, noise, NO_MODES, self.correlation
+            )
         lobe = main_lobe(self.window) * self.fft_size / self.window.length
         modes = NO_MODES if self.fading is None else mode_table(self.window, self.fft_size)
-        return DetectionRule(self.real_ends, math.ceil(lobe), pairs, fades, half, noise, modes)
+        return DetectionRule(
+            self.real_ends, math.ceil(lobe), pairs, fades, half, noise, modes, self.correlation
+        )
 
     @cached_property
     def speckle_table(self) -> "SpeckleTable":

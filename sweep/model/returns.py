@@ -48,7 +48,7 @@ import numpy as np
 from sweep.kernels import njit
 from sweep.model import philox, waveform
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.detection import echo_of, is_end
+from sweep.model.detection import echo_of, is_end, levels_of, pedestal_of_bins
 from sweep.model.draws import (
     ECHO,
     Seen,
@@ -258,6 +258,8 @@ class Known(NamedTuple):
     """(n, beamlets)"""
     levels: np.ndarray
     """(n, 3): sigma [V]; over it, the threshold and the noise of bins that hold lines."""
+    of_bins: np.ndarray
+    """(n, 7): of :class:`sweep.model.detection.BinLevels` [V]."""
     alarm: np.ndarray
     """(n, 3): probability of a false alarm by noise alone."""
     third: np.ndarray
@@ -335,6 +337,7 @@ def known_of(shots: Shots, found: Groups, motion: OwnMotion | None = None) -> Kn
     return Known(
         bins, found.pd, found.neighbours, spread, lines, amplitude,
         np.stack([shots.bin_deviation, *noise_levels(shots)], axis=1),
+        np.ascontiguousarray(shots.bin_levels.T),
         np.zeros(found.leakage.shape),
         np.stack([np.broadcast_to(part, shots.size) for part in _third(shots, motion)], axis=1),
         np.ascontiguousarray(np.moveaxis(beside, 0, 1)), _searched(shots),
@@ -793,7 +796,8 @@ def speckled_bins(i, how, known, seen):
                 low, start = seen.low[i, s], seen.start[i, s]
                 run = seen.ratios[start : start + seen.bins[i, s]]
                 ends = known.bins[i, s, FIRST, g] - low, known.bins[i, s, LAST, g] - low
-                begin, end = echo_of(run, ends[0], ends[1], known.levels[i, 1], how.beside)
+                beside = max(how.beside, int(known.of_bins[i, 4]))
+                begin, end = echo_of(run, ends[0], ends[1], known.levels[i, 1], beside)
                 first[g, s], count[g, s] = low + begin, end - begin + 1
             else:
                 first[g, s] = centre - known.fan.reach[i]
@@ -1102,19 +1106,28 @@ def look_at_all(address, at, g, how, known, seen, speckle, tables, peak):
     The peak is the largest of them.
     """
     (a, b, draw), (i, s) = address, at
-    _, beta, under_lines = known.levels[i]
+    sigma, beta, under_lines = known.levels[i]
     low, start = seen.low[i, s], seen.start[i, s]
     run = seen.ratios[start : start + seen.bins[i, s]]
     first, last = known.bins[i, s, FIRST, g] - low, known.bins[i, s, LAST, g] - low
-    first, last = echo_of(run, first, last, beta, how.beside)
+    first, last = echo_of(run, first, last, beta, max(how.beside, int(known.of_bins[i, 4])))
     count, best = last - first + 1, 0
+    pedestal = np.zeros(count)
+    if under_lines > 1.0:
+        echo = np.ones(count, np.bool_)
+        pedestal_of_bins(
+            sigma * run[first : last + 1], echo, levels_of(known.of_bins.T, i), pedestal
+        )
     room = np.empty((4, count + how.rule[0].shape[1]))
     numbers = ECHO * (1 + g)
     draw_noise((a, b, draw, philox.STREAM_NOISE[s]), numbers, low + first, count, how.rule, room)
     for k in range(count):
         real = is_end(low + first + k, how.ends)
-        echo = speckled(run[first + k], speckle, g, s, k, real)
-        re, im = echo.real + under_lines * room[0, k], echo.imag + under_lines * room[1, k]
+        amplitude, deviation = speckled(run[first + k], speckle, g, s, k, real), 1.0
+        if pedestal[k] > 0.0:  # fades as the lines do
+            power = pedestal[k] * abs(speckled(1.0, speckle, g, s, k, False)) ** 2
+            deviation = math.sqrt(1.0 + power)
+        re, im = amplitude.real + deviation * room[0, k], amplitude.imag + deviation * room[1, k]
         room[0, k] = math.hypot(re, im)
         best = k if room[0, k] > room[0, best] else best
     middle, spread = room[0, best], known.spread[i, s, g]

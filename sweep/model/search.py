@@ -103,7 +103,7 @@ def _cut(numbers, where, levels, how, speckle, magnitudes, exempts, chances):
 
     ``numbers`` (5, segments, m) are low, count, peak, exempted and start of runs; ``where`` the
     band (3, 2, m), N of complex records or 0, places of lines (m, 3, beamlets), and whether a run's
-    largest bin is searched; ``levels`` (5, m) those of :class:`sweep.model.detection.BinLevels`,
+    largest bin is searched; ``levels`` (8, m) those of :class:`sweep.model.detection.BinLevels`,
     and the floor of leakage over the noise; ``how`` the rule of detection and segments whose
     leakage is looked at; ``speckle`` points (m,) and the speckle of all; ``chances`` (3, segments,
     m) pd, miss and leakage.
@@ -125,9 +125,9 @@ def _cut(numbers, where, levels, how, speckle, magnitudes, exempts, chances):
             if not inside[s, j]:
                 exempt[:] = False
                 if levels[1, j] <= run[peak[s, j]]:
+                    beside = max(rule.beside, int(levels[4, j]))
                     _keep_echoes(
-                        run, exempt, at, levels[1, j], rule.beside, (band[s, :, j], period),
-                        lines[j, s],
+                        run, exempt, at, levels[1, j], beside, (band[s, :, j], period), lines[j, s]
                     )  # fmt: skip
             best = first
             for k in range(first, last + 1):
@@ -148,7 +148,7 @@ def _cut(numbers, where, levels, how, speckle, magnitudes, exempts, chances):
                 )  # fmt: skip
             if leaks[s]:
                 chances[2, s, j] = leakage_of(
-                    run, exempt, (levels[1, j], levels[2, j], levels[4, j])
+                    run, exempt, (levels[1, j], levels[2, j], levels[7, j])
                 )
 
 

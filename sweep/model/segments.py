@@ -15,7 +15,14 @@ import numpy as np
 from sweep.kernels import njit
 from sweep.model import line_shape
 from sweep.model.crossings import MOST_TERMS, crossing_series
-from sweep.model.detection import BinLevels, any_neighbour, found_pair, free_images, speckle_of
+from sweep.model.detection import (
+    BinLevels,
+    PedestalShape,
+    any_neighbour,
+    found_pair,
+    free_images,
+    speckle_of,
+)
 from sweep.model.effects.circulator_leak import beside_leak
 from sweep.model.effects.line_width import gaussian_shifts
 from sweep.model.ground import different_rows
@@ -583,9 +590,10 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
     ``points`` are rows of :meth:`sweep.model.preparation.Shots.point_table`; ``where`` (3, m) rows
     in the footprints, shapes, and numbers of the points; ``modes`` and ``shapes`` those of
     :class:`Together`, with shifts (m, segments, 2, k) and with sizes that end in the view and half
-    of the echo's main lobe; ``tables`` limits of nodes, and tangents; ``how`` segments that there
-    are, levels below which bins may be left out, each segment's way to look at leakage, the
-    window's sum, the rule of detection, and the speckle of all points. ``made`` and ``work`` are
+    of the echo's main lobe, in whose place a wider pedestal's reach comes; ``tables`` limits of
+    nodes, and tangents; ``how`` segments that there are, levels below which bins may be left out,
+    each segment's way to look at leakage, the window's sum, the rule of detection, and the speckle
+    of all points. ``made`` and ``work`` are
     room for shapes and for spectra. Results (``out``): low, count, peak, exempted and start (5,
     segments, m); pd, miss, magnitude and leakage (4, segments, m); magnitudes and exempt bins of
     runs, which may have no room at all.
@@ -615,6 +623,8 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
                     line_shape.build(s, (which, made_of), modes, shapes, table[s], form[s])
             made_of = which
         sigma, level = p[10], p[11]
+        pedestal = PedestalShape(p[18], p[19], p[20])
+        sizes[8] = max(rule.beside, int(pedestal.reach))
         if leaks.any() and level / sigma != before:
             before = level / sigma
             crossing_series(before, series)
@@ -649,7 +659,8 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
                 at = _keep(at, count, room, exempt, magnitudes, exempts)
             found, missed = found_pair(
                 room[OUT, :count], exempt[:count], peak, low, rule,
-                BinLevels(p[13], level, sigma, p[17]), speckle_of(speckle, s, where[2, i]),
+                BinLevels(p[13], level, sigma, p[17], pedestal),
+                speckle_of(speckle, s, where[2, i]),
             )  # fmt: skip
             if leaks[s] == BIN_BY_BIN:
                 if fades:

@@ -29,7 +29,7 @@ threshold, which keeps q away from 0, it has no variance. :func:`wander_covarian
 covariance of two segments.
 
 In footprints of half a bin and more the place is bounded by the bins that are looked at.
-:func:`wander_reduction` holds the ratio of the drawn deviation to that by (3).
+:func:`place_errors` bounds it so where the strongest bin alone detects.
 """
 
 import math

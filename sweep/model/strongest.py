@@ -28,7 +28,7 @@ import numpy as np
 
 from sweep.kernels import njit
 from sweep.model import alarms, waveform
-from sweep.model.detection import BinLevels, found_pair, speckle_of
+from sweep.model.detection import BinLevels, found_pair, levels_of, speckle_of
 from sweep.model.marcum import marcum_q1_pair
 from sweep.model.search import leakage_of
 from sweep.model.segments import runs_of
@@ -83,7 +83,7 @@ def _of_runs(shots: Any, runs: Any, pd: np.ndarray) -> tuple[np.ndarray, np.ndar
     numbers = np.array([runs.low, runs.bins, runs.peak, runs.start])
     _at_levels(
         numbers, runs.inside, (runs.magnitudes, runs.exempt), level,
-        (deviation, sigma, floor, shots.bin_levels[3, part]),
+        np.concatenate([shots.bin_levels[:, part], floor[None]]),
         (shots.echo_rule, shots.leakage), (part, shots.speckle_table), lost, silence,
     )  # fmt: skip
     alarm = -np.expm1(-silence[..., 0])
@@ -148,27 +148,28 @@ def _at_levels(numbers, inside, bins, levels, noise, how, speckle, lost, silence
 
     ``numbers`` (4, segments, m) are low, count, peak and start of runs; ``bins`` |X| [V] of all
     runs, and whether they are of the echo; ``levels`` (segments, m, k) [V], the threshold first;
-    ``noise`` that of bins with lines, and of others [V], the floor of leakage over that, and the
-    noise beside lines;
-    ``how`` the rule of detection, and whether leakage is looked at; ``speckle`` points (m,) and the
-    speckle of all. Results, of the levels' shape:
+    ``noise`` (8, m) levels of the bins (:class:`sweep.model.detection.BinLevels`), and the floor of
+    leakage over the noise; ``how`` the rule of detection, and whether leakage is looked at;
+    ``speckle`` points (m,) and the speckle of all. Results, of the levels' shape:
     ``lost`` P_b - P_z; ``silence`` -ln P(Z < z), to which that of leaked signal is added.
     """
     low, count, peak, start = numbers
-    deviation, sigma, floor, beside = noise
+    sigma, floor = noise[2], noise[7]
     for s in range(low.shape[0]):
         for j in range(low.shape[1]):
             if count[s, j] == 0:
                 continue
             run = bins[0][start[s, j] : start[s, j] + count[s, j]]
             echo = bins[1][start[s, j] : start[s, j] + count[s, j]]
-            found_first, missed_first = 0.0, 1.0
+            found_first, missed_first, of_bins = 0.0, 1.0, levels_of(noise, j)
             for k in range(levels.shape[2]):
                 level = levels[s, j, k]
                 if inside[s, j]:
                     found, missed = found_pair(
                         run, echo, peak[s, j], low[s, j], how[0],
-                        BinLevels(deviation[j], level, sigma[j], beside[j]),
+                        BinLevels(
+                            of_bins.line, level, of_bins.quiet, of_bins.beside, of_bins.pedestal
+                        ),
                         speckle_of(speckle[1], s, speckle[0][j]),
                     )  # fmt: skip
                     if k == 0:

@@ -1,4 +1,4 @@
-"""Echoes of a study that arrive after their record, or that are read as another range, in words.
+"""Echoes of a study that arrive late, are read as another range, or walk in phase, in words.
 
 A record begins at the acquisition delay and ends fft_size samples later, or where the chirp does.
 An echo is there from 2 R / c on. Beats beyond half the sample rate fold, and the readings of three
@@ -28,6 +28,10 @@ if TYPE_CHECKING:
 LOSS_DB = 3.0
 """Loss of an echo's power beyond which is warned of."""
 
+WALK_DELAY, WALK_PHASE = 0.125, 0.3
+"""Delay over the record's duration, and variance of the laser's phase over it [rad^2], beyond which
+a random walk leaves more than 0.02 of error in probabilities of detection."""
+
 POINTS_MAX = 200_000
 """Points of the grid of the parameters that matter; of larger grids so many, spread over them."""
 
@@ -39,7 +43,7 @@ PARAMETERS = (
     CHIRP + "duration", CHIRP + "start_frequency", waveform.ORDER, waveform.DOPPLER_SLOPE,
     waveform.DOWN_SLOPE, PROCESSING + "acquisition_delay", PROCESSING + "sample_rate",
     PROCESSING + "fft_size", PROCESSING + "window", waveform.TWO_BEATS, RECORD,
-    RECEIVER + "architecture",
+    RECEIVER + "architecture", LASER + "line_width", LASER + "line_shape",
 )  # fmt: skip
 """Parameters by which echoes arrive and are read."""
 
@@ -53,6 +57,8 @@ class Echoes(NamedTuple):
     """(n,): share of the window's sum before the echo arrives, 0..1; 1: it never does."""
     misread: np.ndarray
     """(n,): true where its beats are read as another range or velocity."""
+    walked: np.ndarray
+    """(n,): true where the laser's phase walks further than the law of detection allows."""
 
 
 def echoes_of(parameters: Mapping[str, Any]) -> Echoes:
@@ -62,7 +68,7 @@ def echoes_of(parameters: Mapping[str, Any]) -> Echoes:
     needed["target.range"] = np.broadcast_to(needed["target.range"], (number,))
     needed |= {path: DEFAULTS[path] for path in DEFAULTS if path not in needed}
     needed |= {"footprint.beamlets": 1}
-    found = Echoes(np.zeros(number), np.zeros(number), np.zeros(number, bool))
+    found = Echoes(np.zeros(number), np.zeros(number), *np.zeros((2, number), bool))
     for index, p in categories(needed):
         shape = window(canonical_name(str(p[PROCESSING + "window"])), int(p["record"]))
         range_, velocity = (p[name] for name in ("target.range", "target.radial_velocity"))
@@ -76,6 +82,13 @@ def echoes_of(parameters: Mapping[str, Any]) -> Echoes:
             first >= shape.length, 1.0, np.minimum(missing_of(shape, first).lost, 1.0)
         )
         found.misread[index] = _is_misread(p, range_, np.asarray(velocity))
+        if str(p[LASER + "line_shape"]) == "lorentzian":
+            delay, record = (
+                2 / SPEED_OF_LIGHT * range_,
+                shape.length / p[PROCESSING + "sample_rate"],
+            )
+            variance = 2 * np.pi * p[LASER + "line_width"] * np.minimum(delay, record)
+            found.walked[index] = (delay > WALK_DELAY * record) & (variance > WALK_PHASE)
     return found
 
 
@@ -150,6 +163,14 @@ def warnings_of(study: GridStudy | FlightStudy) -> Iterator[str]:
             "wrong range or velocity: raise processing.sample_rate, or lower chirp.bandwidth over "
             "chirp.duration"
         )
+    walked = echoes.walked & ~none & (study.spec.modes()["line_width"] != "off")
+    if walked.any() and (study.spec.draws is None or study.spec.draws.method != "spectra"):
+        yield (
+            f"the laser's phase walks so far within the delay of the echo at {_share(walked)} of "
+            f"the {points}, {_where(walked, echoes.range, none)}, that probabilities of detection "
+            "may be off by up to 0.1: take draws.method: spectra, which draws the walk, or lower "
+            "instrument.laser.line_width"
+        )
 
 
 def _share(some: np.ndarray) -> str:
@@ -205,5 +226,5 @@ def _of_flight(study: FlightStudy) -> Echoes:
     return (
         Echoes(*map(np.concatenate, zip(*found, strict=True)))
         if found
-        else Echoes(*[np.empty(0)] * 3)
+        else Echoes(*[np.empty(0)] * 4)
     )

@@ -147,3 +147,17 @@ def test_a_flight_in_which_beats_fold_is_told_of_and_flags_its_points(tmp_path):
     found = sweep.open_scene(tmp_path / "fold.zarr")["down"].to_dataset()
     flags = found.flags.values
     assert (flags & FLAGS["misread"]).any() and not (flags & FLAGS["true"]).any()
+
+
+def test_a_phase_that_walks_far_within_a_delay_is_told_but_of_drawn_spectra():
+    laser = {"line_width": "30 kHz", "line_shape": "lorentzian"}
+    noisy = {**STUDY["instrument"], "laser": STUDY["instrument"]["laser"] | laser}
+    ranges = [f"{r} m" for r in (100, 400, 700, 1000)]
+    (words,) = told(along(*ranges, instrument=noisy))
+    assert "the laser's phase walks" in words and "50 % of the points, from 700 m on" in words
+    assert "draws.method: spectra" in words
+    narrow = {**noisy, "laser": noisy["laser"] | {"line_width": "1 kHz"}}
+    assert told(along(*ranges, instrument=narrow)) == []
+    assert told(along(*ranges, instrument=noisy, effects={"line_width": "off"})) == []
+    drawn = {"number": 100, "method": "spectra"}
+    assert told(along(*ranges, instrument=noisy, draws=drawn)) == []

@@ -220,8 +220,8 @@ def raised(
 def beside_leak(shots: Shots, runs: Any) -> Any:
     """Put the line to :class:`sweep.model.segments.Runs`: it masks bins, and raises others."""
     from sweep.model.detection import (  # needs the compiler, which reading specs does not
-        BinLevels,
         found_pair,
+        levels_of,
         speckle_of,
     )
 
@@ -259,7 +259,7 @@ def beside_leak(shots: Shots, runs: Any) -> Any:
         else:
             pd[s, i], miss[s, i] = found_pair(
                 seen, echo, peak, runs.low[s, i], rule,
-                BinLevels(*shots.bin_levels[:, runs.part[i]]),
+                levels_of(shots.bin_levels, runs.part[i]),
                 speckle_of(speckle, s, runs.part[i]),
             )  # fmt: skip
         exempted[s, i] += np.count_nonzero(masked & searched)
