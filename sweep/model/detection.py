@@ -93,6 +93,7 @@ class BinLevels(NamedTuple):
     beside: float
     """Noise per quadrature in bins beside the lines, with all of the pedestal."""
     pedestal: PedestalShape = NO_PEDESTAL
+    """Shape of the pedestal about the lines."""
 
 
 class BinSpeckle(NamedTuple):
@@ -148,7 +149,7 @@ def pedestal_density(shape, bins):
 
 @njit(cache=True, error_model="numpy")
 def pedestal_reaches(ratio, width, delay, most):
-    """Last bin beside a line in which its pedestal has at least the power of the noise, (n,).
+    """Distance of the last bin in which a pedestal has at least the power of the noise, (n,).
 
     ``ratio`` (n,) is the power of the pedestal under the line over that of the noise; ``width`` and
     ``delay`` (n,) are those of :class:`PedestalShape`. No result exceeds ``most``.

@@ -425,7 +425,7 @@ class Found(NamedTuple):
     delta: np.ndarray
     """Place past the strongest bin [bins]."""
     power: np.ndarray
-    """|X|^2 of that bin [V^2]."""
+    """|X|^2 of the echo's strongest bin in the mean, and at least the threshold's [V^2]."""
 
 
 def view_of(
@@ -511,7 +511,9 @@ def look(spectra: Sequence[np.ndarray], signal: Signal, view: View) -> Found:
     first, beyond = np.ones((len(power), 1)), np.full((len(power), 1), half)
     first[row[own], 0], beyond[row[own], 0] = start[own], end[own]
     peak = np.where((first <= bins) & (bins < beyond), power, -1.0).argmax(axis=1)
-    strength = power[np.arange(len(power)), peak]
+    # The largest of several bins would be brighter than a bin whose place wanders.
+    least = np.minimum(power[np.arange(len(power)), peak], view.setting.threshold**2)
+    strength = np.maximum(power[:, strongest], least)
     strongest_bin = (peak - turn) % shots.fft_size if shots.complex_record else peak
     peak_place = placed(spectra, strongest_bin, view)
     frequency = peak_place - index_of_zero(shots)

@@ -12,9 +12,12 @@ from scipy.interpolate import CubicSpline
 from sweep.analysis.answers.physical import parameter, require_variables, spec_of
 from sweep.model import estimators, waveform
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects.catalogue import NAMES
+from sweep.model.effects.catalogue import DEFAULTS, EFFECTS, NAMES, names_of
 from sweep.model.looks import COHERENT
+from sweep.model.shot import prepare
+from sweep.model.wander import mean_wander
 from sweep.model.window import Window, transform, window
+from sweep.spec import Spec
 
 _SEGMENTS = ("up", "doppler", "down")
 _INSTRUMENT = "instrument."
@@ -28,6 +31,9 @@ _PARAMETERS = {
     "delay": "processing.acquisition_delay", "line_width": "laser.line_width",
     "line_shape": "laser.line_shape", "looks": "looks.number", "combine": "looks.combine",
 }  # fmt: skip
+_RANDOM = {effect.name for effect in EFFECTS if effect.is_random}
+"""Effects whose draws do not change an echo's footprint."""
+
 _ALIKE = ("architecture", "segments", "window", "fft_size", "duration", "delay", "sample_rate")
 """Parameters that points have in common whose bounds are worked out together."""
 
@@ -41,7 +47,8 @@ def range_error(dataset: xr.Dataset) -> xr.Dataset:
         [m], lazy. `reported` is the reported less the true range without noise, from whole bins.
         `resolution` is the mean spread that whole bins make: a bin over sqrt(24), because two
         peaks share the error. `bound` is the least standard deviation, that of a lone line with
-        the stored SNR in the three segments together (:mod:`sweep.model.estimators`). Below the
+        the stored SNR in the three segments together (:mod:`sweep.model.estimators`), with what
+        developed speckle adds to echoes that are detected (:mod:`sweep.model.wander`). Below the
         threshold noise is taken for signal, and no estimate comes near the bound. A study that
         draws whole spectra has instead what it stores: `bias`, `rmse` and `bound`.
     """
@@ -80,6 +87,7 @@ def _errors(dataset: xr.Dataset, quantity: str) -> xr.Dataset:
     bounds = xr.apply_ufunc(
         bound, *snr, *values.values(), dask="parallelized", output_dtypes=[float]
     ).transpose(*snr[0].dims)
+    bounds = np.hypot(bounds, _wander(dataset, quantity, spec))
     width = values["sample_rate"] / values["fft_size"]
     bins = (
         SPEED_OF_LIGHT / 2 * values["duration"] / values["bandwidth"] * width
@@ -99,6 +107,43 @@ def _errors(dataset: xr.Dataset, quantity: str) -> xr.Dataset:
     ):
         result[name].attrs = {"units": units, "long_name": text}
     return result.assign_attrs(dataset.attrs)
+
+
+def _wander(dataset: xr.Dataset, quantity: str, spec: Spec) -> xr.DataArray:
+    """Return the deviation that developed speckle adds to an estimate; 0 where nothing fades."""
+    fades = (dataset["effects"] & (1 << NAMES.index("fading"))) > 0
+    if spec.modes()["fading"] == "off" or spec.parameters()["footprint.speckle"] != "developed":
+        return xr.zeros_like(fades, float)
+    fixed = DEFAULTS | spec.parameters()
+    varying = {
+        member.path: parameter(dataset, member.path, spec)
+        for axis in spec.axes
+        for member in axis.members
+    }
+    probabilities, ratios = (
+        [dataset[f"{kind}_{name}"] for name in _SEGMENTS] for kind in ("pd", "snr")
+    )
+
+    def deviation(flags: np.ndarray, *arrays: np.ndarray) -> np.ndarray:
+        shape = np.broadcast_shapes(flags.shape, *(array.shape for array in arrays))
+        columns = [np.broadcast_to(array, shape).ravel() for array in (flags, *arrays)]
+        square = np.zeros(columns[0].size)
+        for value in np.unique(columns[0]):
+            index = np.flatnonzero(columns[0] == value)
+            effects = [name for name in names_of(int(value)) if name not in _RANDOM]
+            if "fading" not in effects:
+                continue
+            own = dict(zip(varying, (column[index] for column in columns[7:]), strict=True))
+            pd, snr = (np.array([c[index] for c in columns[k : k + 3]]) for k in (1, 4))
+            for part, shots in prepare(fixed | own, effects):
+                kind = mean_wander(shots, pd[:, part], snr[:, part])
+                square[index[part]] = kind[0 if quantity == "range" else 1]
+        return np.sqrt(square).reshape(shape)
+
+    return xr.apply_ufunc(
+        deviation, dataset["effects"], *probabilities, *ratios, *varying.values(),
+        dask="parallelized", output_dtypes=[float],
+    )  # fmt: skip
 
 
 def _bounds(snr: tuple[np.ndarray, ...], p: dict[str, np.ndarray]) -> estimators.Deviation:

@@ -5,11 +5,13 @@ Each record has its own random walk theta. The beat has the phase theta(t) - the
 
 import numpy as np
 import pytest
+from engine import keys
 
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detectors import main_lobe
 from sweep.model.effects.catalogue import DEFAULTS
-from sweep.model.shot import CORE, find, prepare, statistics
+from sweep.model.sampling import simulate
+from sweep.model.shot import CORE, evaluate, find, prepare, statistics
 
 DRAWS, FINER = 3_000, 2
 WIDTH, SHAPE = (f"instrument.laser.line_{name}" for name in ("width", "shape"))
@@ -128,3 +130,28 @@ def test_a_pedestal_fades_with_its_line_and_detects(
     plain = shots_of(p, [name for name in effects if name != "line_width"])
     drawn, expected = drawn_pd(shots, plain, rule), float(statistics(shots)["pd_up"][0])
     assert abs(drawn - expected) < 0.02 + 3 * np.sqrt(drawn * (1 - drawn) / DRAWS)
+
+
+@pytest.mark.parametrize("law", ["none", "developed"])
+def test_draws_detect_by_the_pedestal_as_probabilities_say(law, table_4_1):
+    p = parameters_of(table_4_1, 300e3, 150.0, law, "any_bin", 1.3)
+    chosen, given = effects_of(law), {"keys": keys(1)}
+    expected = float(evaluate(p, chosen)["pd_up"][0])
+    for method, draws, slack in (
+        ("probabilities", 20_000, 0.0), ("noise", 20_000, 0.02), ("spectra", 1000, 0.02)
+    ):  # fmt: skip
+        found = simulate(p, chosen, batch_sizes=[draws], method=method, **given)
+        share = found["n_detected_up"].sum() / draws
+        error = np.sqrt(expected * (1 - expected) / draws)
+        assert abs(share - expected) < 4 * error + slack, method
+
+
+def test_weak_phase_noise_gives_an_echo_no_more_bins(table_4_1):
+    for width, rule in ((1e3, "any_bin"), (300e3, "peak_bin")):
+        p = parameters_of(table_4_1, width, 150.0, "none", rule, 1.5)
+        assert shots_of(p, effects_of("none")).bin_levels[4] == 0
+    p = parameters_of(table_4_1, 300e3, 150.0, "none", "any_bin", 1.5)
+    wide = shots_of(p, effects_of("none"))
+    assert wide.bin_levels[4] > 10
+    narrow = [name for name in effects_of("none") if name != "line_width"]
+    assert find(wide)[0, 4, 0] > find(shots_of(p, narrow))[0, 4, 0] + 10
