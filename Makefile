@@ -6,7 +6,7 @@ READY := .venv/.ready
 KERNELS := .venv/.kernels
 TIMED := .ci/timed
 
-.PHONY: install-core install demo test timed-lint timed-kernels test-all lint size stability fuzz chaos side-by-side effects accuracy stopping frozen promise detectors peers scaling validation instruments docs pictures fields scale million lock clean
+.PHONY: install-core install demo test timed-lint timed-kernels test-all lint size stability validate-speckle fuzz chaos side-by-side effects accuracy stopping frozen promise detectors peers scaling validation instruments docs pictures fields scale million lock clean
 SEED ?= 1
 
 # What grids and figures need; the demo needs no more.
@@ -70,6 +70,10 @@ size: $(READY)
 
 stability: $(READY)
 	PYTHONPATH=tests $(BIN)/python tests/stability/stability_table.py
+
+# 200 random specs in developed speckle, compared with drawn scatterers; some six minutes. SEED has others.
+validate-speckle: $(READY)
+	PYTHONPATH=tests OPENBLAS_NUM_THREADS=1 $(BIN)/python tests/validate_speckle.py --seed $(SEED)
 
 # 10,000 random specs and 10,000 spoilt ones, some 40 minutes; failures are shrunk and shown.
 fuzz: $(READY)

@@ -8,8 +8,9 @@ The echo is linear in the scatterers' amplitudes. So the spectrum of each scatte
 computed once, by the FFT of its record, and a draw is a sum of these with new amplitudes.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import ndtri
@@ -17,6 +18,8 @@ from scipy.special import ndtri
 SPEED_OF_LIGHT = 299_792_458.0
 SEGMENTS = ("up", "doppler", "down")
 SLOPES = {"up": 1.0, "doppler": 0.0, "down": -1.0}
+FFT_BINS_MIN = 5
+"""Bins from which an FFT is faster than a sum for every bin."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,16 +59,6 @@ class Facet:
     those that leave it."""
 
 
-@dataclass(frozen=True)
-class Spectra:
-    """Draws of the spectra of a shot: X of some bins by segment, noise included."""
-
-    bins: dict[str, np.ndarray] = field(default_factory=dict)
-    """(k,): bins by segment; of a complex record signed."""
-    values: dict[str, np.ndarray] = field(default_factory=dict)
-    """(draws, k): complex X by segment."""
-
-
 def scatterer_delays(
     facet: Facet, number: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -101,26 +94,19 @@ def scatterer_spectra(
     start = facet.segments.index(segment) + look * len(facet.segments)
     start *= facet.duration + facet.gap
     slope = SLOPES[segment] * facet.bandwidth / facet.duration
-    carrier = SPEED_OF_LIGHT / facet.wavelength
-    carrier += facet.bandwidth if slope < 0 else 0.0
-    at_bins = np.empty((delay.size, bins.size), complex)
-    at_negatives = np.empty_like(at_bins)
-    for b, (tau_0, beta) in enumerate(zip(delay, doppler, strict=True)):
-        tau = tau_0 - beta * (start + time)
-        # Whole cycles go first: float64 cannot hold them together with their fraction.
-        cycles = -np.mod(carrier * tau_0, 1.0) + carrier * beta * (start + time)
-        tau = tau - 2 * facet.slide / SPEED_OF_LIGHT * (start + time)
-        cycles += slope * tau * (tau / 2 - time)
-        exists = (time >= tau) & (time <= facet.duration)
-        record = facet.window * exists * np.exp(2j * np.pi * np.mod(cycles, 1.0))
-        if bins.size == 1:
-            turned = np.exp(-2j * np.pi * (bins[0] * samples % facet.fft_size) / facet.fft_size)
-            at_bins[b], at_negatives[b] = (record * turned).sum(), (record * turned.conj()).sum()
-            continue
-        spectrum = np.fft.fft(record, facet.fft_size)
-        at_bins[b] = spectrum[bins % facet.fft_size]
-        at_negatives[b] = spectrum[-bins % facet.fft_size]
-    return at_bins, at_negatives
+    carrier = carrier_frequency(facet, segment)
+    tau_0, beta = delay[:, None], doppler[:, None]
+    tau = tau_0 - (beta + 2 * facet.slide / SPEED_OF_LIGHT) * (start + time)
+    # Whole cycles go first: float64 cannot hold them together with their fraction.
+    cycles = -np.mod(carrier * tau_0, 1.0) + carrier * beta * (start + time)
+    cycles += slope * tau * (tau / 2 - time)
+    exists = (time >= tau) & (time <= facet.duration)
+    record = facet.window * exists * np.exp(2j * np.pi * np.mod(cycles, 1.0))
+    if bins.size < FFT_BINS_MIN:
+        turned = np.exp(-2j * np.pi * (np.outer(samples, bins) % facet.fft_size) / facet.fft_size)
+        return record @ turned, record @ turned.conj()
+    spectrum = np.fft.fft(record, facet.fft_size)
+    return spectrum[:, bins % facet.fft_size], spectrum[:, -bins % facet.fft_size]
 
 
 def noise_factor(facet: Facet, bins: np.ndarray) -> np.ndarray:
@@ -138,100 +124,94 @@ def noise_factor(facet: Facet, bins: np.ndarray) -> np.ndarray:
     return vectors * np.sqrt(np.maximum(values, 0.0))
 
 
-def draw_spectra(
+class Records(NamedTuple):
+    """Draws of the spectra of several looks of a shot, by segment."""
+
+    values: dict[str, np.ndarray]
+    """(draws, looks, k): complex X of some bins, noise included."""
+    mean_power: dict[str, np.ndarray]
+    """(k,): mean of |X|^2 over speckle and looks, without noise."""
+
+
+def draw_records(
     facet: Facet,
     *,
-    amplitude: float,
+    bins: Mapping[str, np.ndarray],
+    amplitude: Mapping[str, float],
     noise_deviation: float,
     draws: int,
     seed: int,
-    reach: int = 12,
+    speckle: str = "motion",
     scatterers: int = 96,
     renewals: int = 8,
-) -> Iterator[Spectra]:
+) -> Iterator[Records]:
     """Yield batches of drawn shots.
 
     Parameters
     ----------
+    bins
+        By segment, (k,); of complex records signed.
     amplitude
-        Root of the mean square amplitude of the beat [V]: the record is ``amplitude cos(psi)`` of a
-        single line whose power is that of the whole echo.
+        By segment, root of the mean square amplitude of the beat [V]: the record is ``amplitude
+        cos(psi)`` of a single line whose power is that of the whole echo.
     noise_deviation
         Of white noise in a sample of a real record, or of I and Q together [V].
     draws
         Shots in all, divided among the renewals of the scatterers' places.
-    reach
-        Bins on either side of the mean echo that are looked at.
-    """
-    rng = np.random.default_rng(seed)
-    for _ in range(renewals):
-        delay, doppler = scatterer_delays(facet, scatterers, rng)
-        number = draws // renewals
-        waves = rng.normal(size=(number, scatterers)) + 1j * rng.normal(size=(number, scatterers))
-        waves *= amplitude / np.sqrt(2 * scatterers)
-        spectra = Spectra()
-        for segment in facet.segments:
-            bins = echo_bins(facet, segment, reach)
-            at_bins, at_negatives = scatterer_spectra(facet, segment, bins, delay, doppler)
-            if facet.complex_record:
-                echo = waves @ at_bins / 2
-            else:
-                echo = (waves @ at_bins + np.conj(waves @ at_negatives)) / 2
-            factor = noise_deviation * noise_factor(facet, bins)
-            parts = rng.normal(size=(number, factor.shape[1])) @ factor.T
-            spectra.bins[segment] = bins
-            spectra.values[segment] = echo + parts[:, : bins.size] + 1j * parts[:, bins.size :]
-        yield spectra
-
-
-def draw_looks(
-    facet: Facet,
-    *,
-    bins: dict[str, int],
-    amplitude: dict[str, float],
-    noise_deviation: float,
-    draws: int,
-    seed: int,
-    scatterers: int = 48,
-    renewals: int = 4,
-) -> dict[str, np.ndarray]:
-    """Draw X of one bin of each segment in every look of a shot, (draws, looks) complex.
-
-    Parameters as of :func:`draw_spectra`. The noise of looks is independent, and circular: the bins
-    lie far from DC and Nyquist.
+    speckle
+        Speckle of looks: as the ``motion`` from one to the next changes it, ``common`` to all, or
+        ``independent``.
     """
     rng = np.random.default_rng(seed)
     number = draws // renewals
-    drawn: dict[str, list[np.ndarray]] = {segment: [] for segment in facet.segments}
-    sigma = noise_deviation * np.sqrt((facet.window**2).sum() / 2)
     for _ in range(renewals):
         delay, doppler = scatterer_delays(facet, scatterers, rng)
-        waves = rng.normal(size=(number, scatterers)) + 1j * rng.normal(size=(number, scatterers))
+        shape = (facet.looks if speckle == "independent" else 1, number, scatterers)
+        waves = rng.normal(size=shape) + 1j * rng.normal(size=shape)
         waves /= np.sqrt(2 * scatterers)
+        values, mean_power = {}, {}
         for segment in facet.segments:
-            looks = np.empty((number, facet.looks), complex)
+            factor = noise_deviation * noise_factor(facet, bins[segment])
+            records, power = [], np.zeros(bins[segment].size)
             for look in range(facet.looks):
-                at_bin, at_negative = scatterer_spectra(
-                    facet, segment, np.array([bins[segment]]), delay, doppler, look
-                )
-                looks[:, look] = waves @ at_bin[:, 0] / 2
+                if look == 0 or speckle == "motion":
+                    at_bins, at_negatives = scatterer_spectra(
+                        facet, segment, bins[segment], delay, doppler, look
+                    )
+                power += (np.abs(at_bins) ** 2).mean(axis=0)
                 if not facet.complex_record:
-                    looks[:, look] += np.conj(waves @ at_negative[:, 0]) / 2
-            noise = rng.normal(size=(2, number, facet.looks))
-            drawn[segment].append(amplitude[segment] * looks + sigma * (noise[0] + 1j * noise[1]))
-    return {segment: np.concatenate(parts) for segment, parts in drawn.items()}
+                    power += (np.abs(at_negatives) ** 2).mean(axis=0)
+                wave = waves[look if speckle == "independent" else 0]
+                echo = wave @ at_bins
+                if not facet.complex_record:
+                    echo += np.conj(wave @ at_negatives)
+                parts = rng.normal(size=(number, factor.shape[1])) @ factor.T
+                noise = parts[:, : bins[segment].size] + 1j * parts[:, bins[segment].size :]
+                records.append(amplitude[segment] / 2 * echo + noise)
+            mean_power[segment] = amplitude[segment] ** 2 / 4 * power / facet.looks
+            values[segment] = np.stack(records, axis=1)
+        yield Records(values, mean_power)
 
 
-def echo_bins(facet: Facet, segment: str, reach: int) -> np.ndarray:
-    """Bins within ``reach`` of the middle of the echo, as far as the spectrum has them, (k,)."""
+def carrier_frequency(facet: Facet, segment: str) -> float:
+    """Optical frequency at the start of a segment [Hz]."""
+    return SPEED_OF_LIGHT / facet.wavelength + (facet.bandwidth if SLOPES[segment] < 0 else 0.0)
+
+
+def echo_beat(facet: Facet, segment: str) -> float:
+    """Beat frequency of a scatterer on the beam's axis in the middle of the record [Hz]."""
     tau = 2 * facet.range / SPEED_OF_LIGHT
     beta = 2 * facet.radial_velocity / SPEED_OF_LIGHT
     slope = SLOPES[segment] * facet.bandwidth / facet.duration
     start = facet.segments.index(segment) * (facet.duration + facet.gap)
     middle = facet.acquisition_delay + facet.window.size / facet.sample_rate / 2
-    carrier = SPEED_OF_LIGHT / facet.wavelength + (facet.bandwidth if slope < 0 else 0.0)
-    beat = carrier * beta - slope * (tau - beta * start) * (1 + beta) + slope * 2 * beta * middle
-    cycles = beat / facet.sample_rate
+    beat = carrier_frequency(facet, segment) * beta - slope * (tau - beta * start) * (1 + beta)
+    return beat + slope * 2 * beta * middle
+
+
+def echo_bins(facet: Facet, segment: str, reach: int) -> np.ndarray:
+    """Bins within ``reach`` of the middle of the echo, as far as the spectrum has them, (k,)."""
+    cycles = echo_beat(facet, segment) / facet.sample_rate
     size = facet.fft_size
     if facet.complex_record:
         centre = round((cycles - np.rint(cycles)) * size)

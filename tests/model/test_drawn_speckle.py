@@ -4,16 +4,24 @@ Points of flights by all methods, and a Monte Carlo simulation of scatterers tha
 echo power, the noise and the threshold with the model, and the interpolation between three bins.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from drawn_shots import (
+    EFFECTS,
+    LANDER,
+    draw_shots,
+    facet_of,
+    searched_bins,
+    shots_of,
+    with_threshold,
+)
 from engine import every, keys
-from scatterers import draw_spectra
 from small_scenes import flight, observed
-from test_speckle_on_slopes import EFFECTS, LANDER, facet_of, shots_of, with_threshold
 
-from sweep.model import beam, link, speckle_lines
+from sweep.model import beam, speckle_lines
 from sweep.model.clouds import cloud
-from sweep.model.detectors import main_lobe
 from sweep.model.effects.catalogue import DEFAULTS
 from sweep.model.geometry.mesh import Surface
 from sweep.model.interpolation import interpolator, sub_bin
@@ -64,39 +72,20 @@ def flown(p, method, draws):
 def scatterers_reported(p, draws, seed):
     """Detection of all segments of drawn shots of scatterers, and range and velocity reported."""
     shots = shots_of(p)
-    facet, tables = facet_of(p, shots), interpolator(shots.window, shots.fft_size)
-    poles = {
-        "detector_bandwidth": shots.detector_bandwidth,
-        "amplifier_bandwidth": shots.amplifier_bandwidth,
-    }
-    beat = np.array(2 * facet.range / 299792458.0 * float(np.ravel(shots.chirp_rate)[0]))
-    gain = np.abs(link.transfer(beat, **poles))
-    amplitude = shots.beat_scale * np.sqrt(shots.relative_echo) * gain
-    batches = list(
-        draw_spectra(
-            facet,
-            amplitude=float(np.ravel(amplitude)[0]),
-            noise_deviation=float(np.sqrt(shots.noise_variance[0])),
-            draws=draws,
-            seed=seed,
-        )
-    )
-    noise = 2 * float(shots.bin_deviation[0]) ** 2
-    half = int(np.ceil(main_lobe(shots.window) * shots.fft_size / shots.window.length))
+    # Points are reported for the start of the shot: what the beam slides until then is corrected.
+    resting = replace(facet_of(p, shots), slide=0.0)
+    drawn = draw_shots(p, shots, draws=draws, seed=seed, facet=resting)
+    tables = interpolator(shots.window, shots.fft_size)
     places, detected = {}, np.ones(draws, bool)
-    for segment in facet.segments:
-        magnitude = np.abs(np.concatenate([batch.values[segment] for batch in batches]))
-        power = np.maximum((magnitude**2).mean(axis=0) - noise, 0.0)
-        best = np.full(draws, power.argmax())
-        if shots.detection == "any_bin":
-            strong = np.flatnonzero(power >= power.max() / 4)
-            low, high = max(strong[0] - half, 1), min(strong[-1] + half, power.size - 2)
-            best = low + magnitude[:, low : high + 1].argmax(axis=1)
+    for segment, values in drawn.values.items():
+        magnitude = np.abs(values[:, 0])
+        searched = np.flatnonzero(searched_bins(drawn.mean_power[segment], shots))
+        best = searched[magnitude[:, searched].argmax(axis=1)]
         row = np.arange(draws)
         detected &= magnitude[row, best] >= float(shots.threshold[0])
         three = np.stack([magnitude[row, best + k] for k in (-1, 0, 1)], axis=1)
         delta = np.array([sub_bin(below, middle, above, tables) for below, middle, above in three])
-        places[segment] = batches[0].bins[segment][best] + delta
+        places[segment] = drawn.bins[segment][best] + delta
     width = float(np.ravel(shots.sample_rate)[0]) / shots.fft_size
     up, down = (places[segment] * width for segment in ("up", "down"))
     beats = reading(FAR, up, down, 200e6)

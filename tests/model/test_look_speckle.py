@@ -3,14 +3,10 @@
 Records of scatterers share the mean echo power, the noise and the threshold with the model.
 """
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from scatterers import draw_looks
-from test_speckle_on_slopes import LANDER, facet_of, shots_of, with_threshold
+from drawn_shots import LANDER, drawn_detections, shots_of, with_threshold
 
-from sweep.model import link
 from sweep.model.effects.catalogue import DEFAULTS
 from sweep.model.look_speckle import LookSpeckle
 from sweep.model.looks import COMBINE, NUMBER, SPECKLE, VOTES, Looks
@@ -18,35 +14,6 @@ from sweep.model.shot import find, statistics
 
 TOLERANCE = 0.02
 DRAWS = 8000
-
-
-def detections(p, shots, seed):
-    """Detections of drawn shots by segment, (draws,) bool."""
-    facet, looks = facet_of(p, shots), shots.looks
-    slide = float(np.ravel(shots.approach - shots.radial_velocity)[0])
-    bins, amplitude = {}, {}
-    for number, segment in enumerate(("up", "doppler", "down")):
-        if segment in facet.segments:
-            beat = find(shots)[number, 3]
-            gain = link.transfer(
-                beat, detector_bandwidth=shots.detector_bandwidth,
-                amplifier_bandwidth=shots.amplifier_bandwidth,
-            )  # fmt: skip
-            echo = shots.beat_scale * np.sqrt(shots.relative_echo) * np.abs(gain)
-            amplitude[segment] = float(np.ravel(echo * shots.whitening[number])[0])
-            bins[segment] = round(float(beat[0]) / float(shots.sample_rate[0]) * shots.fft_size)
-    found = {}
-    drawn = draw_looks(
-        replace(facet, looks=looks.number, slide=slide), bins=bins, amplitude=amplitude,
-        noise_deviation=float(np.sqrt(shots.noise_variance[0])), draws=DRAWS, seed=seed,
-    )  # fmt: skip
-    for segment, values in drawn.items():
-        power, level = np.abs(values) ** 2, float(shots.threshold[0]) ** 2
-        if looks.combine == "power":
-            found[segment] = power.mean(axis=1) >= level
-        else:
-            found[segment] = (power >= level).sum(axis=1) >= looks.votes
-    return found
 
 
 SLOPE = {
@@ -105,7 +72,7 @@ def test_looks_detect_as_often_as_in_drawn_records(case, table_4_1):
     p = with_threshold(p | {NUMBER: 1}, 1.3 if COMBINE not in p else 1.0) | {NUMBER: p[NUMBER]}
     shots = shots_of(p)
     outputs = statistics(shots)
-    found = detections(p, shots, seed=len(case))
+    found = drawn_detections(p, shots, draws=DRAWS, seed=len(case))
     shot = found["up"] & found["down"]
     if shots.any_two:
         shot = sum(found[segment].astype(int) for segment in found) >= 2

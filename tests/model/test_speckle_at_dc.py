@@ -5,14 +5,7 @@ Compared with drawn records of scatterers, which share the mean echo power, nois
 
 import numpy as np
 import pytest
-from test_speckle_on_slopes import (
-    DRAWS,
-    EFFECTS,
-    LANDER,
-    drawn_detections,
-    shots_of,
-    with_threshold,
-)
+from drawn_shots import EFFECTS, LANDER, drawn_detections, shots_of, with_threshold
 
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.catalogue import DEFAULTS
@@ -20,6 +13,7 @@ from sweep.model.hoyt import hoyt_pair
 from sweep.model.sampling import simulate
 from sweep.model.shot import find, statistics
 
+DRAWS = 20_000
 BIN_WIDTH = LANDER["instrument.processing.sample_rate"] / LANDER["instrument.processing.fft_size"]
 RANGE_BEAT = 1e9 / 50e-6 * 2 * 300.0 / SPEED_OF_LIGHT
 HOVER = LANDER | {
@@ -80,7 +74,7 @@ def test_slow_echoes_are_detected_as_often_as_drawn_ones(
     }  # fmt: skip
     p = with_threshold(at_doppler(p, doppler * BIN_WIDTH), 1.6)
     shots = shots_of(p)
-    drawn = drawn_detections(p, shots, seed=7)["doppler"].mean()
+    drawn = drawn_detections(p, shots, draws=DRAWS, seed=7)["doppler"].mean()
     expected = float(statistics(shots)["pd_doppler"][0])
     assert abs(drawn - expected) < 4 * np.sqrt(expected * (1 - expected) / DRAWS) + tolerance
 
@@ -91,7 +85,7 @@ def test_an_up_beat_at_dc_is_a_real_number(rule, tolerance, table_4_1):
     p = DEFAULTS | table_4_1() | HOVER | {"instrument.processing.detection": rule}
     p = with_threshold(at_doppler(p, RANGE_BEAT + 0.3 * BIN_WIDTH), 1.6)
     shots = shots_of(p)
-    detections, outputs = drawn_detections(p, shots, seed=3), statistics(shots)
+    detections, outputs = drawn_detections(p, shots, draws=DRAWS, seed=3), statistics(shots)
     both = (detections["up"] & detections["down"]).mean()
     error = np.sqrt(0.25 / DRAWS)
     assert abs(detections["up"].mean() - outputs["pd_up"][0]) < 4 * error
@@ -103,7 +97,7 @@ def test_any_two_segments_detect_a_hovering_lidar_as_drawn(table_4_1):
     p = DEFAULTS | table_4_1() | HOVER | {"instrument.processing.shot_detection": "any_two"}
     p = with_threshold(at_doppler(p, 0.2 * BIN_WIDTH), 1.6)
     shots = shots_of(p)
-    detections = drawn_detections(p, shots, seed=3)
+    detections = drawn_detections(p, shots, draws=DRAWS, seed=3)
     two = (np.sum([detections[name] for name in detections], axis=0) >= 2).mean()
     outputs = statistics(shots)
     assert abs(two - outputs["pd_shot"][0]) < 0.003 + 4 * np.sqrt(two * (1 - two) / DRAWS)

@@ -1,0 +1,378 @@
+"""Table of random specs in developed speckle, compared with drawn scatterers.
+
+``make validate-speckle`` prints a row for every spec: probabilities of detection that a study
+stores, those of drawn records (:mod:`drawn_shots`), and the difference over what is allowed, five
+standard deviations of the drawn share, the spec's tolerance, and the error that docs/physics.md
+states for the law of this kind. The exit status is 1 if any spec is beyond.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from drawn_shots import (
+    SEGMENTS,
+    detections,
+    draw_shots,
+    facet_of,
+    line_deviation,
+    number,
+    shot_detections,
+    shots_of,
+)
+from scatterers import SPEED_OF_LIGHT, Facet, echo_beat
+
+from sweep.model.effects.catalogue import CORE
+from sweep.model.shot import Shots, find
+from sweep.model.unsupported import UnsupportedShot
+from sweep.spec import Spec, SpecError
+from sweep.tasks.grid_study import GridStudy
+
+WAVELENGTH = 1550e-9
+SIGMAS = 5.0
+DRAWS = 24_000
+EFFECTS = (
+    *CORE, "footprint", "doppler_spread", "segment_motion", "range_walk", "image", "overlap",
+    "fading",
+)  # fmt: skip
+WINDOWS = ("rectangular", "hann", "hamming", "blackman", "flattop")
+TOLERANCE = 1e-3
+"""``accuracy.tolerance`` of the specs, its default."""
+PD_RANGE = (0.02, 0.985)
+"""Probabilities of the up- or down-chirp from which a comparison says something."""
+
+
+# Random specs
+
+
+def mapping_at_random(rng: np.random.Generator) -> dict[str, Any]:
+    """A spec of one point, which may be refused."""
+    rule = str(rng.choice(["any_bin", "peak_bin", "looks"], p=[0.55, 0.25, 0.2]))
+    padding = int(rng.choice([1, 2, 4], p=[0.6, 0.25, 0.15]))
+    fft_size = int(2 ** rng.integers(8, 13 if rule != "looks" else 11))
+    length = max(fft_size // padding, 64)
+    fft_size, rate = length * padding, float(rng.choice([100e6, 200e6, 400e6]))
+    record = length / rate
+    waist, bandwidth = rng.uniform(2e-3, 8e-3), 10 ** rng.uniform(8.7, 9.6)
+    delay = rng.uniform(0.05, 0.4) * record
+    duration = delay + record * (1.0 if padding > 1 else rng.uniform(1.0, 1.1))
+    range_beat = rng.uniform(0.04, 0.42) * rate
+    distance = range_beat * SPEED_OF_LIGHT * duration / (2 * bandwidth)
+    grazing = float(rng.choice([90.0, np.exp(rng.uniform(0.0, np.log(90)))], p=[0.1, 0.9]))
+    bin_width = rate / length
+    place = str(rng.choice(["doppler at dc", "up at dc", "far"], p=[0.25, 0.08, 0.67]))
+    doppler = {
+        "doppler at dc": rng.uniform(-2.5, 2.5) * bin_width * rng.integers(0, 2),
+        "up at dc": range_beat + rng.uniform(-2.5, 2.5) * bin_width,
+        "far": rng.choice([-1, 1]) * rng.uniform(0.0, 0.45 * rate - range_beat),
+    }[place]
+    far_field = distance > 4 * np.pi * waist**2 / WAVELENGTH
+    sideways = rng.uniform(-30, 30) if far_field and rng.random() < 0.6 else 0.0
+    segments = str(rng.choice(
+        ["up doppler down", "up down", "down up", "up down doppler"], p=[0.6, 0.2, 0.1, 0.1]
+    ))  # fmt: skip
+    any_two = "doppler" in segments and rng.random() < 0.3
+    record_kind = str(rng.choice(["real", "complex"], p=[0.7, 0.3]))
+    instrument = {
+        "laser": {"wavelength": WAVELENGTH, "power": 1.0, "beam_waist": waist},
+        "chirp": {
+            "bandwidth": bandwidth, "start_frequency": 5.5e9, "duration": duration,
+            "segments": segments, "gap": float(rng.choice([0.0, rng.uniform(0, 5e-6)])),
+        },
+        "telescope": {"aperture": 25e-3},
+        "receiver": {
+            "responsivity": 1.1, "detector_bandwidth": 2e9, "optical_passband": 25e-9,
+            "noise_equivalent_power": 5e-12, "transimpedance": 7e3, "amplifier_bandwidth": 2e9,
+            "amplifier_noise_current": 25e-9, "record": record_kind,
+            "noise_shape": str(rng.choice(["white", "receiver"], p=[0.7, 0.3])),
+        },
+        "processing": {
+            "sample_rate": rate, "fft_size": fft_size, "window": str(rng.choice(WINDOWS)),
+            "tnr": rng.uniform(5.5, 12.0), "acquisition_delay": delay,
+            "detection": "peak_bin" if rule == "looks" else rule,
+            "shot_detection": "any_two" if any_two else "both_chirps",
+        },
+    }  # fmt: skip
+    if rule == "looks":
+        count = int(rng.integers(2, 9))
+        instrument["looks"] = {
+            "number": count, "combine": str(rng.choice(["power", "binary"])),
+            "votes": int(rng.integers(1, count + 1)),
+            "speckle": str(rng.choice(["motion", "common", "independent"], p=[0.6, 0.2, 0.2])),
+        }  # fmt: skip
+    return {
+        "title": "Speckle at random",
+        "instrument": instrument,
+        "target": {
+            "range": distance, "reflectance": 0.1, "reflectance_law": "lambert",
+            "grazing_angle": math.radians(grazing),
+            "radial_velocity": doppler * WAVELENGTH / 2, "transverse_velocity": sideways,
+        },
+    }  # fmt: skip
+
+
+class RandomSpec(NamedTuple):
+    """A valid spec of one point, with what its study stores."""
+
+    mapping: dict[str, Any]
+    spec: Spec
+    parameters: Mapping[str, Any]
+    shots: Shots
+    stored: dict[str, float]
+    """pd_up, pd_doppler (nan if there is none), pd_down and pd_shot."""
+
+
+def spec_at_random(seed: int, which: int) -> RandomSpec:
+    """The spec of a number in the table: random ones until one is valid and says something."""
+    rng = np.random.default_rng([seed, which])
+    while True:
+        mapping = mapping_at_random(rng)
+        ratio = np.exp(rng.uniform(np.log(0.8), np.log(5.0)))
+        try:
+            evaluated = _evaluated(mapping, ratio)
+        except (SpecError, UnsupportedShot):
+            continue
+        chirps = [evaluated.stored["pd_up"], evaluated.stored["pd_down"]]
+        if PD_RANGE[0] < min(chirps) and max(chirps) < PD_RANGE[1]:
+            return evaluated
+
+
+def _evaluated(mapping: dict[str, Any], ratio: float) -> RandomSpec:
+    """The spec with the laser power for which a chirp's |X| is so many times the threshold."""
+    study = GridStudy(Spec.from_mapping(with_units(mapping)))
+    shots = shots_of(study.grid.parameters(0), EFFECTS)
+    magnitude = np.nanmax(find(shots)[[0, 2], 2, 0])
+    mapping["instrument"]["laser"]["power"] = (ratio * number(shots.threshold) / magnitude) ** 2
+    spec = Spec.from_mapping(with_units(mapping))
+    study = GridStudy(spec)
+    results = study.evaluate(0)
+    stored = {name: number(results[name]) for name in (*(f"pd_{s}" for s in SEGMENTS), "pd_shot")}
+    if np.isnan(stored["pd_shot"]):
+        raise UnsupportedShot("beyond the model")
+    parameters = study.grid.parameters(0)
+    return RandomSpec(mapping, spec, parameters, shots_of(parameters, EFFECTS), stored)
+
+
+UNITS = {
+    "wavelength": "m", "power": "W", "beam_waist": "m", "bandwidth": "Hz", "start_frequency": "Hz",
+    "duration": "s", "gap": "s", "aperture": "m", "responsivity": "A/W",
+    "detector_bandwidth": "Hz", "optical_passband": "m", "noise_equivalent_power": "W/Hz^0.5",
+    "transimpedance": "ohm", "amplifier_bandwidth": "Hz", "amplifier_noise_current": "A",
+    "sample_rate": "Hz", "acquisition_delay": "s", "range": "m", "grazing_angle": "rad",
+    "radial_velocity": "m/s", "transverse_velocity": "m/s",
+}  # fmt: skip
+
+
+def with_units(section: Any, name: str = "") -> Any:
+    """A section of a spec whose numbers in SI have their units written out."""
+    if isinstance(section, dict):
+        return {key: with_units(value, key) for key, value in section.items()}
+    return f"{float(section)!r} {UNITS[name]}" if name in UNITS else section
+
+
+# Comparison
+
+
+class Comparison(NamedTuple):
+    """Stored and drawn probability of one segment or of the shot."""
+
+    quantity: str
+    stored: float
+    drawn: float
+    sigma: float
+    """Standard deviation of the drawn share."""
+    stated: float
+    """Largest error that docs/physics.md states for the law of this kind."""
+    tolerance: float
+
+    @property
+    def difference(self) -> float:
+        return self.stored - self.drawn
+
+    @property
+    def over_allowed(self) -> float:
+        """Difference over that which is allowed; beyond it above 1."""
+        return abs(self.difference) / (SIGMAS * self.sigma + self.tolerance + self.stated)
+
+
+class Row(NamedTuple):
+    """A spec of the table with its comparisons."""
+
+    which: int
+    rule: str
+    window: str
+    padding: int
+    fft_size: int
+    record: str
+    segments: str
+    slope: float
+    """Grazing angle [deg]."""
+    spread: float
+    """Deviation of the lines [bins of fs/L]."""
+    from_end: float
+    """Distance of the nearest segment's line from DC or Nyquist [bins of fs/L]."""
+    threshold: float
+    """[sigma]"""
+    comparisons: tuple[Comparison, ...]
+
+    @property
+    def worst(self) -> Comparison:
+        return max(self.comparisons, key=lambda one: one.over_allowed)
+
+    @property
+    def is_near_end(self) -> bool:
+        return self.from_end < NEAR_END + DEVIATIONS_NEAR_END * self.spread
+
+    def kind(self, comparison: Comparison) -> tuple[str, ...]:
+        """Kind by which errors are summed up."""
+        quantity = "shot" if comparison.quantity == "shot" else "segment"
+        words = self.rule.split()
+        rule = words[0] if len(words) < 3 else f"looks {'power' if 'mean' in words else 'votes'}"
+        any_two = " any_two" if quantity == "shot" and "any_two" in words else ""
+        slope = "below 5 deg" if self.slope < 5 else "to 30 deg" if self.slope < 30 else "steeper"
+        return (quantity, rule + any_two, self.window, "DC" if self.is_near_end else "", slope)
+
+
+NEAR_END = 4.0
+DEVIATIONS_NEAR_END = 3.0
+
+
+def stated_error(quantity: str, shots: Shots) -> float:
+    """Largest error that docs/physics.md states for the law of a quantity."""
+    return 0.0
+
+
+def rule_of(shots: Shots) -> str:
+    """Rule of detection in a few words."""
+    looks, rule = shots.looks, shots.detection
+    if looks.several:
+        speckle = "independent" if looks.independent else "motion" if looks.moving else "common"
+        votes = f"{looks.votes} of" if looks.combine == "binary" else "mean of"
+        rule = f"{votes} {looks.number} {speckle}"
+    return rule + (" any_two" if shots.any_two else "")
+
+
+def distance_from_end(facet: Facet) -> float:
+    """Distance of the nearest segment's line from DC or Nyquist [bins of fs/L]."""
+    nearest = math.inf
+    for segment in () if facet.complex_record else facet.segments:
+        cycles = echo_beat(facet, segment) / facet.sample_rate
+        place = abs(cycles - round(cycles)) * facet.window.size
+        nearest = min(nearest, place, facet.window.size / 2 - place)
+    return nearest
+
+
+def compared(seed: int, which: int, draws: int = DRAWS) -> Row:
+    """Draw a random spec's shots, and compare how often they are detected with what is stored."""
+    random = spec_at_random(seed, which)
+    shots = random.shots
+    drawn = draw_shots(random.parameters, shots, draws=draws, seed=which)
+    detected = detections(drawn, shots)
+    detected["shot"] = shot_detections(detected, shots)
+    comparisons = []
+    for quantity, values in detected.items():
+        share, stored = float(values.mean()), random.stored[f"pd_{quantity}"]
+        likely = np.clip([share, stored], 1 / draws, 1 - 1 / draws)
+        sigma = float(np.sqrt(likely * (1 - likely) / values.size).max())
+        stated = stated_error(quantity, shots)
+        comparisons.append(Comparison(quantity, stored, share, sigma, stated, TOLERANCE))
+    facet = facet_of(random.parameters, shots)
+    return Row(
+        which=which,
+        rule=rule_of(shots),
+        window=shots.window.name,
+        padding=shots.fft_size // shots.window.length,
+        fft_size=shots.fft_size,
+        record="I/Q" if shots.complex_record else "real",
+        segments=" ".join(facet.segments),
+        slope=math.degrees(facet.grazing_angle),
+        spread=line_deviation(facet),
+        from_end=distance_from_end(facet),
+        threshold=number(shots.threshold / shots.bin_deviation),
+        comparisons=tuple(comparisons),
+    )
+
+
+HEAD = (
+    f"{'no':>4} {'rule':22} {'window':>12} {'N':>5} {'rec':>4} {'waveform':16} {'slope':>6} "
+    f"{'spread':>6} {'to DC':>6} {'Th':>5} | {'worst':8} {'stored':>7} {'drawn':>7} {'sigma':>6} "
+    f"{'differs':>8} {'stated':>6} {'ratio':>6}"
+)
+
+
+def line_of(row: Row) -> str:
+    """A row of the table, by the comparison that is worst."""
+    worst = row.worst
+    window = f"{row.window} x{row.padding}"
+    place = f"{row.from_end:6.1f}" if row.from_end < 100 else "   far"
+    return (
+        f"{row.which:4} {row.rule:22} {window:>12.12} {row.fft_size:5} {row.record:>4} "
+        f"{row.segments:16} {row.slope:6.1f} {row.spread:6.2f} {place} {row.threshold:5.2f} | "
+        f"{worst.quantity:8} {worst.stored:7.4f} {worst.drawn:7.4f} {worst.sigma:6.4f} "
+        f"{worst.difference:+8.4f} {worst.stated:6.3f} {worst.over_allowed:6.2f}"
+        + (" BEYOND" if worst.over_allowed > 1 else "")
+    )
+
+
+def rows_of(seed: int, specs: int, draws: int, processes: int) -> Iterator[Row]:
+    """Compare specs 0 .. specs - 1 of a seed, in their order."""
+    if processes == 1:
+        yield from (compared(seed, which, draws) for which in range(specs))
+        return
+    with ProcessPoolExecutor(processes) as pool:
+        yield from pool.map(partial(compared, seed, draws=draws), range(specs))
+
+
+def summary(rows: list[Row]) -> str:
+    """Largest errors by kind, and how many specs are beyond what is allowed."""
+    by_kind: dict[tuple[str, ...], list[Comparison]] = defaultdict(list)
+    for row in rows:
+        for comparison in row.comparisons:
+            by_kind[row.kind(comparison)].append(comparison)
+    lines = [
+        f"{'pd of':8} {'rule':18} {'window':12} {'':3} {'slope':12} {'n':>4} {'largest error':>14} "
+        f"{'sigmas':>7} {'stated':>7}"
+    ]
+    for kind, comparisons in sorted(by_kind.items()):
+        largest = max(comparisons, key=lambda one: abs(one.difference))
+        lines.append(
+            f"{kind[0]:8} {kind[1]:18} {kind[2]:12} {kind[3]:3} {kind[4]:12} {len(comparisons):4} "
+            f"{largest.difference:+14.4f} {abs(largest.difference) / largest.sigma:7.1f} "
+            f"{largest.stated:7.3f}"
+        )
+    beyond = [row.which for row in rows if row.worst.over_allowed > 1]
+    numbers = f": {', '.join(map(str, beyond))}" if beyond else ""
+    lines.append(f"{len(beyond)} of {len(rows)} specs are beyond what is allowed{numbers}")
+    return "\n".join(lines)
+
+
+def main() -> int:
+    """Print the table. The exit status is 1 if a spec is beyond what is allowed."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--specs", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--draws", type=int, default=DRAWS)
+    parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
+    options = parser.parse_args()
+    begun, rows = time.perf_counter(), []
+    print(HEAD)
+    for row in rows_of(options.seed, options.specs, options.draws, options.processes):
+        rows.append(row)
+        print(line_of(row), flush=True)
+    print(summary(rows))
+    print(f"{options.draws} draws a spec, {time.perf_counter() - begun:.0f} s")
+    return int(any(row.worst.over_allowed > 1 for row in rows))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
