@@ -21,7 +21,10 @@ from sweep.model.detectors import main_lobe
 from sweep.model.effects.catalogue import CORE
 from sweep.model.shot import Shots, find, prepare
 
-EFFECTS = (*CORE, "footprint", "doppler_spread", "segment_motion", "range_walk", "image", "fading")
+EFFECTS = (
+    *CORE, "footprint", "doppler_spread", "segment_motion", "range_walk", "image", "overlap",
+    "fading",
+)  # fmt: skip
 SEGMENTS = ("up", "doppler", "down")
 
 LANDER = {

@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from drawn_shots import (
+    EFFECTS,
     SEGMENTS,
     detections,
     draw_shots,
@@ -32,7 +33,6 @@ from drawn_shots import (
 )
 from scatterers import SPEED_OF_LIGHT, Facet, echo_beat
 
-from sweep.model.effects.catalogue import CORE
 from sweep.model.shot import Shots, find
 from sweep.model.unsupported import UnsupportedShot
 from sweep.spec import Spec, SpecError
@@ -41,10 +41,6 @@ from sweep.tasks.grid_study import GridStudy
 WAVELENGTH = 1550e-9
 SIGMAS = 5.0
 DRAWS = 24_000
-EFFECTS = (
-    *CORE, "footprint", "doppler_spread", "segment_motion", "range_walk", "image", "overlap",
-    "fading",
-)  # fmt: skip
 WINDOWS = ("rectangular", "hann", "hamming", "blackman", "flattop")
 TOLERANCE = 1e-3
 """``accuracy.tolerance`` of the specs, its default."""
@@ -63,7 +59,7 @@ def mapping_at_random(rng: np.random.Generator) -> dict[str, Any]:
     length = max(fft_size // padding, 64)
     fft_size, rate = length * padding, float(rng.choice([100e6, 200e6, 400e6]))
     record = length / rate
-    waist, bandwidth = rng.uniform(2e-3, 8e-3), 10 ** rng.uniform(8.7, 9.6)
+    waist, bandwidth = np.exp(rng.uniform(np.log(7e-4), np.log(8e-3))), 10 ** rng.uniform(8.7, 9.6)
     delay = rng.uniform(0.05, 0.4) * record
     duration = delay + record * (1.0 if padding > 1 else rng.uniform(1.0, 1.1))
     range_beat = rng.uniform(0.04, 0.42) * rate
@@ -243,13 +239,62 @@ class Row(NamedTuple):
         return (quantity, rule + any_two, self.window, "DC" if self.is_near_end else "", slope)
 
 
-NEAR_END = 4.0
-DEVIATIONS_NEAR_END = 3.0
+NEAR_END, DEVIATIONS_NEAR_END = 4.0, 3.0
+NARROW = 0.2
+"""Deviation [bins of fs/L] up to which lines near DC are taken for one."""
 
 
-def stated_error(quantity: str, shots: Shots) -> float:
-    """Largest error that docs/physics.md states for the law of a quantity."""
-    return 0.0
+class StatedErrors(NamedTuple):
+    """Largest errors that docs/physics.md states for the laws of developed speckle."""
+
+    peak_bin: float = 0.002
+    peak_bin_any_two: float = 0.01
+    """Any two segments, by ``peak_bin``."""
+    any_bin: float = 0.01
+    rectangular: float = 0.02
+    """``any_bin`` of the rectangular window; of one that is padded :attr:`padded`."""
+    padded: float = 0.035
+    wide: float = 0.03
+    """``any_bin`` of a padded record, of lines that spread over more than WIDE bins."""
+    near_end: float = 0.03
+    """``any_bin`` of a line within a main lobe of DC or Nyquist."""
+    across_end: float = 0.06
+    """``any_bin`` of lines that spread across DC or Nyquist."""
+    chirps: float = 0.01
+    """What the law of several segments adds with ``any_bin``."""
+    looks: float = 0.025
+    """Shots of several looks whose speckle motion changes; segments have the half."""
+    alike_looks: float = 0.015
+    """Shots of several looks in common or independent speckle."""
+
+
+STATED = StatedErrors()
+WIDE = 4.0
+
+
+def stated_error(quantity: str, shots: Shots, facet: Facet) -> float:
+    """Largest error that docs/physics.md states for the law of a segment or of the shot."""
+    if shots.looks.several:
+        if not shots.looks.moving:
+            return STATED.alike_looks if quantity == "shot" else STATED.peak_bin
+        return STATED.looks if quantity == "shot" else STATED.looks / 2
+    if shots.detection == "peak_bin":
+        both = quantity == "shot" and shots.any_two
+        return STATED.peak_bin_any_two if both else STATED.peak_bin
+    spread, is_padded = line_deviation(facet), shots.fft_size > shots.window.length
+    errors = [STATED.any_bin]
+    if shots.window.name == "rectangular":
+        errors.append(STATED.padded if is_padded else STATED.rectangular)
+    if is_padded and spread > WIDE:
+        errors.append(STATED.wide)
+    if is_near_end(facet, spread):
+        errors.append(STATED.across_end if spread > NARROW else STATED.near_end)
+    return max(errors) + (STATED.chirps if quantity == "shot" else 0.0)
+
+
+def is_near_end(facet: Facet, spread: float) -> bool:
+    """True where lines or the main lobe of a segment lie across DC or Nyquist."""
+    return distance_from_end(facet) < NEAR_END + DEVIATIONS_NEAR_END * spread
 
 
 def rule_of(shots: Shots) -> str:
@@ -279,14 +324,14 @@ def compared(seed: int, which: int, draws: int = DRAWS) -> Row:
     drawn = draw_shots(random.parameters, shots, draws=draws, seed=which)
     detected = detections(drawn, shots)
     detected["shot"] = shot_detections(detected, shots)
+    facet = facet_of(random.parameters, shots)
     comparisons = []
     for quantity, values in detected.items():
         share, stored = float(values.mean()), random.stored[f"pd_{quantity}"]
         likely = np.clip([share, stored], 1 / draws, 1 - 1 / draws)
         sigma = float(np.sqrt(likely * (1 - likely) / values.size).max())
-        stated = stated_error(quantity, shots)
+        stated = stated_error(quantity, shots, facet)
         comparisons.append(Comparison(quantity, stored, share, sigma, stated, TOLERANCE))
-    facet = facet_of(random.parameters, shots)
     return Row(
         which=which,
         rule=rule_of(shots),

@@ -229,29 +229,81 @@ class Fading(NamedTuple):
 
 
 def fading_together(
-    one: np.ndarray, other: np.ndarray, level: np.ndarray, alike: np.ndarray
+    one: np.ndarray,
+    other: np.ndarray,
+    level: np.ndarray,
+    alike: np.ndarray,
+    number: np.ndarray | float = 1.0,
 ) -> np.ndarray:
     """Probability that two segments in developed speckle are both detected; nan where one lacks.
 
-    Two correlated Rayleigh magnitudes [Schwartz, Bennett and Stein, Communication Systems and
-    Techniques, 1966, appendix A]. With A, B = Th^2 over the mean powers, e^-A and e^-B the
-    probabilities that either is detected, and r the square of the correlation that noise leaves of
-    the signals' (``alike``),
+    Parameters
+    ----------
+    one, other
+        Probabilities that either is detected.
+    level
+        Threshold over the noise per quadrature.
+    alike
+        Correlation of the signals' amplitudes in matching bins of the two segments.
+    number
+        Independent bins as which either echo counts, :func:`independent_bins`.
 
-        e^-A (1 - Q_1(sqrt(2 B / (1-r)), sqrt(2 r A / (1-r))))
+    Notes
+    -----
+    Of one bin these are two correlated Rayleigh magnitudes [Schwartz, Bennett and Stein,
+    Communication Systems and Techniques, 1966, appendix A]. With A, B = Th^2 over the mean powers,
+    e^-A and e^-B the probabilities that either is detected, and r the square of the correlation
+    that noise leaves of the signals',
+
+        J = e^-A (1 - Q_1(sqrt(2 B / (1-r)), sqrt(2 r A / (1-r))))
             + e^-B Q_1(sqrt(2 r B / (1-r)), sqrt(2 A / (1-r)))
 
-    An echo of many bins, any of which detects, counts as the one that is detected as often.
+    An echo that any of its bins detects counts as M independent bins, each of which is detected
+    with q = 1 - (1 - p)^(1/M) and sees in the other segment the one that matches it. Both are
+    missed with (1 - q_1 - q_2 + J(q_1, q_2))^M, so that both are detected with
+
+        p_1 p_2 + (1 - p_1) (1 - p_2) ((1 + (J - q_1 q_2) / ((1 - q_1) (1 - q_2)))^M - 1)
     """
     there, y = np.isfinite(one) & np.isfinite(other), 0.5 * level**2
     with np.errstate(divide="ignore"):
-        a, b = (np.minimum(-np.log(np.where(there, p, 1.0)), 700.0) for p in (one, other))
+        bins = [np.where(there, p, 1.0) for p in (one, other)]
+        bins = [np.where(number > 1, -np.expm1(np.log1p(-p) / number), p) for p in bins]
+        a, b = (np.minimum(-np.log(p), 700.0) for p in bins)
     shares = np.maximum(1 - a / y, 0.0) * np.maximum(1 - b / y, 0.0)  # SNR / (1 + SNR)
     square = np.minimum(alike**2 * shares, 1 - 1e-12)
     rest = 1 / (1 - square)
     both = np.exp(-a) * marcum_q1(np.sqrt(2 * b * rest), np.sqrt(2 * square * a * rest)).p
     both += np.exp(-b) * marcum_q1(np.sqrt(2 * square * b * rest), np.sqrt(2 * a * rest)).q
+    missed = np.maximum((1 - bins[0]) * (1 - bins[1]), 1e-300)
+    more = np.expm1(number * np.log1p(np.maximum(both - bins[0] * bins[1], 0.0) / missed))
+    of_many = one * other + (1 - one) * (1 - other) * more
+    both = np.where(number > 1, np.minimum(of_many, np.minimum(one, other)), both)
     return np.where(there, both, np.nan)
+
+
+MOST_BINS = 1e3
+"""Independent bins as which an echo counts at the most."""
+
+
+def independent_bins(pd: np.ndarray, strongest: np.ndarray, level: np.ndarray) -> np.ndarray:
+    """Count the independent bins, each as the strongest, that detect as often as an echo: M.
+
+    Parameters
+    ----------
+    pd
+        Probability that any bin of the echo is detected.
+    strongest, level
+        |X| of its strongest bin and threshold over the noise per quadrature.
+
+    Notes
+    -----
+    With q = exp(-Th^2 / (2 sigma^2 (1 + SNR))) of the strongest bin, 1 - pd = (1 - q)^M. It is 1
+    for a lone line: all its bins fade together.
+    """
+    single = np.exp(-0.5 * np.square(level) / (1 + 0.5 * np.square(strongest)))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        number = np.log1p(-np.minimum(pd, 1 - 1e-15)) / np.log1p(-np.minimum(single, 1 - 1e-15))
+    return np.clip(np.nan_to_num(number, nan=1.0), 1.0, MOST_BINS)
 
 
 def any_two(chances: np.ndarray, others: np.ndarray) -> np.ndarray:
@@ -383,15 +435,7 @@ def any_pair(magnitude, echo, low, ends, levels, pairs):
         crosses, stays = crossing_pair(magnitude[i] / deviation, level / deviation, real)
         if not stays > 0.0:
             return 1.0, 0.0
-        t = _deviate(crosses) if crosses < stays else -_deviate(stays)
-        chance, rest = crosses, stays
-        if before > 0.0:
-            joint = 0.0
-            for k in range(pairs.shape[1]):
-                square = t * t + t_before * t_before - 2.0 * t * t_before * pairs[0, k]
-                joint += pairs[1, k] * math.exp(-square * pairs[2, k])
-            joint = min(joint / before, crosses)
-            chance, rest = crosses - joint, stays + joint
+        chance, rest, t = _after_neighbour((crosses, stays), before, t_before, pairs)
         found += missed * chance
         missed *= rest
         before, t_before = stays, t
@@ -412,6 +456,26 @@ def _any_on_pedestal(magnitude, echo, low, rule, levels):
 
 
 @njit(cache=True, error_model="numpy")
+def _after_neighbour(chances, before, t_before, pairs):
+    """Probabilities that a bin crosses, and that it does not, where the bin before has not.
+
+    ``chances`` are those of the bin by itself, ``before`` and ``t_before`` the probability that the
+    bin before does not cross and the normal deviate of that; below 0 where there is none before.
+    Returns the deviate of this bin as well.
+    """
+    crosses, stays = chances
+    t = _deviate(crosses) if crosses < stays else -_deviate(stays)
+    if not before > 0.0:
+        return crosses, stays, t
+    joint = 0.0
+    for k in range(pairs.shape[1]):
+        square = t * t + t_before * t_before - 2.0 * t * t_before * pairs[0, k]
+        joint += pairs[1, k] * math.exp(-square * pairs[2, k])
+    joint = min(joint / before, crosses)
+    return crosses - joint, stays + joint, t
+
+
+@njit(cache=True, error_model="numpy")
 def any_neighbour(chances, count, pairs):
     """Probability that any of ``count`` adjacent bins crosses, by their own probabilities.
 
@@ -427,14 +491,7 @@ def any_neighbour(chances, count, pairs):
         if crosses < 1e-4:
             found, missed, before = found + missed * crosses, missed * stays, -1.0
             continue
-        t, chance, rest = -_deviate(stays) if stays < crosses else _deviate(crosses), crosses, stays
-        if before > 0.0:
-            joint = 0.0
-            for k in range(pairs.shape[1]):
-                square = t * t + t_before * t_before - 2.0 * t * t_before * pairs[0, k]
-                joint += pairs[1, k] * math.exp(-square * pairs[2, k])
-            joint = min(joint / before, crosses)
-            chance, rest = crosses - joint, stays + joint
+        chance, rest, t = _after_neighbour((crosses, stays), before, t_before, pairs)
         found += missed * chance
         missed *= rest
         before, t_before = stays, t
@@ -472,7 +529,7 @@ def any_faded(magnitude, echo, low, rule, levels, speckle):
     bin k over its power, t uniform (:mod:`sweep.model.quadratures`).
 
     Stretches of bins of half the largest magnitude are echoes by themselves; weaker stretches
-    belong to the one below. It is within 0.016 of drawn echoes of any width and window.
+    belong to the one below. Errors: docs/physics.md.
     """
     largest = 0.0
     for i in range(magnitude.size):

@@ -431,17 +431,38 @@ class Shots:
                     at_ends, up * down + part * (np.minimum(up, down) - up * down), both
                 )
         else:
-            both = detection.fading_together(up, down, level, alike)
+            number = self.independent_bins((up, down), magnitudes)
+            both = detection.fading_together(up, down, level, alike, number)
             speckle, rows = self.speckle_table, self.speckle_table.row[[0, 2]]
             near = np.flatnonzero(rows.any(axis=0))
             if near.size:
-                level, alike = (np.broadcast_to(v, self.size)[near] for v in (level, alike))
+                level, alike, number = (
+                    np.broadcast_to(v, up.shape)[..., near] for v in (level, alike, number)
+                )
                 (both[..., near],) = mean_over_angles(
                     speckle.factors[rows[:, near]],
                     (up[..., near], down[..., near]),
-                    lambda up, down: (detection.fading_together(up, down, level, alike),),
+                    lambda up, down: (detection.fading_together(up, down, level, alike, number),),
                 )
         return both if self.band is None else np.where((up == 0) | (down == 0), 0.0, both)
+
+    def independent_bins(
+        self, chances: tuple[np.ndarray, ...], magnitudes: tuple[np.ndarray, ...]
+    ) -> np.ndarray | float:
+        """Independent bins as which the echoes of some segments count, on the geometric mean.
+
+        By the segments' probabilities of detection and |X| [V] of their strongest bins.
+        """
+        from sweep.model.detection import independent_bins
+
+        if self.detection == "peak_bin":
+            return 1.0
+        deviation = self.line_deviation
+        level = self.threshold / deviation
+        number: Any = 1.0
+        for pd, magnitude in zip(chances, magnitudes, strict=True):
+            number = number * independent_bins(pd, magnitude / deviation, level)
+        return np.asarray(number ** (1 / len(chances)))
 
     @property
     def any_two(self) -> bool:

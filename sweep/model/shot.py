@@ -145,7 +145,7 @@ def statistics(shots: Shots, found: np.ndarray | None = None) -> dict[str, np.nd
     if shots.any_two:
         results["pd_both_chirps"] = shots.both(pd[0], pd[2], (magnitude[0], magnitude[2]))
     if shots.peaks == waveform.STRONGEST:
-        results |= outcomes(shots, pd, miss)
+        results |= outcomes(shots, pd, miss, magnitude)
         # Both peaks are the echo's, and they are read as another range.
         right = np.where(wrong_range, results["pd_shot"], 0.0)
         results["p_wrong_range_shot"] = results["p_wrong_range_shot"] + right

@@ -6,10 +6,10 @@ that starts at t_s, the beat phase
     -2 pi F tau + 2 pi F beta (t_s + t_c),    F = f + S (t_c - tau_0)                            (1)
 
 with the carrier f and the signed chirp rate S of the segment, and the delay tau_0 on the beam's
-axis. F is the optical frequency of the echo in the middle of the record. Between two segments the
-phases of scatterers at different places turn against each other by their difference. If all
-scatterers lay in one bin the two amplitudes, circular complex Gaussian numbers both, would have the
-correlation
+axis. F is the optical frequency of the echo in the middle of the record. If the echo fills a part
+of the record its middle is the centroid of the window there. Between two segments the phases of
+scatterers at different places turn against each other by their difference. If all scatterers lay in
+one bin the two amplitudes, circular complex Gaussian numbers both, would have the correlation
 
     mu = E[exp(i (phase_2 - phase_1))]                                                          (2)
 
@@ -140,6 +140,18 @@ def window_transform(window: Window, distance: np.ndarray) -> np.ndarray:
     """
     place, value = transform_table(window)
     return np.interp(np.abs(distance), place, value, right=0.0)
+
+
+@lru_cache(maxsize=16)
+def middle_moved(window: Window) -> np.ndarray:
+    """Return by how many samples a centroid is later without a window's first k ones, (L + 1,)."""
+    w, n = samples(window.name, window.length), np.arange(window.length)
+    later = np.cumsum(w[::-1])[::-1]
+    moment = np.cumsum((w * n)[::-1])[::-1]
+    moved = np.zeros(window.length + 1)
+    there = later > 1e-6 * w.sum()  # of hardly a sample left nothing is detected
+    moved[:-1][there] = moment[there] / later[there] - moment[0] / later[0]
+    return moved
 
 
 def _half_width(window: Window) -> float:

@@ -23,7 +23,7 @@ from sweep.model.detectors import main_lobe
 from sweep.model.speckle_correlation import window_transform
 from sweep.model.window import COSINE_SUMS, Window, window
 
-SPREADS = np.array([0, 0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0, 1.4, 2.0, 3.0])
+SPREADS = np.array([0, 0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0, 1.4, 2.0, 3.0, 4.5, 7.0, 11.0])
 """Deviations of p that tables have [bins of fs/L, or half main lobes over two if that is more]."""
 
 OFFSETS = 9
@@ -31,7 +31,12 @@ OFFSETS = 9
 
 _STAND_IN_LENGTH = 1024
 _ITERATIONS = 80
-_NODES = 40
+_NODES_MIN = 41
+_NODE_DISTANCE = 0.4
+"""Distance of lines that stand for a Gaussian [bins, as of SPREADS]; a wider one is a comb."""
+_DEVIATIONS_MAX = 4.5
+_SPREAD_OF_BINS = 3.0
+"""Spread up to which twice the deviation is in tables; the strongest mode of wider ones is."""
 
 
 class ModeTable(NamedTuple):
@@ -57,13 +62,13 @@ def mode_table(shape: Window, fft_size: int) -> ModeTable:
     if shape.name in COSINE_SUMS:
         shape = window(shape.name, min(shape.length, _STAND_IN_LENGTH))
     deviations = SPREADS * max(1.0, lobe / 2)
-    half = math.ceil((lobe + 2 * deviations[-1]) * ratio)
+    half = math.ceil((lobe + 2 * _SPREAD_OF_BINS * max(1.0, lobe / 2)) * ratio)
     bins = np.arange(-half, half + 1) / ratio
-    node, weight = np.polynomial.hermite_e.hermegauss(_NODES)
     offsets = np.linspace(-0.5, 0.5, OFFSETS) / ratio
     share = np.empty((deviations.size, OFFSETS, bins.size))
     coherence, lean = np.zeros_like(share), np.empty(share.shape[:2])
     for s, deviation in enumerate(deviations):
+        node, weight = _gaussian_nodes(SPREADS[s])
         for d, offset in enumerate(offsets):
             lines = offset + deviation * node
             of_bins = window_transform(shape, bins[:, None] - lines)
@@ -81,6 +86,14 @@ def mode_table(shape: Window, fft_size: int) -> ModeTable:
     share[0], coherence[0] = 1.0, np.where(coherence[0] < 0, -1.0, 1.0)
     coherence[:, :, 0] = coherence[:, :, 1]
     return ModeTable(deviations * ratio, share, coherence, np.maximum.accumulate(lean, axis=1))
+
+
+def _gaussian_nodes(spread: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return evenly spaced nodes and weights of a mean over a standard normal number."""
+    number = max(_NODES_MIN, math.ceil(2 * _DEVIATIONS_MAX * spread / _NODE_DISTANCE))
+    node = np.linspace(-_DEVIATIONS_MAX, _DEVIATIONS_MAX, number)
+    weight = np.exp(-0.5 * node * node)
+    return node, weight / weight.sum()
 
 
 def _strongest_mode(covariance: np.ndarray) -> np.ndarray:

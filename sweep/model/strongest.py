@@ -45,8 +45,13 @@ _SLOPE = np.array(
 """Derivative at the points of the polynomial through values at them."""
 
 
-def outcomes(shots: Any, pd: np.ndarray, miss: np.ndarray) -> dict[str, np.ndarray]:
-    """Probabilities of segments and shot, (n,) by name: ``pd_``, ``miss_``, ``p_wrong_range_``."""
+def outcomes(
+    shots: Any, pd: np.ndarray, miss: np.ndarray, magnitude: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Probabilities of segments and shot, (n,) by name: ``pd_``, ``miss_``, ``p_wrong_range_``.
+
+    By those of all peaks and |X| [V] of the strongest bin, by segment, (3, n) each.
+    """
     lost, alarm, shared = np.zeros((3, shots.size)), np.zeros((3, shots.size)), np.zeros(shots.size)
     for runs in runs_of(shots, every_bin=True):
         lost[:, runs.part], alarm[:, runs.part], shared[runs.part] = _of_runs(shots, runs, pd)
@@ -60,7 +65,7 @@ def outcomes(shots: Any, pd: np.ndarray, miss: np.ndarray) -> dict[str, np.ndarr
     quiet = (1 - alarm[0]) * (1 - alarm[2])
     both = right[0] * right[2] + shared
     if shots.fading is not None:
-        cross = shots.both(pd[0], pd[2], (pd[0], pd[2])) - pd[0] * pd[2]
+        cross = shots.both(pd[0], pd[2], (magnitude[0], magnitude[2])) - pd[0] * pd[2]
         both = np.minimum(both + quiet * cross, np.minimum(right[0], right[2]))
     report = wrong[0] * (right[2] + wrong[2]) + right[0] * wrong[2]
     return found | {

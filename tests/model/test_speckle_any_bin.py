@@ -28,7 +28,9 @@ def drawn_and_expected(name, padding, spread, place, snr, seed=1):
     time = (np.arange(LENGTH) - LENGTH / 2) / LENGTH
     centre, half = 100 * padding, int((10 + 4 * spread) * padding)
     bins = np.arange(centre - half, centre + half + 1)
-    node, weight = np.polynomial.hermite_e.hermegauss(40 if spread else 1)
+    node = np.linspace(-5, 5, 401) if spread else np.zeros(1)
+    weight = np.exp(-0.5 * node**2)
+    weight /= weight.sum()
     lines = (centre + place) / padding + spread * node
     distance = bins[:, None] / padding - lines
     of_lines = (w * np.cos(2 * np.pi * distance[..., None] * time)).sum(axis=-1)
@@ -72,8 +74,14 @@ def test_a_lone_line_fades_as_one(name, padding, place, snr):
 
 
 @pytest.mark.parametrize(("name", "padding"), WINDOWS)
-@pytest.mark.parametrize("spread", [0.1, 0.3, 0.6, 1.0, 2.0, 3.0])
-def test_wider_echoes_fade_in_parts(name, padding, spread):
-    drawn, pd = drawn_and_expected(name, padding, spread, 0.3, 20.0)
-    rule = 0.017 if name == "rectangular" else 0.007
+@pytest.mark.parametrize(
+    ("spread", "snr"),
+    [(0.1, 20.0), (0.3, 20.0), (0.6, 20.0), (1.0, 20.0), (2.0, 20.0), (3.0, 5.0), (4.0, 5.0),
+     (8.0, 5.0)],
+)  # fmt: skip
+def test_wider_echoes_fade_in_parts(name, padding, spread, snr):
+    drawn, pd = drawn_and_expected(name, padding, spread, 0.3, snr)
+    rule = 0.007
+    if name == "rectangular":
+        rule = 0.017 if padding == 1 else 0.032
     assert abs(drawn - pd) < rule + 3 * np.sqrt(max(pd * (1 - pd), 1e-3) / DRAWS)

@@ -39,23 +39,36 @@ CASES = {
         "target.range": 300.0, "target.grazing_angle": np.radians(25),
         "target.transverse_velocity": -25.0, "target.radial_velocity": 12.0,
     },
+    "four bins": {
+        "target.range": 450.0, "target.grazing_angle": np.radians(1.0),
+        "instrument.processing.window": "hann",
+    },
+    "samples missing": {
+        "target.range": 1500.0, "target.grazing_angle": np.radians(20),
+        "instrument.processing.window": "hann", "instrument.chirp.segments": "up down",
+        "target.transverse_velocity": -21.0,
+    },
     "straight down": {"target.range": 300.0, "target.grazing_angle": np.pi / 2},
 }  # fmt: skip
+
+
+RATIOS = {"four bins": 0.6}
+"""Of |X| to the threshold; any of many bins detects more often than one."""
 
 
 @pytest.mark.parametrize(
     ("rule", "tolerance"),
     [
         ("peak_bin", 0.0),
-        # There is no closed form of both chirps, each detected in any of several bins: drawn
-        # records differ by up to 0.014, and this much is allowed beyond 4 deviations.
-        ("any_bin", 0.012),
+        # There is no closed form of both chirps, each detected in any of several bins. Drawn
+        # records differ by up to 0.01 beyond 4 deviations.
+        ("any_bin", 0.01),
     ],
 )
 @pytest.mark.parametrize("case", CASES)
 def test_both_chirps_are_detected_as_often_as_in_drawn_records(case, rule, tolerance, table_4_1):
     p = DEFAULTS | table_4_1() | LANDER | CASES[case] | {"instrument.processing.detection": rule}
-    p = with_threshold(p, 1.3)
+    p = with_threshold(p, RATIOS.get(case, 1.3))
     shots = shots_of(p)
     outputs = statistics(shots)
     detections = drawn_detections(p, shots, draws=DRAWS, seed=len(case))

@@ -49,6 +49,7 @@ from sweep.model.speckle_correlation import (
     LineSpread,
     SpeckleLines,
     bin_correlation,
+    middle_moved,
     window_transform,
 )
 
@@ -214,6 +215,8 @@ def _line_deviation(shots: Shots, moments: "BeamletMoments") -> np.ndarray:
     return np.sqrt(np.maximum(variance, 0.0))
 
 
+_NODES, _DEVIATIONS_MAX = 81, 4.0
+"""Lines of a footprint, evenly spaced: few would be a comb where they spread over bins."""
 _ALIKE = 1e-9
 """Loss of correlation from the first to the last look up to which all have one speckle."""
 
@@ -272,7 +275,8 @@ def _power_of_looks(shots: Shots, slopes: Slopes) -> np.ndarray:
     nothing = PhaseDifference(np.zeros(shots.size), np.zeros(shots.size))
     padding = shots.fft_size / shots.window.length
     late = np.arange(number) - (number - 1) / 2
-    node, weight = np.polynomial.hermite_e.hermegauss(7)
+    node = np.linspace(-_DEVIATIONS_MAX, _DEVIATIONS_MAX, _NODES)
+    weight = np.exp(-0.5 * node * node)
     drift = np.broadcast_to(shots.look_drift, (len(shots.waveform), shots.size)) / padding
     for segment in map(int, np.flatnonzero(shots.segments)):
         lines = _line_spread(shots, (segment, segment), nothing, slopes)
@@ -380,12 +384,15 @@ def segment_phases(shots: Shots) -> list[PhaseDifference]:
 
 
 def _echo_frequencies(shots: Shots) -> tuple[list[np.ndarray], np.ndarray]:
-    """Optical frequencies F of the echo in the middle of each segment's record, and its times."""
+    """Optical frequencies F of the echo in the middle of each segment's record, and its times.
+
+    That is the centroid of the window over the samples that the echo has: there the phase of a bin
+    is that of the line, to first order in their distance.
+    """
     delay = 2 * shots.range / SPEED_OF_LIGHT
-    first = 0 if shots.first_sample is None else shots.first_sample
-    late = np.broadcast_to(first, (len(shots.carriers), shots.size)) / shots.sample_rate
-    # The middle of the samples that hold the echo.
-    middles = shots.acquisition_delay + (shots.record_duration + late) / 2
+    later = 0.0 if shots.first_sample is None else middle_moved(shots.window)[shots.first_sample]
+    later = np.broadcast_to(later, (len(shots.carriers), shots.size)) / shots.sample_rate
+    middles = shots.acquisition_delay + shots.record_duration / 2 + later
     return [
         carrier + slope * shots.chirp_rate * (middle - delay)
         for carrier, slope, middle in zip(shots.carriers, shots.slopes, middles, strict=True)
