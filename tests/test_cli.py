@@ -364,7 +364,7 @@ def test_a_plan_and_a_run_tell_how_often_noise_raises_an_alarm(here, processing,
     ],
 )
 def test_the_remedy_for_many_false_alarms_names_a_field_that_the_study_has(processing, remedy):
-    from sweep.cli.terminal import fewer_alarms
+    from sweep.spec.noise_alarms import fewer_alarms
 
     drawn = "draws: {method: spectra, number: 2}" if "detector" in processing else ""
     spec = Spec.from_mapping(yaml.safe_load(STUDY.replace("tnr: 8", processing) + drawn))
@@ -372,7 +372,7 @@ def test_the_remedy_for_many_false_alarms_names_a_field_that_the_study_has(proce
 
 
 def test_alarms_of_an_axis_of_thresholds_and_of_cfar_are_by_design(here):
-    from sweep.analysis.noise_only import alarms_of_study
+    from sweep.spec.noise_alarms import alarms_of_study
 
     text = STUDY.replace("instrument.laser.power: [1 W, 3 W]", "instrument.processing.tnr: [7, 9]")
     text = text.replace("tnr: 8", "tnr: 7")

@@ -12,7 +12,7 @@ import numpy as np
 import pandas
 import xarray as xr
 
-from sweep.analysis import labels, noise_only
+from sweep.analysis import labels
 from sweep.analysis.answers.probability import of_a_shot
 from sweep.analysis.selection import (
     NEAREST,
@@ -24,6 +24,7 @@ from sweep.analysis.selection import (
     split,
     statistics,
 )
+from sweep.model import noise_only
 from sweep.model.looks import Looks
 from sweep.model.shot import evaluate
 from sweep.model.threshold import tnr_of

@@ -37,7 +37,6 @@ from sweep.cli.terminal import (
     tell,
     tell_effects,
     tell_inconsistencies,
-    warn_before,
     warn_of,
     warn_of_echoes,
 )
@@ -216,7 +215,6 @@ def run(
     study, path = load(spec), store or _default_store(spec)
     if is_free(path) or not resuming:  # else it was asked as it was begun
         ask_before(study, path, yes=yes)
-        warn_before(study, path)
     outcome = driver.run(study, store=path, overwrite=overwrite, resume=resuming, **how)
     conclude(outcome, shown(path))
 

@@ -28,9 +28,6 @@ if TYPE_CHECKING:
     from sweep.tasks.plan import EffectRow, EffectsTable, Plan
     from sweep.tasks.session import Outcome
 
-MANY_ALARMS = 0.01
-"""Probability of a false alarm in a shot beyond which a study is warned of."""
-
 MOST_POINTS, MOST_BYTES, MOST_SECONDS = 10**9, 10**12, 30 * 86400.0
 """Size of a study, and its time on one core [s], beyond which a run asks before it begins."""
 
@@ -601,7 +598,7 @@ def _excess(points: int, size: int, seconds: float) -> str:
 
 def alarms_told(study: Spec | SceneSpec) -> str:
     """Probability of a false alarm in a shot, in words; empty where it is not known."""
-    from sweep.analysis.noise_only import alarms_of_study
+    from sweep.spec.noise_alarms import alarms_of_study
 
     if not (found := alarms_of_study(study)):
         return ""
@@ -617,38 +614,12 @@ def warn_of(study: Spec | SceneSpec) -> None:
 
     SceneError for a flight that sees nothing.
     """
-    from sweep.analysis.noise_only import alarms_of_study
-    from sweep.tasks.doubts import doubts_of_geometry
+    from sweep.tasks.doubts import doubts_of_spec
 
-    for doubt in doubts_of_geometry(study):
+    for doubt in doubts_of_spec(study):
         tell(f"warning: {doubt}", err=True)
     for sentence in study.unstated_errors():
         tell(f"note: {sentence}", err=True)
-    most = max((any_ for any_, _ in alarms_of_study(study)), default=0.0)
-    if most > MANY_ALARMS:
-        tell(
-            "warning: noise alone raises a false alarm in either chirp with probability "
-            f"{most:.3g} (more than {MANY_ALARMS:g}): {fewer_alarms(study)}",
-            err=True,
-        )
-
-
-def fewer_alarms(study: Spec | SceneSpec) -> str:
-    """Fields of a study to change for fewer false alarms, as an imperative."""
-    from sweep.model.detectors import DETECTORS, FIXED
-    from sweep.model.estimators import DETECTOR
-    from sweep.model.threshold import WAYS
-
-    parameters, kind = study.parameters(), f"{DETECTOR}kind"
-    along = {member.path: member.values for axis in study.axes for member in axis.members}
-    kinds = {str(name) for name in along.get(kind, [parameters.get(kind, FIXED)])}
-    told = []
-    if FIXED in kinds:
-        (way,) = (way for way in WAYS if parameters.get(way) is not None)
-        told.append(f"{'lower' if 'pfa' in way else 'raise'} {way}")
-    if kinds & set(DETECTORS) - {FIXED}:
-        told.append(f"lower {DETECTOR}pfa")
-    return " and ".join(told)
 
 
 def warn_of_echoes(study: Spec | SceneSpec, store: Location) -> None:
@@ -658,16 +629,6 @@ def warn_of_echoes(study: Spec | SceneSpec, store: Location) -> None:
 
     for warning in warnings_of(study_of(study, store.absolute())):
         tell(f"warning: {warning}", err=True)
-
-
-def warn_before(study: Spec | SceneSpec, store: Location) -> None:
-    """Before a run: what :func:`warn_of` has, echoes that lack, and effects off that matter."""
-    from sweep.tasks.doubts import doubts_of_results
-    from sweep.tasks.studies import study_of
-
-    warn_of(study)
-    for doubt in doubts_of_results(study_of(study, store.absolute())):
-        tell(f"warning: {doubt}", err=True)
 
 
 def effects_of(study: Spec | SceneSpec, store: Location, *, costs: bool = True) -> EffectsTable:

@@ -10,7 +10,7 @@ import numpy as np
 import pandas
 import xarray as xr
 
-from sweep.analysis import charts, labels, noise_only
+from sweep.analysis import charts, labels
 from sweep.analysis.answers import probability
 from sweep.analysis.charts import CHANCE, LINEAR, LOG, Axis, Chart, Line, Panel, Ruler
 from sweep.analysis.figures import Study
@@ -24,6 +24,7 @@ from sweep.analysis.selection import (
     split,
     spread,
 )
+from sweep.model import noise_only
 from sweep.model.effects.catalogue import EFFECTS, names_of
 from sweep.model.looks import COMBINE, NUMBER, VOTES, Looks
 from sweep.model.shot import prepare

@@ -15,7 +15,7 @@ import pandas
 import xarray as xr
 import yaml
 
-from sweep.analysis import labels, noise_only
+from sweep.analysis import labels
 from sweep.analysis.charts import Chart, Room
 from sweep.analysis.consistency import consistency
 from sweep.analysis.figures import SceneStudy, Study, held
@@ -29,6 +29,7 @@ from sweep.report import detector, flights
 from sweep.report.flights import Seen
 from sweep.report.page import Item, Page, Section, Table, Text, plot, rendered
 from sweep.spec import SceneSpec, Slices, Spec, Surface
+from sweep.spec.noise_alarms import alarms_of_study
 from sweep.spec.sections import parameter_rules
 from sweep.storage.locations import Location, draft, located
 from sweep.storage.opening import software_versions
@@ -138,7 +139,7 @@ def _answer(
         f"{np.nanmin(columns[3]):.3g}.",
         *further,
     ]
-    if alarms := noise_only.alarms_of_study(spec):
+    if alarms := alarms_of_study(spec):
         most = max(any_ for any_, _ in alarms)
         chance = f"{most:.3g}" + " at the most" * (len(alarms) > 1)
         told.append(f"Noise alone raises a false alarm in either chirp with probability {chance}.")

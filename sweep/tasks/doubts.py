@@ -8,11 +8,13 @@ from __future__ import annotations
 import os
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
+from sweep.messages import is_command
 from sweep.spec import SceneSpec
 from sweep.spec.grid_rules import too_narrow
+from sweep.spec.noise_alarms import warnings_of_alarms
 from sweep.tasks.coverage import coverage, refuse_blind
 from sweep.tasks.echoes import warnings_of
 from sweep.tasks.eyepoint_study import beneath, world_of
@@ -29,8 +31,8 @@ class StudyWarning(UserWarning):
     """A study that can be computed, but is hardly meant as it is written."""
 
 
-def doubts_of_geometry(spec: Spec | SceneSpec) -> Iterator[str]:
-    """Yield what is doubtful of a study's beam, scene and path.
+def doubts_of_spec(spec: Spec | SceneSpec) -> Iterator[str]:
+    """Yield what is doubtful of a study's beam, scene, path and threshold.
 
     SceneError for a flight that sees nothing.
     """
@@ -42,6 +44,7 @@ def doubts_of_geometry(spec: Spec | SceneSpec) -> Iterator[str]:
             yield path
         refuse_blind(spec)
         yield from coverage(spec).warnings()
+    yield from warnings_of_alarms(spec)
 
 
 def doubts_of_results(study: GridStudy | FlightStudy) -> Iterator[str]:
@@ -53,11 +56,20 @@ def doubts_of_results(study: GridStudy | FlightStudy) -> Iterator[str]:
         yield from effects_table(study, costs=False).warnings()
 
 
-def warn_of_doubts(study: GridStudy | FlightStudy) -> None:
-    """Issue a `StudyWarning` for each doubt, at the line of the caller's program."""
+def tell_doubts(study: GridStudy | FlightStudy, say: Callable[[str], None]) -> None:
+    """Tell each doubt of a study, and then errors that it does not state.
+
+    Doubts are a `StudyWarning` each, at the line of the caller's program; the command says them.
+    What is not stated is a note, which is said.
+    """
     level, frame = 1, sys._getframe()
     while frame.f_back is not None and frame.f_code.co_filename.startswith(_PACKAGE):
         level, frame = level + 1, frame.f_back
-    for doubts in (doubts_of_geometry(study.spec), doubts_of_results(study)):
+    for doubts in (doubts_of_spec(study.spec), doubts_of_results(study)):
         for doubt in doubts:
-            warnings.warn(doubt, StudyWarning, stacklevel=level)
+            if is_command():
+                say(f"warning: {doubt}")
+            else:
+                warnings.warn(doubt, StudyWarning, stacklevel=level)
+    for sentence in study.spec.unstated_errors():
+        say(f"note: {sentence}")

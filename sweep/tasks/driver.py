@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from sweep.messages import is_command, option, suggestion
+from sweep.messages import option, suggestion
 from sweep.spec import SceneSpec, Spec
 from sweep.storage.locations import (
     PACKED,
@@ -45,7 +45,7 @@ from sweep.tasks.journal import (
     wait_for_silence,
     write_recipe,
 )
-from sweep.tasks.memory import refuse_too_large_blocks, refuse_too_large_scene
+from sweep.tasks.memory import refuse_too_large_blocks, refuse_too_large_study
 from sweep.tasks.progress import BusyError, ClusterError, StoreError, chosen, told, working
 from sweep.tasks.session import Outcome, Pool, RunOptions, Session
 from sweep.tasks.store import (
@@ -118,14 +118,10 @@ def run(
     pool, study = Pool(how, spec), studies.study_of(spec, path)
     if not overwrite:
         _refuse_in_the_way(path, study)
-    refuse_too_large_blocks(study, pool.memory)
-    if isinstance(spec, SceneSpec):
-        with working("building the scene", pool.told):
-            refuse_too_large_scene(spec, pool.memory)
-    if not is_command():  # which has printed them
-        from sweep.tasks.doubts import warn_of_doubts  # the model's kernels
+    _hold_against_memory(study, pool)
+    from sweep.tasks.doubts import tell_doubts  # the model's kernels
 
-        warn_of_doubts(study)
+    tell_doubts(study, pool.told.say)
     return _into(path, spec, pool, replace=overwrite, anew=True)
 
 
@@ -233,7 +229,19 @@ def extend(
     goal = path if to is None else real(located(to))
     if not overwrite:
         under_way(goal)
+    study = studies.study_of(asked, goal)
+    _hold_against_memory(study, pool)
+    from sweep.tasks.doubts import tell_doubts  # the model's kernels
+
+    tell_doubts(study, pool.told.say)
     return _into(goal, asked, pool, replace=overwrite or goal == path, anew=overwrite, extends=path)
+
+
+def _hold_against_memory(study: GridStudy | FlightStudy, pool: Pool) -> None:
+    """Refuse a study that is too large for what computes it, here or once that is reached."""
+    pool.study = study
+    with working("building the scene", pool.told):
+        refuse_too_large_study(study, pool.memory)
 
 
 def _refuse_no_study(spec: object) -> None:
@@ -332,9 +340,12 @@ def _into(
                 pool.told.say(line)
 
         def prepare() -> None:
-            if there and anew and not pool.is_plain:
+            is_created = anew or not there
+            if is_created and pool.is_reached_by_address:
+                pool.connect()  # its workers' memory may be too small for the study
+            elif there and anew and not pool.is_plain:
                 pool.connect()  # what was begun goes when there are workers for what replaces it
-            if anew or not there:
+            if is_created:
                 create(new, study, replace=there, recipe=facts, durable=durable)
             if extends is not None:
                 pool.told.say(what_is_there(new, study))
@@ -408,7 +419,8 @@ def _go_on(
     pool: Pool,
     prepare: Callable[[], None] = lambda: None,
 ) -> Outcome:
-    pool.most = study.n_blocks
+    pool.most, pool.study = study.n_blocks, study
+    refuse_too_large_blocks(study, pool.memory)
     with pool.interrupts, ExitStack() as stack, pool:  # the lock goes when the workers are gone
         prepare()
         lock = Lock(path, pool.told.say)
@@ -443,7 +455,7 @@ def _cast(study: FlightStudy, pool: Pool) -> tuple[dict[str, int], str]:
         rays[scanner] = 0
         if _is_whole(path, eyepoints):
             continue
-        _ = eyepoints.world  # what is wrong with the scene is the user's to mend, not a block's
+        _hold_against_memory(study, pool)  # a scene's mistakes are the user's, not a block's
         with ExitStack() as stack:
             if not (lock := _locked(path, eyepoints, pool)):
                 del rays[scanner]

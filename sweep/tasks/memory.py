@@ -7,13 +7,16 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from sweep.messages import option
+from sweep.spec import SceneSpec
 from sweep.spec.clusters import AnyCluster, Bounds, Local
 from sweep.spec.rules import Mistake, SpecError
 
 if TYPE_CHECKING:
     from distributed import Client
 
-    from sweep.spec import SceneSpec, Spec
+    from sweep.spec import Spec
+    from sweep.tasks.flight_study import FlightStudy
+    from sweep.tasks.grid_study import GridStudy
     from sweep.tasks.study import Study
 
 FFT_SIZE = "instrument.processing.fft_size"
@@ -91,6 +94,14 @@ def refuse_too_large(spec: Spec | SceneSpec, memory: WorkerMemory) -> None:
         size = f"{largest_fft(spec):,} points"
         remedy = f"take fewer points of the FFT{_or_fewer_workers(memory, needed)}"
         raise SpecError([Mistake(FFT_SIZE, rule, size, remedy)])
+
+
+def refuse_too_large_study(study: GridStudy | FlightStudy, memory: WorkerMemory) -> None:
+    """Refuse a study of which a point, a block or the scene takes more than a process has."""
+    refuse_too_large(study.spec, memory)
+    refuse_too_large_blocks(study, memory)
+    if isinstance(study.spec, SceneSpec):
+        refuse_too_large_scene(study.spec, memory)
 
 
 def refuse_too_large_scene(spec: SceneSpec, memory: WorkerMemory) -> None:

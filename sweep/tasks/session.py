@@ -42,7 +42,12 @@ from sweep.storage.opening import read_receipts
 from sweep.tasks import journal, store
 from sweep.tasks.interrupts import Interrupts
 from sweep.tasks.journal import Failure, Journal, Lock, Look, Receipt, given_up
-from sweep.tasks.memory import refuse_too_large, this_machine, worker_memory
+from sweep.tasks.memory import (
+    refuse_too_large,
+    refuse_too_large_study,
+    this_machine,
+    worker_memory,
+)
 from sweep.tasks.progress import (
     ClusterError,
     Progress,
@@ -61,6 +66,8 @@ if TYPE_CHECKING:
 
     from sweep.spec import SceneSpec
     from sweep.tasks.cluster import Reached
+    from sweep.tasks.flight_study import FlightStudy
+    from sweep.tasks.grid_study import GridStudy
 
 #: Scheduler "address" of the plain loop.
 NONE = "none"
@@ -258,6 +265,7 @@ class Pool(ExitStack):
             this_machine() if self.is_plain else worker_memory(options.client, self._cluster)
         )
         refuse_too_large(spec, self.memory)
+        self.study: GridStudy | FlightStudy | None = None  # once it is known
         self.most = 1  # blocks of the study: more workers than that have nothing to do
         self._reached: Reached | None = None
 
@@ -265,6 +273,11 @@ class Pool(ExitStack):
     def is_plain(self) -> bool:
         """Tell whether blocks are computed in a plain loop, without workers."""
         return self.options.client is None and self._cluster is None
+
+    @property
+    def is_reached_by_address(self) -> bool:
+        """Tell whether the workers are those of a scheduler that runs already."""
+        return self.options.client is None and isinstance(self._cluster, Address)
 
     def connect(self) -> Reached:
         """Reach the workers, no more than `most`; ClusterError where there are none to be had."""
@@ -282,8 +295,9 @@ class Pool(ExitStack):
                         say=self.told.say,
                     )
                 )
-                if isinstance(self._cluster, Address):  # whose workers are known from here on
-                    refuse_too_large(self._spec, worker_memory(self._reached.client, None))
+                if self.is_reached_by_address and self.study is not None:
+                    # Its workers are known from here on.
+                    refuse_too_large_study(self.study, worker_memory(self._reached.client, None))
             elif client.asynchronous:
                 raise ClusterError("the client is asynchronous: give one of another kind, Client()")
             else:

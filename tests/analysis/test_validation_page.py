@@ -7,7 +7,7 @@ import pytest
 import validation
 
 import sweep
-from sweep.analysis.noise_only import bin_probability
+from sweep.model.noise_only import bin_probability
 from sweep.spec import Spec, load
 
 ROOT = Path(__file__).parents[2]

@@ -9,6 +9,7 @@ from small_flights import small_scene
 from sweep.spec import SpecError
 from sweep.tasks import driver, memory
 from sweep.tasks.plan import plan
+from sweep.tasks.store import create
 from sweep.tasks.studies import study_of
 
 HUGE = {"instrument.processing.fft_size": [2**16, 2**30]}
@@ -78,6 +79,41 @@ def test_a_scene_is_held_against_the_memory_of_each_worker(tmp_path, monkeypatch
         with pytest.raises(SpecError, match=r"scene\.objects: takes about .* in each process"):
             use()
     assert not (tmp_path / "s.zarr").exists()
+
+
+def test_a_store_that_goes_on_is_held_against_memory_too(tmp_path, monkeypatch):
+    spec, whole = small_scene(), small_scene(draws={"number": 6, "returns": 3})
+    runs(spec, tmp_path / "s.zarr")
+    limit = memory.point_bytes(spec) + memory.scene_bytes(spec) - 1
+    monkeypatch.setattr("distributed.system.MEMORY_LIMIT", limit)
+    plain = {"scheduler": "none", "progress": False}
+    with pytest.raises(SpecError, match=r"scene\.objects: takes about .* in each process"):
+        driver.extend(tmp_path / "s.zarr", whole, to=tmp_path / "t.zarr", **plain)
+    assert not (tmp_path / "t.zarr").exists()
+    assert driver.resume(tmp_path / "s.zarr", **plain).complete  # nothing is left to compute
+    begun = tmp_path / "begun" / "s.zarr"
+    create(begun, study_of(spec, begun), recipe={"base": str(Path.cwd())})
+    with pytest.raises(SpecError, match=r"scene\.objects: takes about .* in each process"):
+        driver.resume(begun, **plain)
+
+
+@pytest.mark.parametrize("kind", ["grid", "flight"])
+def test_a_refusal_by_the_workers_of_a_scheduler_leaves_nothing(kind, tmp_path, monkeypatch):
+    from distributed import LocalCluster
+
+    spec = small_scene() if kind == "flight" else small(axes=HUGE)
+    monkeypatch.setattr("distributed.system.MEMORY_LIMIT", 10**13)
+    if kind == "flight":  # a point fits into a worker, and the scene with it does not
+        monkeypatch.setattr(memory, "scene_bytes", lambda spec: 2 * 10**9)
+    one = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "dashboard_address": None}
+    with (
+        LocalCluster(**one, memory_limit="1 GB", protocol="tcp") as cluster,
+        pytest.raises(SpecError, match=r"a worker of the client has 1\.0 GB"),
+    ):
+        driver.run(
+            spec, store=tmp_path / "s.zarr", scheduler=cluster.scheduler_address, progress=False
+        )
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_block_that_no_memory_holds_is_refused(tmp_path, monkeypatch):

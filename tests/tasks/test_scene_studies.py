@@ -126,7 +126,7 @@ def test_another_radiometry_of_the_same_geometry_casts_no_ray(undisturbed, tmp_p
     )
     looks = []
     # Warnings are of a few rays, before the geometry is looked for.
-    monkeypatch.setattr("sweep.tasks.doubts.warn_of_doubts", lambda study: None)
+    monkeypatch.setattr("sweep.tasks.doubts.tell_doubts", lambda study, say: None)
     monkeypatch.setattr("sweep.model.eyepoints.observe", lambda *a, **k: looks.append(a))
     outcome = quiet(other, tmp_path / "darker.zarr")
     assert outcome.complete and outcome.rays == {"three": 0, "line": 0} and not looks

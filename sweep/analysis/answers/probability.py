@@ -10,7 +10,6 @@ import dask.array
 import numpy as np
 import xarray as xr
 
-from sweep.analysis import noise_only
 from sweep.analysis.answers.physical import (
     parameter,
     quantity,
@@ -179,7 +178,23 @@ def of_a_shot(dataset: xr.Dataset, leakage: bool) -> xr.DataArray:
         return noise
     require_variables(dataset, "pfa_segment", "p_leakage_up", "p_leakage_down")
     segments = (dataset["p_leakage_up"], dataset["p_leakage_down"])
-    return noise_only.shot_with_leakage(dataset["pfa_segment"], noise, *segments)
+    return shot_with_leakage(dataset["pfa_segment"], noise, *segments)
+
+
+def shot_with_leakage(
+    pfa_segment: xr.DataArray,
+    pfa_both_chirps: xr.DataArray,
+    p_leakage_up: xr.DataArray,
+    p_leakage_down: xr.DataArray,
+) -> xr.DataArray:
+    """Probability that noise or leakage raises an extra group in both chirp segments, 0..1.
+
+    Of noise alone in the up-chirp, and in both, a product, as the segments' numbers of bins
+    differ; of leakage in each.
+    """
+    down = pfa_both_chirps / (pfa_segment + (pfa_segment == 0))  # both are 0 where one is
+    up = pfa_segment + p_leakage_up * (1 - pfa_segment)
+    return up * (down + p_leakage_down * (1 - down))
 
 
 STATISTICS = ("mean", "least", "largest", "number")

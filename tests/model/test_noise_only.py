@@ -2,7 +2,7 @@ import mpmath
 import numpy as np
 import pytest
 
-from sweep.analysis import noise_only
+from sweep.model import noise_only
 
 
 def shot_probability(tnr, bins):
