@@ -179,15 +179,20 @@ class Seen(NamedTuple):
     """int64: numbers of bins of leaked signal, that may raise a false alarm by themselves."""
     leaked: np.ndarray
     """|X| / sigma of them."""
+    edge: np.ndarray
+    """|X| / sigma of the bin next to each of them that is exempt from false alarms, 0 for none."""
+    side: np.ndarray
+    """int64: 1 where that bin is above, else -1."""
 
     @classmethod
     def nothing(cls, points: int) -> "Seen":
         """No spectra, for what is drawn against probabilities."""
         low, stretch = np.zeros((points, 3), np.int64), np.zeros((points, 3, 2), np.int64)
         none, others = np.full((points, 3), np.nan), np.zeros((points, 3))
-        real, leaked = np.zeros((points, 3), np.bool_), (np.empty(0, np.int64), np.empty(0))
-        bins = low, low, np.empty(0), np.empty(0, np.bool_)
-        return cls(low, low, none, real, *bins, others, stretch, *leaked)
+        numbers, values = np.empty(0, np.int64), np.empty(0)
+        bins = low, low, values, np.empty(0, np.bool_)
+        leaked = numbers, values, values, numbers
+        return cls(low, low, none, np.zeros((points, 3), np.bool_), *bins, others, stretch, *leaked)
 
 
 def seen_spectra(
@@ -210,6 +215,9 @@ def seen_spectra(
         inside = runs.inside.T.ravel()
         leaks = (ratio >= floor[point]) & ((number != peak[run]) | ~inside[run])
         leaks &= ~runs.exempt[at]
+        edges = np.pad(np.where(runs.exempt[at], ratio, 0.0), 1)
+        below = np.where(number > 0, edges[:-2], 0.0)
+        above = np.where(number < count[run] - 1, edges[2:], 0.0)
         leaking = np.bincount(run[leaks], minlength=count.size).reshape(-1, 3)
         after = np.cumsum(leaking).reshape(-1, 3)
         there = runs.bins.T > 0
@@ -230,6 +238,8 @@ def seen_spectra(
             stretch=np.stack([after - leaking, after], axis=2),
             aside=number[leaks],
             leaked=ratio[leaks],
+            edge=np.maximum(below, above)[leaks],
+            side=np.where(above >= below, 1, -1)[leaks],
         )
         # In C order as those of `nothing`: numba compiles anew for each order.
         yield runs.part, Seen(*map(np.ascontiguousarray, seen))

@@ -75,6 +75,9 @@ class Interpolator(NamedTuple):
     """What makes the noise of three adjacent bins, in one quadrature, of independent numbers z for
     the middle one, the one above and the one below: above m0 z0 + m1 z1, below m0 z0 + m2 z1 +
     m3 z2."""
+    sidelobe_correlation: float
+    """Correlation of the noise of neighbouring bins in phase with a tone's sidelobes there, which
+    change sign from one to the next: once in L of N bins, for records of L samples."""
     widening: np.ndarray
     """(m,): shift [bins] by |delta| over the variance [bins^2] of lines that add as powers."""
 
@@ -113,6 +116,7 @@ def interpolator(window: Window, fft_size: int) -> Interpolator:
         weight=0 * weight if vanishing else weight,
         error=error,
         mixing=_mixing(near, far),
+        sidelobe_correlation=near * (1.0 - 2.0 * window.length / fft_size),
         widening=np.zeros(0),
     )
     return tables._replace(widening=_widening(window, fft_size, tables))
@@ -332,7 +336,10 @@ def _late_tables(window: Window, fft_size: int) -> tuple[np.ndarray, np.ndarray]
         weight = rises * phase
         variance = np.einsum("jk,kl,jl->j", weight.conj(), noise, weight).real
         error = np.sqrt(np.maximum(variance, 0.0)) / slope
-        whole = np.interp(place, np.linspace(0, 1, tables.error.size), tables.error)
+        if tables.measure == TWO_BINS:  # on a bin either neighbour may be the larger one
+            error[0] = error[1]
+        # Of a whole echo's error at the place that is read, by which it is stated.
+        whole = np.interp(read, np.linspace(0, 1, tables.error.size), tables.error)
         distinct = np.append(True, np.diff(read) > 1e-9)
         shift[i] = np.interp(place, read[distinct], place[distinct]) - place
         wider[i] = np.interp(place, read[distinct], (error / whole)[distinct])

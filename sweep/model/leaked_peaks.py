@@ -55,6 +55,9 @@ SELDOM = 1e-9
 LINE = 1 << 24
 """Numbers of the random numbers of the line, from which they count apart from the echoes'."""
 
+EDGES = 1 << 25
+"""Numbers of the random numbers of bins of an echo next to leaked signal, likewise."""
+
 POINTS_WITH_LINE = 4
 """Points whose bins of a line of leaked light are held at a time: a hundred million numbers."""
 
@@ -82,6 +85,8 @@ class LeakedPeaks(NamedTuple):
     """ln(|X| / sigma)"""
     echo: np.ndarray
     """int64: the group with which the bin fades."""
+    edge: np.ndarray
+    """|X| / sigma of the bin next to it that is exempt from false alarms, 0 for none."""
     total: np.ndarray
     """(m, 3): sum of the rates of these bins without fading."""
     line_stretch: np.ndarray
@@ -105,8 +110,9 @@ class LeakedPeaks(NamedTuple):
         """No leaked signal."""
         none, bins, sums = np.zeros((points, 3, 2), np.int64), np.empty(0, np.int64), (points, 3)
         return cls(
-            none, bins, np.empty(0), bins, np.zeros(sums), none, bins, np.empty((PHASES, 0)),
-            np.zeros(sums), none, bins, np.zeros((points, 1)), np.zeros((points, 2)),
+            none, bins, np.empty(0), bins, np.empty(0), np.zeros(sums), none, bins,
+            np.empty((PHASES, 0)), np.zeros(sums), none, bins, np.zeros((points, 1)),
+            np.zeros((points, 2)),
         )  # fmt: skip
 
     def mean_leakage(self) -> np.ndarray:
@@ -165,7 +171,8 @@ def leaked_peaks(
             rates, scale = _rates(shots.looks, level, floor)
             leaks = leaks._replace(
                 stretch=seen.stretch, bin=_leaked_bins(seen)[0],
-                amplitude=np.empty(seen.aside.size), echo=echo, rates=rates, scale=scale,
+                amplitude=np.empty(seen.aside.size), echo=echo, edge=seen.edge, rates=rates,
+                scale=scale,
             )  # fmt: skip
             _sum_rates(seen.leaked, leaks)
             yield part, leaks
@@ -211,7 +218,10 @@ def _with_line(
             stretches[:, j, s, 1] = ends
     none = np.empty(0, np.int64)
     return (
-        seen._replace(stretch=stretches[0], aside=seen.aside[kept], leaked=seen.leaked[kept]),
+        seen._replace(
+            stretch=stretches[0], aside=seen.aside[kept], leaked=seen.leaked[kept],
+            edge=seen.edge[kept], side=seen.side[kept],
+        ),
         echo[kept],
         LeakedPeaks.nothing(part.size)._replace(
             line_stretch=stretches[1], line_bin=np.concatenate([none, *raised]),
@@ -343,7 +353,7 @@ def list_peak(peak, bins, ratios, number):
 
 
 @njit(cache=True, error_model="numpy")
-def draw_leaked(address, at, leaks, fading, level, looks, bins, ratios):
+def draw_leaked(address, at, leaks, fading, level, looks, tables, bins, ratios):
     """List the strongest peaks that leaked signal raises in a segment; return their number.
 
     ``address``: key of the point, number of the draw; ``at``: point and segment; ``fading`` (most,
@@ -353,32 +363,35 @@ def draw_leaked(address, at, leaks, fading, level, looks, bins, ratios):
     """
     (a, b, draw), (i, s) = address, at
     number = _list_raised(
-        address, s, 0, leaks.stretch[i, s], leaks.bin, leaks.amplitude, leaks.echo, fading[:, s],
-        leaks.total[i, s], leaks.rates[i], leaks.scale[i], (level, looks), bins, ratios, 0,
+        address, s, 0, leaks.stretch[i, s], leaks.bin, leaks.amplitude, leaks.echo, leaks.edge,
+        fading[:, s], leaks.total[i, s], leaks.rates[i], leaks.scale[i],
+        (level, looks, tables.sidelobe_correlation), bins, ratios, 0,
     )  # fmt: skip
     if leaks.line_total[i, s] > 0.0:
         turn = philox.uniform(a, b, draw, philox.STREAM_LEAKAGE[s], LINE)
         phase = int(turn * leaks.line_amplitude.shape[0])
         number = _list_raised(
             address, s, LINE + 1, leaks.line_stretch[i, s], leaks.line_bin,
-            leaks.line_amplitude[phase], np.zeros(leaks.line_bin.size, np.int64), np.ones(1),
-            leaks.line_total[i, s], leaks.rates[i], leaks.scale[i], (level, looks), bins, ratios,
-            number,
+            leaks.line_amplitude[phase], np.zeros(leaks.line_bin.size, np.int64),
+            np.zeros(leaks.line_bin.size), np.ones(1), leaks.line_total[i, s], leaks.rates[i],
+            leaks.scale[i], (level, looks, 0.0), bins, ratios, number,
         )  # fmt: skip
     return number
 
 
 @njit(cache=True, error_model="numpy")
 def _list_raised(
-    address, s, first, stretch, bins, amplitude, echo, fading, total, rates, scale, law,
+    address, s, first, stretch, bins, amplitude, echo, edge, fading, total, rates, scale, law,
     listed, ratios, number,
 ):  # fmt: skip
     """Go from one bin that is raised to the next; adjacent ones make one peak, the largest.
 
-    Random numbers are those from ``first`` on of the segment's stream; ``total`` is the sum of the
-    rates of all bins without fading; ``law`` the threshold and the number of looks.
+    They are of the echo if they join on to a bin of it that crosses. Random numbers are those from
+    ``first`` on of the segment's stream; ``total`` is the sum of the rates of all bins without
+    fading; ``law`` the threshold, the number of looks, and the correlation of neighbours' noise.
     """
-    (a, b, draw), stream, (level, looks) = address, philox.STREAM_LEAKAGE[s], law
+    (a, b, draw), stream, (level, looks, near) = address, philox.STREAM_LEAKAGE[s], law
+    rest = math.sqrt(1.0 - near * near)
     left, brightest = -math.log1p(-philox.uniform(a, b, draw, stream, first)), 0.0
     for g in range(fading.size):
         brightest = max(brightest, fading[g])
@@ -386,23 +399,29 @@ def _list_raised(
         return number
     many = math.sqrt(float(looks))
     z = level * many
-    before, peak, largest = np.int64(-2), np.int64(-1), 0.0
+    before, peak, largest, is_echo = np.int64(-2), np.int64(-1), 0.0, False
     for k in range(stretch[0], stretch[1]):
         own = amplitude[k] + math.log(fading[echo[k]])
         left -= _rate(own, rates, scale)
         if left > 0.0:
             continue
         if bins[k] != before + 1:
-            number = list_peak((peak, largest), listed, ratios, number)
-            peak, largest = np.int64(-1), 0.0
+            number = list_peak((np.int64(-1) if is_echo else peak, largest), listed, ratios, number)
+            peak, largest, is_echo = np.int64(-1), 0.0, False
         before, signal = bins[k], math.exp(own) * many
         chance = philox.uniform(a, b, draw, stream, first + 1) * _added(signal, z)
+        if edge[k] > 0.0:  # its noise is in step with that which raises this bin
+            re, im = philox.normal_pair(a, b, draw, stream, EDGES + k - stretch[0])
+            along = edge[k] * fading[echo[k]] * many + near * (
+                _exceeded(signal, z, chance) - signal
+            )
+            is_echo |= math.hypot(along + rest * re, rest * im) >= z
         least = max(largest, ratios[number - 1] if number == ratios.size else 0.0)
         if least * many < z or _added(signal, least * many) > chance:
             peak, largest = bins[k], _exceeded(signal, z, chance) / many
         first += 2
         left = -math.log1p(-philox.uniform(a, b, draw, stream, first))
-    return list_peak((peak, largest), listed, ratios, number)
+    return list_peak((np.int64(-1) if is_echo else peak, largest), listed, ratios, number)
 
 
 @njit(cache=True, error_model="numpy")

@@ -42,7 +42,8 @@ from scipy import fft
 from sweep.model import waveform
 from sweep.model.band import is_searched
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.detectors import DETECTORS, Detector, Setting, main_lobe, taper
+from sweep.model.detection import mark
+from sweep.model.detectors import DETECTORS, FIXED, Detector, Setting, main_lobe, taper
 from sweep.model.effects.line_width import seen_line, walk_steps, walked_phase
 from sweep.model.effects.segment_motion import looks_of
 from sweep.model.estimators import (
@@ -93,8 +94,7 @@ class Signal(NamedTuple):
     all."""
     first: int
     """First of the bins that the signal occupies: those from the first to the last of half its
-    largest magnitude, and a main lobe's half-width to either side. What is detected elsewhere is
-    a false alarm, leaked signal or not."""
+    largest magnitude, and a main lobe's half-width to either side."""
     last: int
     """Last of them; below ``first`` where there is no echo, or its largest bin is not searched."""
     frequency: float
@@ -110,14 +110,19 @@ class Signal(NamedTuple):
     """
     reach: int = 0
     """Bins on either side of such an echo that it occupies."""
+    exempt: np.ndarray | None = None
+    """(bins,) bool: bins that raise no false alarm: those from ``first`` to ``last``, and those at
+    or above the threshold with their neighbours, as of :func:`sweep.model.detection.mark`."""
 
 
 def signal_of(
-    shots: Shots, i: int, segment: int, echoes: Sequence[int] | np.ndarray = ()
-) -> Signal:
+    shots: Shots, i: int, segment: int, echoes: Sequence[int] | np.ndarray = (),
+    level: float = math.inf,
+) -> Signal:  # fmt: skip
     """Spectrum of point i's segment without noise: 0 up, 1 Doppler, 2 down.
 
     ``echoes``: strongest bins of the echoes of several surfaces, where there are several.
+    ``level``: fixed threshold [V], if there is one: bins that reach it raise no false alarm.
     """
     magnitude = whole_spectrum(shots, i, segment)
     if (laser := _laser(shots, i))["line_width"] > 0:  # as it is before its phase walks
@@ -131,7 +136,8 @@ def signal_of(
     k = int(np.clip(np.argmax(magnitude), least, last - least))
     if not magnitude[k] > 0:
         place = float(k - index_of_zero(shots))
-        return Signal(magnitude.astype(complex), k, 1, 0, place, 0.0, segment)
+        none = np.zeros(magnitude.size, bool)
+        return Signal(magnitude.astype(complex), k, 1, 0, place, 0.0, segment, exempt=none)
     place = _between(shots, magnitude, k)
     turn = turn_of(shots, k)
     high = np.flatnonzero(unrolled(shots, magnitude, k) >= 0.5 * magnitude[k]) - turn
@@ -175,7 +181,25 @@ def signal_of(
         echo=echo,
         others=others,
         reach=beside,
+        exempt=_exempt_bins(shots, magnitude, k, (first, end), level),
     )
+
+
+def _exempt_bins(
+    shots: Shots, magnitude: np.ndarray, strongest: int, ends: tuple[int, int], level: float
+) -> np.ndarray:
+    """Bins that raise no false alarm, as of :class:`Signal`; none of an echo not searched for."""
+    first, last = ends
+    exempt = np.zeros(magnitude.size, bool)
+    if last < first:
+        return exempt
+    run = unrolled(shots, magnitude, strongest)
+    marked = np.zeros(run.size, bool)
+    mark(run, run.size, level, marked, shots.echo_rule.beside)
+    if shots.complex_record:
+        marked = np.roll(marked[1:-1], 1 - turn_of(shots, strongest))
+    exempt[np.arange(first, last + 1) % exempt.size] = True
+    return exempt | marked
 
 
 def index_of_zero(shots: Shots) -> int:
@@ -348,7 +372,7 @@ def spectra_of(view: "View", segment: int, draws: np.ndarray) -> Iterator[np.nda
         if id(shots) not in known:
             signal = view.signals[segment]
             if shots is not view.shots or signal is None:
-                signal = signal_of(shots, view.i, segment, view.echoes_of(segment))
+                signal = signal_of(shots, view.i, segment, view.echoes_of(segment), view.level)
             known[id(shots)] = signal
         signal = known[id(shots)]
         factors = _speckle_in_look(view, shots, segment, k, draws, signal)
@@ -404,6 +428,8 @@ class View(NamedTuple):
     """(3, k) int64: strongest bins of the shot's echoes in each segment, -1 for none."""
     fan: LineFan | None = None
     """Lines of all shots' footprints in developed speckle."""
+    level: float = math.inf
+    """Fixed threshold [V], if the detector has one."""
 
     def echoes_of(self, segment: int) -> np.ndarray:
         """Return indices of the echoes' strongest bins in a segment; none where echoes are one."""
@@ -452,9 +478,10 @@ def view_of(
         methods.estimators[str(p[ESTIMATOR + "kind"])],
         echoes,
         line_fan(shots) if fan is None else fan,
+        setting.threshold if str(p[DETECTOR + "kind"]) == FIXED else math.inf,
     )  # fmt: skip
     signals = tuple(
-        signal_of(shots, i, s, view.echoes_of(s)) if there else None
+        signal_of(shots, i, s, view.echoes_of(s), view.level) if there else None
         for s, there in enumerate(shots.segments)
     )
     return view._replace(signals=signals)
@@ -501,7 +528,9 @@ def look(spectra: Sequence[np.ndarray], signal: Signal, view: View) -> Found:
     edges = np.diff(flags.astype(np.int8), axis=1)
     row, start = np.nonzero(edges > 0)  # of each group of flagged bins
     start, end = start + 1, np.nonzero(edges < 0)[1] + 1
-    false = (start > last) | (end <= before)
+    assert signal.exempt is not None
+    exempt = np.cumsum(np.pad(unrolled(shots, signal.exempt, signal.strongest), (1, 0)))
+    false = exempt[start] == exempt[end]  # no bin of theirs is exempt
     false &= (start <= half - shots.searched_from) & (end > shots.searched_from)
     alarms, bins_flagged = (
         np.bincount(row[false], weights, len(power)).astype(np.int64)
@@ -533,7 +562,7 @@ def counted(view: View, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             found[s] = look(list(spectra_of(view, s, draws)), signal, view)
             bins = np.arange(view.shots.bins)
             inside = is_searched(view.shots, s, view.i, bins - index_of_zero(view.shots))
-            occupied = inside[np.arange(signal.first, signal.last + 1) % bins.size].sum()
+            occupied = inside[signal.exempt].sum()
             least = 0 if view.shots.complex_record else view.shots.searched_from
             searched += int(inside[least : bins.size - least].sum() - occupied)
     up, doppler, down = found

@@ -545,8 +545,8 @@ _HALF_A_BIN = 0.5
 def _with_late_echo(shots: Shots, drawn: Drawn, told: Told) -> Drawn:
     """Correct places between bins for the samples that lack before the echo arrives.
 
-    The instrument knows them by the range that whole bins tell. Where so many lack that the place
-    can not be read, the error is half a bin.
+    The instrument knows them by the range that whole bins tell. No error is larger than half a bin,
+    as a place is always within one.
     """
     column = partial(columns, shots, dims=2)
     delay = 2 / SPEED_OF_LIGHT * np.nan_to_num(told.range[..., WHOLE])
@@ -918,9 +918,9 @@ def draw_peaks(address, at, how, known, seen, leaks, fading, speckle, tables, pe
     room = peaks.shape[0] - count
     false, ratios, number = np.empty(room, np.int64), np.zeros(room), 0
     if how.noisy:
-        number = list_noisy(address, at, seen, leaks, fading[:, s], beta, false, ratios)
+        number = list_noisy(address, at, seen, leaks, fading[:, s], beta, tables, false, ratios)
     else:
-        number = draw_leaked(address, at, leaks, fading, beta, how.looks, false, ratios)
+        number = draw_leaked(address, at, leaks, fading, beta, how.looks, tables, false, ratios)
     stream = philox.STREAM_NOISE_MAXIMUM[s] if how.noisy else philox.STREAM_FALSE_ALARM[s]
     words = philox.words4(a, b, draw, stream, philox.FIRST_BLOCK)
     chance = philox.to_uniform(words[0])
@@ -940,27 +940,36 @@ def draw_peaks(address, at, how, known, seen, leaks, fading, speckle, tables, pe
 
 
 @njit(cache=True, error_model="numpy")
-def list_noisy(address, at, seen, leaks, fading, level, bins, ratios):
+def list_noisy(address, at, seen, leaks, fading, level, tables, bins, ratios):
     """List the strongest peaks of bins of leaked signal with their noise; return their number.
 
-    Adjacent bins that cross make one peak, the largest. ``fading`` (most,): factors on the groups'
-    magnitudes. Results are bins, and |X| / sigma.
+    Adjacent bins that cross make one peak, the largest, or are of the echo if they join on to a bin
+    of it that crosses. ``fading`` (most,): factors on the groups' magnitudes. Results are bins, and
+    |X| / sigma.
     """
     (a, b, draw), (i, s) = address, at
     number, before, peak, largest = 0, np.int64(-2), np.int64(-1), 0.0
+    near, is_echo = tables.sidelobe_correlation, False
+    rest = math.sqrt(1.0 - near * near)
     for n in range(seen.stretch[i, s, 0], seen.stretch[i, s, 1]):
         re, im = philox.normal_pair(a, b, draw, philox.STREAM_NOISE[s], seen.aside[n])
-        ratio = math.hypot(seen.leaked[n] * fading[leaks.echo[n]] + re, im)
+        faded = fading[leaks.echo[n]]
+        ratio = math.hypot(seen.leaked[n] * faded + re, im)
         if ratio < level:
             continue
         place = seen.low[i, s] + seen.aside[n]
         if place != before + 1:
-            number = list_peak((peak, largest), bins, ratios, number)
-            peak, largest = np.int64(-1), 0.0
+            number = list_peak((np.int64(-1) if is_echo else peak, largest), bins, ratios, number)
+            peak, largest, is_echo = np.int64(-1), 0.0, False
         before = place
         if ratio > largest:
             peak, largest = place, ratio
-    return list_peak((peak, largest), bins, ratios, number)
+        if seen.edge[n] > 0.0:
+            own = seen.aside[n] + seen.side[n]
+            re_own, im_own = philox.normal_pair(a, b, draw, philox.STREAM_NOISE[s], own)
+            along = seen.edge[n] * faded + near * re + rest * re_own
+            is_echo |= math.hypot(along, near * im + rest * im_own) >= level
+    return list_peak((np.int64(-1) if is_echo else peak, largest), bins, ratios, number)
 
 
 @njit(cache=True, error_model="numpy")

@@ -6,7 +6,8 @@ the estimator; the strongest of them are paired, judged and measured as all othe
 (:mod:`sweep.model.returns`). A peak belongs to an echo whose bins it touches. These are the bins
 from the first to the last of half the echo's largest magnitude, and a main lobe's half-width to
 either side (the strongest and one to either side of it by ``peak_bin``). An echo has one peak, the
-strongest. All others are false, as many as there are.
+strongest. All others are false, as many as there are, but those that touch bins of a signal at or
+above a fixed threshold, or their neighbours: closed forms exempt these from false alarms, too.
 
 A draw is looked at by itself, so that a user's function answers the same however draws are cut.
 
@@ -135,6 +136,8 @@ def peaks_of(
         flags[1] |= flags[0] and signal.first == 0
         flags[-2] |= flags[-1] and signal.last == half
     flags[[0, -1]] = False
+    assert signal.exempt is not None
+    exempt = unrolled(shots, signal.exempt, signal.strongest)
     edges = np.diff(flags.astype(np.int8))
     starts, ends = np.flatnonzero(edges > 0) + 1, np.flatnonzero(edges < 0) + 1
     bins: list[int] = []
@@ -146,6 +149,8 @@ def peaks_of(
         own = np.flatnonzero((echoes[:, 0] < end) & (start <= echoes[:, 1]))
         group = int(own[0]) if own.size else FALSE
         if group == FALSE and (start > half - least or end <= least):
+            continue
+        if group == FALSE and exempt[start:end].any():
             continue
         if group != FALSE and group in groups:
             continue

@@ -17,6 +17,7 @@ from sweep.model import waveform
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.catalogue import DEFAULTS
 from sweep.model.effects.points import missing_of
+from sweep.model.estimators import ESTIMATOR
 from sweep.model.preparation import CHIRP, LASER, PROCESSING, RECEIVER, RECORD, categories
 from sweep.model.shot import MISREAD_BINS
 from sweep.model.window import canonical_name, window
@@ -46,6 +47,14 @@ PARAMETERS = (
     RECEIVER + "architecture", LASER + "line_width", LASER + "line_shape",
 )  # fmt: skip
 """Parameters by which echoes arrive and are read."""
+
+
+PHASE_LOSS = 0.03
+"""Share of the window's sum that an echo may lack for places by the phases of bins to be within
+some 0.02 bin. Half a record without an echo sets them off by up to 0.6 bin."""
+
+PHASE_ESTIMATORS = ("jacobsen", "candan")
+"""Estimators that take the phases of neighbouring bins for those of a whole record."""
 
 
 class Echoes(NamedTuple):
@@ -154,6 +163,15 @@ def warnings_of(study: GridStudy | FlightStudy) -> Iterator[str]:
             f"{_share(weak)} of the {points}, {_where(weak, echoes.range, none)}: raise "
             "processing.acquisition_delay to the largest 2R/c, and chirp.duration with it"
         )
+    shifted = gated & ~none & (echoes.lost > PHASE_LOSS)
+    if (kinds := _phase_estimators(study)) and shifted.any():
+        yield (
+            f"instrument.processing.estimator.kind {' and '.join(kinds)} takes echoes for whole "
+            f"records, and echoes begin within theirs at {_share(shifted)} of the {points}, "
+            f"{_where(shifted, echoes.range, none)}: places there are off by up to half a bin. "
+            "Take maximum_likelihood or chirp_z, or raise processing.acquisition_delay to the "
+            "largest 2R/c, and chirp.duration with it"
+        )
     wrong = echoes.misread & ~none
     if wrong.any():
         yield (
@@ -171,6 +189,14 @@ def warnings_of(study: GridStudy | FlightStudy) -> Iterator[str]:
             "may be off by up to 0.1: take draws.method: spectra, which draws the walk, or lower "
             "instrument.laser.line_width"
         )
+
+
+def _phase_estimators(study: GridStudy | FlightStudy) -> list[str]:
+    """List the estimators of a study that places of late echoes are wrong by."""
+    path = f"{ESTIMATOR}kind"
+    values = [m.values for axis in study.spec.axes for m in axis.members if m.path == path]
+    kinds = values[0] if values else [study.spec.parameters().get(path)]
+    return [kind for kind in PHASE_ESTIMATORS if kind in {str(name) for name in kinds}]
 
 
 def _share(some: np.ndarray) -> str:

@@ -205,6 +205,27 @@ def test_places_of_late_echoes_are_those_of_their_lines(name, length, size, shar
         assert found.mean() == pytest.approx(place, abs=0.2 * float(stated) + 2e-3)
 
 
+@pytest.mark.parametrize("share", [0.31, 0.5, 0.7])
+@pytest.mark.parametrize("place", [0.0, 0.02, 0.3, 0.5])
+def test_half_a_record_and_less_tells_a_place_with_a_rectangular_window(share, place):
+    """Errors of drawn noise are far below half a bin, and as large as stated, on bins too."""
+    length = size = 1024
+    shape, missing, n = window("rectangular", length), int(share * length), np.arange(length)
+    tables, rng, draws, ratio = interpolator(shape, size), np.random.default_rng(2), 2000, 300.0
+    turns = np.exp(-2j * np.pi * np.outer(n, [99, 100, 101]) / size)
+    bins = ((n >= missing) * np.exp(2j * np.pi * (100 + place) * n / size)) @ turns
+    sigma = abs(bins[1]) / ratio / np.sqrt(length)
+    noise = rng.normal(size=(2, draws, length))
+    noisy = np.abs(bins + sigma * (noise[0] + 1j * noise[1]) @ turns)
+    read = np.array([sub_bin(*row, tables) for row in noisy])
+    late = late_echo(read, np.full(draws, missing), shape, size)
+    error = np.sqrt(np.square(np.abs(read + late.shift) - place).mean())
+    stated = np.median(sub_bin_error(np.median(read), ratio, tables) * late.wider)
+    assert stated < 0.03
+    floor = 0.06 if share > 0.6 else 0.01  # next to a bin, where reads hardly rise with the place
+    assert 0.85 * stated < error < 1.15 * stated + (floor if place < 0.1 else 0.0)
+
+
 def test_whole_echoes_stay_as_they_are():
     late = late_echo(np.array([-0.4, 0.2]), np.array([0, 0]), window("hann", 512), 512)
     np.testing.assert_array_equal(late.shift, 0.0)

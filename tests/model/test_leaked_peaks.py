@@ -19,7 +19,9 @@ from sweep.model.effects import circulator_leak
 from sweep.model.effects.catalogue import CORE, DEFAULTS
 from sweep.model.geometry.mesh import Surface
 from sweep.model.groups import groups
+from sweep.model.interpolation import interpolator
 from sweep.model.pairing import FALSE_ALARM
+from sweep.model.window import window
 
 NUMBER = {"probabilities": 8000, "noise": 8000, "spectra": 1500}
 """Draws of a method in a scene.
@@ -44,6 +46,13 @@ SCENES = {
     "strong ground and a dim roof": ({**HAMMING, "power": 200.0}, {}),
     "the same in speckle": ({**HAMMING, "power": 150.0, "effects": (*CORE, "fading")}, {}),
     "near ground": ({**HAMMING, "power": 0.8, "height": 60.0, "roof": False}, {}),
+    "rectangular window and near ground": (
+        {"window": "rectangular", "power": 0.4, "height": 30.0, "roof": False}, {},
+    ),
+    "rectangular window and near ground in speckle": (
+        {"window": "rectangular", "power": 0.002, "height": 6.8, "roof": False,
+         "effects": (*CORE, "fading")}, {},
+    ),
     "complex record": (
         {**HAMMING, "power": 150.0, "effects": (*CORE, "fading")}, {RECORD: "complex"},
     ),
@@ -130,12 +139,12 @@ def _raised(leaks, level, draws, *, fading=None, room=3):
     """Bins and sizes of the peaks raised in the up-chirp, a list for each draw."""
     found = []
     bins, ratios = np.empty(room, np.int64), np.empty(room)
-    (key,) = keys(1)
+    (key,), tables = keys(1), interpolator(window("hamming", SIZE), SIZE)
     for d in range(draws):
         ratios[:] = 0.0
         factors = np.ones((1, 3)) if fading is None else np.full((1, 3), fading[d])
         number = leaked.draw_leaked(
-            (key[0], key[1], d), (0, 0), leaks, factors, level, 1, bins, ratios
+            (key[0], key[1], d), (0, 0), leaks, factors, level, 1, tables, bins, ratios
         )
         found.append((bins[:number].copy(), ratios[:number].copy()))
     return found
