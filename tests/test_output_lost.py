@@ -1,5 +1,6 @@
 """Whoever listens may go away: a study is computed all the same, and its exit code says how far."""
 
+import fcntl
 import io
 import json
 import os
@@ -7,6 +8,7 @@ import pty
 import signal
 import subprocess
 import sys
+import termios
 import time
 from pathlib import Path
 
@@ -20,7 +22,7 @@ from sweep.cli import main
 from sweep.storage.locations import JOURNAL
 from sweep.tasks import progress, summary
 from sweep.tasks.interrupts import Interrupts
-from sweep.tasks.streams import ForgivingStream, is_terminal
+from sweep.tasks.streams import ForgivingStream, PatientStream, is_terminal
 
 SWEEP = [sys.executable, "-c", "from sweep.cli import main; main()"]
 
@@ -166,6 +168,39 @@ def test_a_run_whose_terminal_is_closed_stops_and_can_be_resumed(tmp_path, where
     events = [json.loads(line) for line in (store / JOURNAL / "sessions.jsonl").open()]
     assert events[-1]["event"] == "ended" and events[-1]["stopped"] == "interrupted"
     assert sweep.resume(store, progress=False, scheduler="none").complete
+
+
+@pytest.mark.parametrize("where", ["none", "workers"])
+def test_a_run_whose_terminal_is_stopped_goes_on_to_its_end(tmp_path, where):
+    """As by Ctrl-S, with a terminal that takes nothing from the start."""
+    store, said, script = (tmp_path / name for name in ("store.zarr", "said", "script.py"))
+    script.write_text(RUN)
+    tests = str(Path(__file__).parent / "tasks")
+    master, slave = pty.openpty()
+    termios.tcflow(slave, termios.TCOOFF)
+    command = [sys.executable, str(script), str(store), str(said), tests, where]
+    started = subprocess.Popen(command, stdin=slave, stdout=slave, stderr=slave)
+    assert started.wait(120) == 0
+    assert said.read_text() == "12 "
+    os.close(slave)
+    os.close(master)
+
+
+def test_a_stream_whose_reader_stops_takes_no_time_and_goes_on_with_it():
+    reading, writing = os.pipe()
+    room = fcntl.fcntl(writing, fcntl.F_SETPIPE_SZ, 4096)
+    with open(writing, "w") as inside, open(reading, "rb") as reader:
+        stream = PatientStream(inside)
+        print("first", file=stream, flush=True)
+        assert os.read(reading, 100) == b"first\n"
+        begun = time.monotonic()
+        for number in range(200):
+            print(f"{number} " + room // 8 * ".", file=stream, flush=True)
+        assert time.monotonic() - begun < 3.0
+        heard = b""
+        while b"199 " not in heard:
+            heard += reader.read1()
+        assert heard.startswith(b"0 ...")
 
 
 def test_a_process_that_ignores_hangups_goes_on_ignoring_them():

@@ -9,7 +9,7 @@ to stop it at once, the thread ends the process. A store survives that, as it su
 from __future__ import annotations
 
 import os
-import select
+import selectors
 import signal
 import socket
 import sys
@@ -137,8 +137,14 @@ class Interrupts:
         self._watcher.start()
 
     def _watch(self, arrivals: socket.socket) -> None:
+        selector = selectors.DefaultSelector()  # which takes descriptors above 1023, too
+        selector.register(arrivals, selectors.EVENT_READ)
+        with selector:
+            self._watch_arrivals(arrivals, selector)
+
+    def _watch_arrivals(self, arrivals: socket.socket, selector: selectors.BaseSelector) -> None:
         while not self._over.is_set():
-            select.select([arrivals], [], [], self._seconds_left())
+            selector.select(self._seconds_left())
             if self._seconds_left() == 0.0:
                 self._deadline = None
                 if self.is_computing:

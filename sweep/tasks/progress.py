@@ -13,7 +13,7 @@ from typing import IO, TYPE_CHECKING, Any, cast
 from sweep.messages import PrintableError, printable
 from sweep.plain_files import UnfitFileError
 from sweep.storage.opening import StoreError as StoreError
-from sweep.tasks.streams import ForgivingStream, is_terminal
+from sweep.tasks.streams import PatientStream, is_terminal
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
@@ -210,6 +210,7 @@ class Lines(_Counting):
     def __init__(self) -> None:
         super().__init__()
         self._said = time.monotonic()
+        self._stream = PatientStream(sys.stderr)
 
     def _show(self, *, begun: bool = False) -> None:
         if begun or time.monotonic() - self._said >= LINE_EVERY:
@@ -217,7 +218,7 @@ class Lines(_Counting):
 
     def say(self, text: str) -> None:
         """Print a line of its own."""
-        print(printable(text), file=ForgivingStream(sys.stderr), flush=True)
+        print(printable(text), file=self._stream, flush=True)
 
     def end(self) -> None:
         """Say how far it is."""
@@ -238,7 +239,7 @@ class Bar(_Counting):
         from rich.table import Column
 
         super().__init__()
-        self.console = Console(file=cast("IO[str]", ForgivingStream(sys.stderr)))
+        self.console = Console(file=cast("IO[str]", PatientStream(sys.stderr)))
 
         def words(text: str) -> TextColumn:
             return TextColumn(text, table_column=Column())  # folded where others would be cut

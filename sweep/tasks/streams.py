@@ -7,13 +7,25 @@ from __future__ import annotations
 
 import io
 import os
+import queue
 import sys
+import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
 #: Descriptors of standard input, output and error.
 STANDARD = (0, 1, 2)
+
+#: Time for which a text waits for a reader that has stopped [s].
+PATIENCE_SECONDS = 0.3
+
+#: Time without any text after which the thread that writes ends [s].
+IDLE_SECONDS_MAX = 5.0
+
+#: Texts that wait for such a reader; further ones are dropped.
+WAITING_TEXTS_MAX = 1000
 
 
 class ForgivingStream(io.TextIOBase):
@@ -90,6 +102,75 @@ class ForgivingStream(io.TextIOBase):
                 nothing = os.open(os.devnull, os.O_WRONLY)
                 os.dup2(nothing, number)
                 os.close(nothing)
+
+
+class PatientStream(ForgivingStream):
+    """Text stream whose reader may stop for a while, as a terminal does after Ctrl-S.
+
+    A thread writes to the descriptor of the stream inside. Whoever writes waits for it for
+    `PATIENCE_SECONDS` at the most, and from then on not at all until the reader goes on. What
+    exceeds `WAITING_TEXTS_MAX` texts is dropped. A stream without a descriptor is written to at
+    once.
+    """
+
+    def __init__(self, stream: Any) -> None:
+        super().__init__(stream)
+        self._texts: queue.Queue[str] = queue.Queue(WAITING_TEXTS_MAX)
+        self._is_late = False
+        self._writer: threading.Thread | None = None
+        self._handing_over = threading.Lock()
+
+    def write(self, text: str) -> int:
+        """Hand over text, or drop it."""
+        try:
+            self.fileno()
+        except io.UnsupportedOperation:
+            return super().write(text)
+        if not isinstance(text, str):
+            raise TypeError(f"a stream of text takes no {type(text).__name__}")
+        if self.error is None:
+            with self._handing_over:
+                with suppress(queue.Full):
+                    self._texts.put_nowait(text)
+                if self._writer is None:
+                    super().flush()  # what others have written comes first
+                    self._writer = threading.Thread(target=self._write_all, daemon=True)
+                    self._writer.start()
+        return len(text)
+
+    def flush(self) -> None:
+        """Wait until all is written, but not for a reader that has stopped."""
+        if self._writer is None:
+            super().flush()
+            return
+        end = time.monotonic() + (0.0 if self._is_late else PATIENCE_SECONDS)
+        with self._texts.all_tasks_done:
+            while self._texts.unfinished_tasks and (left := end - time.monotonic()) > 0:
+                self._texts.all_tasks_done.wait(left)
+            self._is_late = self._texts.unfinished_tasks > 0
+
+    def _write_all(self) -> None:
+        """Write texts as they come: past buffers, whose locks the main thread needs to end."""
+        while True:
+            try:
+                text = self._texts.get(timeout=IDLE_SECONDS_MAX)
+            except queue.Empty:
+                with self._handing_over:
+                    if self._texts.empty():
+                        self._writer = None
+                        return
+                continue
+            try:
+                data = text.encode(self.encoding, "backslashreplace")
+                while data and self.error is None:
+                    try:
+                        data = data[os.write(self.fileno(), data) :]
+                    except BlockingIOError:
+                        time.sleep(PATIENCE_SECONDS)
+            except Exception as error:
+                self._go_silent(error)
+            finally:
+                self._texts.task_done()
 
 
 def is_terminal(stream: Any) -> bool:
