@@ -169,6 +169,8 @@ def _enable_cache(kernel: Any) -> None:
         except RuntimeError:  # numba has no place to cache it in
             return
     if folder.path in Path(kernel_cache.cache_path).parents:
+        # As numba's `enable_caching` does with its own class. There is no public way to another
+        # one, and that one ends a program on a damaged file, and takes those of other signatures.
         kernel._cache = kernel_cache
 
 

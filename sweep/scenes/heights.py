@@ -55,8 +55,15 @@ def without_data(path: Path, values: np.ndarray, no_data: float | None) -> tuple
         rule = (
             f"holds the height {place:g} at {int(far.sum()):,} cells, farther than {HEIGHT_MAX:g}"
         )
-        raise SceneError(path, rule, f"if they have no data, state 'no_data: {place!r}'")
+        raise SceneError(path, rule, f"if they have no data, state 'no_data: {_shortest(place)}'")
     return tuple(_doubts(path, values))
+
+
+def _shortest(value: float) -> str:
+    """Return a number in the fewest digits that name it, in single precision if it has no more."""
+    with np.errstate(over="ignore"):
+        single = np.float32(value)
+    return str(single) if float(single) == value else repr(value)
 
 
 def _doubts(path: Path, values: np.ndarray) -> list[str]:
@@ -87,7 +94,7 @@ def _doubts(path: Path, values: np.ndarray) -> list[str]:
             if is_doubtful:
                 warnings.append(
                     f"{path}: the value {value:g} stands in {count:,} cells, {gap:.4g} from the "
-                    f"next: if it means that there is no data, state 'no_data: {value!r}'"
+                    f"next: if it means that there is no data, state 'no_data: {_shortest(value)}'"
                 )
                 low, high = (value, high) if value == least else (low, value)
                 break
