@@ -138,6 +138,16 @@ def test_a_changed_spec_is_refused_with_what_changed(ran):
     assert sweep("resume", store, "--spec", "small.yaml", "--scheduler", "none").exit_code == 0
 
 
+def test_a_link_that_leads_nowhere_is_told_as_such(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "turning.yaml").symlink_to("turning.yaml")
+    (tmp_path / "lost.yaml").symlink_to("gone.yaml")
+    for name, target in (("turning.yaml", "turning.yaml"), ("lost.yaml", "gone.yaml")):
+        done = CliRunner().invoke(main, ["plan", name])
+        assert done.exit_code == 2
+        assert f"'{name}' does not exist: it is a link to '{target}', which" in done.stderr
+
+
 @pytest.mark.parametrize(
     ("arguments", "shown"),
     [

@@ -56,9 +56,14 @@ class LocalPath(click.Path):
 
 
 def _near(path: Path) -> str:
-    """Remark on a file whose name is like that of a missing one, or on the YAML files beside it."""
+    """Remark on a file whose name is like that of a missing one, or on the YAML files beside it.
+
+    A link that leads nowhere is there, and has no near one.
+    """
     from sweep.spec.reading import similar_file
 
+    if path.is_symlink():
+        return f": it is a link to '{os.readlink(path)}', which leads nowhere"
     try:
         names = [other.name for other in path.parent.iterdir() if other.suffix in (".yaml", ".yml")]
     except OSError:
