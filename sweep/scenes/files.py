@@ -262,6 +262,10 @@ def _factors(
     example: str,
 ) -> dict[str, float]:
     """Factor that makes each column SI, by name in the order of the header; all its mistakes."""
+    for mark, its_name in ((";", "semicolons"), ("\t", "tabs")):
+        if len(header) == 1 and mark in header[0]:
+            rule = f"separates its columns by {its_name}"
+            raise SceneError(path, rule, "separate them by commas, with points in numbers")
     factors: dict[str, float] = {}
     mistakes: list[SceneError] = []
     for cell in header:

@@ -68,6 +68,8 @@ def test_remarks_blank_lines_and_a_byte_order_mark_are_passed_over(table):
     ("text", "said"),
     [
         (PLAIN.replace("z [m]", "height [m]"), "unknown column 'height"),
+        (PLAIN.replace(",", ";"), "separates its columns by semicolons"),
+        (PLAIN.replace(",", "\t"), "separates its columns by tabs"),
         (PLAIN.replace(", z [m]", ""), "no column 'z'"),
         (PLAIN.replace("z [m]", "y [m]"), "two columns 'y'"),
         (PLAIN.replace("x [m]", "x"), "has no unit for column 'x'"),
