@@ -178,7 +178,9 @@ def test_a_run_whose_terminal_is_stopped_goes_on_to_its_end(tmp_path, where):
     tests = str(Path(__file__).parent / "tasks")
     master, slave = pty.openpty()
     termios.tcflow(slave, termios.TCOOFF)
-    command = [sys.executable, str(script), str(store), str(said), tests, where]
+    # Warnings are Python's to print, which waits for the terminal.
+    options = [sys.executable, "-W", "ignore", str(script)]
+    command = [*options, str(store), str(said), tests, where]
     started = subprocess.Popen(command, stdin=slave, stdout=slave, stderr=slave)
     assert started.wait(120) == 0
     assert said.read_text() == "12 "
