@@ -60,7 +60,7 @@ def tell_doubts(study: GridStudy | FlightStudy, say: Callable[[str], None]) -> N
     """Tell each doubt of a study, and then errors that it does not state.
 
     Doubts are a `StudyWarning` each, at the line of the caller's program; the command says them.
-    What is not stated is a note, which is said.
+    Errors that are not stated are said as notes.
     """
     level, frame = 1, sys._getframe()
     while frame.f_back is not None and frame.f_code.co_filename.startswith(_PACKAGE):
