@@ -21,7 +21,7 @@ from sweep.model.eyepoints import Eyepoints, seen_ground
 from sweep.model.geometry.mesh import Surface
 from sweep.model.ground import Footprints
 from sweep.model.groups import Groups, groups
-from sweep.model.leaked_peaks import leaked_peaks
+from sweep.model.leaked_peaks import LeakedPeaks, leaked_peaks
 from sweep.model.marcum import at_least_one
 from sweep.model.noisy_spectra import Methods
 from sweep.model.outputs import POINTS, STATISTICS
@@ -81,7 +81,7 @@ def cloud(
         own = None if flags is None else flags[part]
         called = effects, own, keys[part]
         try:
-            shots, rays, found = _groups(seen, parameters, surfaces, returns, called)
+            shots, rays, found, leaks = _groups(seen, parameters, surfaces, returns, called)
         except UnsupportedShot as error:
             if error.point is None:
                 raise
@@ -109,6 +109,7 @@ def cloud(
                 keys=keys[part],
                 method=method,
                 motion=own_motion(seen, priors),
+                leaks=leaks,
                 **numbers,
             )
         left = np.full(shots.size, np.nan)
@@ -128,10 +129,11 @@ def _groups(
     surfaces: Sequence[Surface],
     most: int,
     called: tuple[Collection[str], np.ndarray | None, np.ndarray],
-) -> tuple[Shots, Footprints, Groups]:
+) -> tuple[Shots, Footprints, Groups, list[tuple[np.ndarray, LeakedPeaks]] | None]:
     """Return prepared shots, footprints, and groups in their spectra; no groups without a target.
 
-    `called`: names of effects, flags of each shot, and the shots' keys.
+    And their leaked peaks, where these had to be listed and are few. `called`: names of effects,
+    flags of each shot, and the shots' keys.
     """
     (effects, flags, keys), seen = called, eyepoints.seen
     somewhere = eyepoints._replace(
@@ -153,10 +155,14 @@ def _groups(
             bins[blind] = -1
         found.neighbours[blind] = found.pd[blind] = np.nan
         found.exempted[blind] = found.leakage[blind] = 0.0
+    listed: list[tuple[np.ndarray, LeakedPeaks]] | None = None
     if shots.fading is not None and shots.leakage:
+        listed = [] if shots.leak_amplitude is None else None  # a line has a great many bins
         for part, leaks in leaked_peaks(shots, found, np.flatnonzero(seen)):
             found.leakage[part] = leaks.mean_leakage()
-    return shots, ground.beamlets, found
+            if listed is not None:
+                listed.append((part, leaks))
+    return shots, ground.beamlets, found, listed
 
 
 def _statistics(shots: Shots, found: Groups) -> dict[str, np.ndarray]:

@@ -106,6 +106,36 @@ def echo_filter(shots: Shots, seen: "Seen", least: int = 0) -> tuple[np.ndarray,
     return *noise_filter(shots.window, shots.fft_size, bins), shots.real_ends
 
 
+ROOT_BINS_MAX = 16
+"""Bins of which noise is made of as few numbers as there are bins."""
+
+
+def noise_root(rule: tuple[np.ndarray, np.ndarray, int]) -> np.ndarray:
+    """Return the triangular matrix (k, k) that makes the noise of adjacent bins of k numbers.
+
+    Of the filter of :func:`echo_filter`, up to ROOT_BINS_MAX bins; away from DC and Nyquist, where
+    :func:`draw_noise` says how bins are alike.
+    """
+    weights, start, _ = rule
+    number = min(weights.shape[0], ROOT_BINS_MAX)
+    of_numbers = np.zeros((number, int(start[number - 1] - start[0]) + TAPS if number else 0))
+    for k in range(number):
+        of_numbers[k, start[k] - start[0] : start[k] - start[0] + TAPS] = weights[k]
+    root = np.zeros((number, number))
+    for k in range(number):
+        for j in range(k + 1):
+            shared = (of_numbers[k] * of_numbers[j]).sum() - (root[k, :j] * root[j, :j]).sum()
+            if j < k:
+                root[k, j] = shared / root[j, j] if root[j, j] > 0 else 0.0
+            elif shared > _LEAST_REMAINDER:
+                root[k, k] = math.sqrt(shared)
+    return root
+
+
+_LEAST_REMAINDER = 1e-9
+"""Share of a bin's noise that its neighbours do not make, below which there is none."""
+
+
 def _chances(outputs: Mapping[str, np.ndarray]) -> np.ndarray:
     """Probabilities of a false alarm, and of a detection without and with one in the up segment.
 
@@ -423,6 +453,26 @@ def draw_noise(draw, number, low, count, rule, room):
             im += weights[k, m] * sign * room[3, abs(j)]
         i = count - 1 - k if turned else k
         room[0, i], room[1, i] = re, im
+
+
+@njit(cache=True, error_model="numpy")
+def draw_noise_by_root(draw, number, count, root, room):
+    """Noise of ``count`` adjacent bins over sigma, to rows 0 and 1 of ``room`` (4, >= count).
+
+    ``draw`` and ``number`` are as of :func:`draw_noise`, with an even number; ``root`` is
+    :func:`noise_root`.
+    """
+    for k in range(0, count, 2):
+        words = philox.words4(draw[0], draw[1], draw[2], draw[3], (number + k) >> 1)
+        room[2, k], room[3, k] = philox.to_normals(words[0], words[1])
+        if k + 1 < count:
+            room[2, k + 1], room[3, k + 1] = philox.to_normals(words[2], words[3])
+    for k in range(count):
+        re, im = 0.0, 0.0
+        for j in range(k + 1):
+            re += root[k, j] * room[2, j]
+            im += root[k, j] * room[3, j]
+        room[0, k], room[1, k] = re, im
 
 
 @njit(cache=True, error_model="numpy")

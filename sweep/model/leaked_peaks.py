@@ -115,6 +115,12 @@ class LeakedPeaks(NamedTuple):
             np.zeros((points, 2)),
         )  # fmt: skip
 
+    def of(self, points: np.ndarray) -> "LeakedPeaks":
+        """Bins of some points by their numbers, or a mask; lists of bins stay whole."""
+        by_point = ("stretch", "total", "line_stretch", "line_total", "barred_stretch", "rates",
+                    "scale")  # fmt: skip
+        return self._replace(**{name: getattr(self, name)[points] for name in by_point})
+
     def mean_leakage(self) -> np.ndarray:
         """Probability of leakage, the mean over developed speckle and over the line's phase.
 
@@ -232,9 +238,22 @@ def _with_line(
 
 
 def _rates(looks: Looks, level: np.ndarray, floor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return :attr:`LeakedPeaks.rates` and ``scale`` of points, by threshold and floor [sigma]."""
+    """Return :attr:`LeakedPeaks.rates` and ``scale`` of points, by threshold and floor [sigma].
+
+    Thresholds of shots of a flight differ by rounding alone, and have one table.
+    """
+    law = np.round(np.stack([level, np.maximum(floor, FAINTEST)], axis=1), 9)
+    law, row = np.unique(law, axis=0, return_inverse=True)
+    rates, scale = _rates_by_law(looks, *np.ascontiguousarray(law.T))
+    return rates[row.ravel()], scale[row.ravel()]
+
+
+def _rates_by_law(
+    looks: Looks, level: np.ndarray, floor: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Compute the tables of :func:`_rates`, one of each threshold and floor."""
     rates, scale = np.empty((level.size, RATES)), np.empty((level.size, 2))
-    _fill_rates(level, np.maximum(floor, FAINTEST), rates, scale)
+    _fill_rates(level, floor, rates, scale)
     if looks.several:
         for j in range(level.size):
             amplitude = np.exp(scale[j, 0] + scale[j, 1] * np.arange(RATES))
@@ -298,6 +317,7 @@ def _average(leaks, powers, weights, out):
     """Average leakage over speckle, of each echo its own, and over phases of the line."""
     classes = int(40.0 / CLASS_WIDTH)
     number, mean = np.zeros(classes), np.zeros(classes)
+    listed = np.empty(classes, np.int64)
     for j in range(out.shape[0]):
         rates, scale = leaks.rates[j], leaks.scale[j]
         for s in range(3):
@@ -313,13 +333,15 @@ def _average(leaks, powers, weights, out):
                         place = min(max(place, 0), classes - 1)
                         number[place] += 1.0
                         mean[place] += leaks.amplitude[k]
-                raised = 0.0
+                raised, filled = 0.0, 0
+                for c in range(classes):
+                    if number[c] > 0.0:
+                        listed[filled], mean[c] = c, mean[c] / number[c]
+                        filled += 1
                 for node in range(powers.size):
                     whole, shift = 0.0, 0.5 * math.log(powers[node])
-                    for c in range(classes):
-                        if number[c] > 0.0:
-                            middle = mean[c] / number[c] + shift
-                            whole += number[c] * _rate(middle, rates, scale)
+                    for c in listed[:filled]:
+                        whole += number[c] * _rate(mean[c] + shift, rates, scale)
                     raised -= weights[node] * math.expm1(-whole)
                 quiet *= 1.0 - raised
             phases, alarm = leaks.line_amplitude.shape[0], 0.0

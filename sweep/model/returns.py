@@ -38,7 +38,7 @@ false alarms.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -54,9 +54,11 @@ from sweep.model.draws import (
     Seen,
     down_given_up,
     draw_noise,
+    draw_noise_by_root,
     echo_filter,
     largest_of,
     noise_levels,
+    noise_root,
     seen_spectra,
 )
 from sweep.model.estimators import Deviation, resolved_deviation
@@ -96,11 +98,14 @@ from sweep.model.shot import fit
 from sweep.model.speckle_lines import (
     ALL_PAIRS,
     CHIRPS,
+    FACTORED_ROWS_MAX,
     NEXT_LOOK,
     LineFan,
     Peaks,
     directions,
+    draw_factored,
     draw_lines,
+    factor_bins,
     line_fan,
     line_powers,
     place_errors,
@@ -153,30 +158,36 @@ def draw_returns(
     draws: int = 1,
     method: str = "probabilities",
     motion: OwnMotion | None = None,
+    leaks: Sequence[tuple[np.ndarray, LeakedPeaks]] | None = None,
 ) -> Returns:
     """Draw returns of n prepared shots by their :func:`groups` and keys (n, 2), draw by draw.
 
     ``method`` is ``probabilities`` or ``noise``; any range of draws can be computed alone.
     ``motion`` is what the instrument knows of its own, by which it corrects range and velocity.
+    ``leaks`` are the :func:`leaked_peaks` of all points that may leak, if they are known already.
     """
     noisy = method == "noise"
     known, drawn = known_of(shots, found, motion), Drawn.nothing(found, draws)
     one = np.exp(shots.looks.log_alarm(known.levels[:, 1:2]))
     how, tables = How.of(shots, first_draw, noisy), interpolator(shots.window, shots.fft_size)
     around = int(2 * known.fan.reach.max(initial=0) + 1)
-    for part, seen, leaks in _spectra(shots, found, noisy):
+    for part, seen, of_signal in _spectra(shots, found, noisy, leaks):
         of_part = known.of(part)
         of_part = of_part._replace(alarm=at_least_one(one[part], seen.others))
         own = Drawn(*(column[part] for column in drawn))
-        rule = how._replace(rule=echo_filter(shots, seen, 0 if noisy else around))
-        _draw(keys[part], rule, of_part, seen, leaks, tables, own)
+        rule = echo_filter(shots, seen, 0 if noisy else around)
+        filtered = how._replace(rule=rule, root=noise_root(rule))
+        _draw(keys[part], filtered, of_part, seen, of_signal, tables, own)
         for column, values in zip(drawn, own, strict=True):
             column[part] = values
     return measured(shots, known, drawn, motion)
 
 
 def _spectra(
-    shots: Shots, found: Groups, noisy: bool
+    shots: Shots,
+    found: Groups,
+    noisy: bool,
+    known: Sequence[tuple[np.ndarray, LeakedPeaks]] | None,
 ) -> Iterator[tuple[np.ndarray, Seen, LeakedPeaks]]:
     """Yield some points at a time, with their spectra and the bins of their leaked signal."""
     if noisy:
@@ -185,7 +196,14 @@ def _spectra(
         return
     counted = np.nan_to_num(shots.counted_bins(found.exempted.T).T)
     leaking = leaking_points(shots, found)
-    for part, leaks in leaked_peaks(shots, found, leaking):
+    listed: Iterable[tuple[np.ndarray, LeakedPeaks]] = leaked_peaks(shots, found, leaking)
+    if known is not None:
+        listed = (
+            (part[some], leaks.of(some))
+            for part, leaks in known
+            if (some := np.isin(part, leaking)).any()
+        )
+    for part, leaks in listed:
         yield part, Seen.nothing(part.size)._replace(others=counted[part]), leaks
     quiet = np.setdiff1d(np.arange(shots.size), leaking)
     nothing = Seen.nothing(quiet.size)._replace(others=counted[quiet])
@@ -214,6 +232,8 @@ class How(NamedTuple):
     """Half of a main lobe [bins] where any bin of an echo detects, else 0."""
     rule: tuple[np.ndarray, np.ndarray, int]
     """:func:`sweep.model.draws.echo_filter`"""
+    root: np.ndarray
+    """:func:`sweep.model.draws.noise_root` of it."""
     looks: int
     """Records whose powers are averaged."""
     apart: bool
@@ -235,8 +255,8 @@ class How(NamedTuple):
         return cls(
             int(first_draw), noisy, shots.incoherent, bool(shots.segments[1]), shots.fft_size // 2,
             signed, alone, shots.real_ends, shots.echo_rule[1], echo_filter(shots, Seen.nothing(0)),
-            shots.looks.number if shots.looks.several else 1, shots.looks.independent,
-            votes,
+            np.zeros((0, 0)), shots.looks.number if shots.looks.several else 1,
+            shots.looks.independent, votes,
         )  # fmt: skip
 
 
@@ -773,13 +793,18 @@ class Speckle(NamedTuple):
     drawn: np.ndarray
     """(most, looks, 3, bins): complex amplitudes of a mean power of 1; of one look where all have
     the same."""
+    rank: np.ndarray
+    """(most,) int64: rows of ``factor`` of a group; 0 where its lines are drawn one by one."""
+    factor: np.ndarray
+    """(most, rows, 3, bins): of :func:`sweep.model.speckle_lines.factor_bins`."""
 
 
 @njit(cache=True, error_model="numpy")
 def no_speckle(most):
     """Return the record of a point whose echoes do not fade."""
     bins = np.zeros((most, 3), np.int64)
-    return Speckle(bins, bins, np.zeros((most, 3, 0)), np.zeros((most, 1, 3, 0), np.complex128))
+    nothing = np.zeros((most, 1, 3, 0), np.complex128)
+    return Speckle(bins, bins, np.zeros((most, 3, 0)), nothing, np.zeros(most, np.int64), nothing)
 
 
 @njit(cache=True, error_model="numpy")
@@ -805,24 +830,38 @@ def speckled_bins(i, how, known, seen):
             widest = max(widest, count[g, s])
     power = np.zeros((most, 3, widest))
     looks = how.looks if how.apart else 1
+    rows = 3 * widest if 3 * widest <= FACTORED_ROWS_MAX else 0
+    rank, factor = np.zeros(most, np.int64), np.empty((most, rows, 3, widest), np.complex128)
     for g in range(most):
+        if count[g].max() == 0:
+            continue
         line_powers(known.fan, i, known.middle[i, :, g], first[g], power[g])
-    return Speckle(first, count, power, np.zeros((most, looks, 3, widest), np.complex128))
+        if rows > 0:
+            rank[g] = factor_bins(
+                known.fan, i, known.middle[i, :, g], first[g], power[g], factor[g]
+            )
+    drawn = np.zeros((most, looks, 3, widest), np.complex128)
+    return Speckle(first, count, power, drawn, rank, factor)
 
 
 @njit(cache=True, error_model="numpy")
 def draw_speckle(address, i, known, speckle, fading):
     """Draw the speckle of a point's groups, and the factors (most, 3) by which they fade."""
     for g in range(speckle.number.shape[0]):
+        fading[g] = 1.0
+        if speckle.number[g].max() == 0:
+            continue
         for look in range(speckle.drawn.shape[1]):
             own = address[0], address[1], address[2] + look * NEXT_LOOK
             amplitudes = speckle.drawn[g, look]
-            draw_lines(
-                own, g, known.fan, i, known.middle[i, :, g], speckle.first[g], speckle.power[g],
-                amplitudes,
-            )  # fmt: skip
+            if speckle.rank[g] > 0:
+                draw_factored(own, g, speckle.factor[g], speckle.rank[g], amplitudes)
+            else:
+                draw_lines(
+                    own, g, known.fan, i, known.middle[i, :, g], speckle.first[g],
+                    speckle.power[g], amplitudes,
+                )  # fmt: skip
         for s in range(3):
-            fading[g, s] = 1.0
             if speckle.number[g, s] == 0:
                 continue
             centre, total = known.bins[i, s, BIN, g] - speckle.first[g, s], 0.0
@@ -1045,11 +1084,11 @@ def detect_faded(address, at, g, how, known, speckle, tables, peak):
     scale, votes, total = known.magnitude[i, s, g] / sigma, 0, complex(0.0, 0.0)
     for look in range(how.looks):
         own = draw + look * NEXT_LOOK
+        address_of_noise = a, b, own, philox.STREAM_NOISE[s]
         if count == 3:
-            three_bins_of_noise((a, b, own, philox.STREAM_NOISE[s]), 3 * g, tables, room)
+            three_bins_of_noise(address_of_noise, 3 * g, tables, room)
         else:
-            numbers = ECHO * (1 + g)
-            draw_noise((a, b, own, philox.STREAM_NOISE[s]), numbers, first, count, how.rule, room)
+            bins_of_noise(address_of_noise, ECHO * (1 + g), (first, count), how, room)
         echo = speckle.drawn[g, look if speckle.drawn.shape[1] > 1 else 0, s]
         for k in range(count):
             if abs(k - middle) <= 1:
@@ -1092,6 +1131,21 @@ def detect_faded(address, at, g, how, known, speckle, tables, peak):
 
 
 @njit(cache=True, error_model="numpy")
+def bins_of_noise(address, number, bins, how, room):
+    """Noise of adjacent bins over sigma, to rows 0 and 1 of ``room`` (4, >= bins + TAPS).
+
+    ``address``: key, draw, stream; independent numbers count from ``number``. ``bins``: the first
+    bin, and their number.
+    """
+    first, count = bins
+    at_end = how.ends > 0 and (first == 0 or 2 * (first + count - 1) == how.ends)
+    if count <= how.root.shape[0] and not at_end:
+        draw_noise_by_root(address, number, count, how.root, room)
+    else:
+        draw_noise(address, number, first, count, how.rule, room)
+
+
+@njit(cache=True, error_model="numpy")
 def three_bins_of_noise(address, number, tables, room):
     """Noise of three adjacent bins over sigma, to rows 0 and 1 of ``room``.
 
@@ -1128,8 +1182,11 @@ def look_at_all(address, at, g, how, known, seen, speckle, tables, peak):
             sigma * run[first : last + 1], echo, levels_of(known.of_bins.T, i), pedestal
         )
     room = np.empty((4, count + how.rule[0].shape[1]))
-    numbers = ECHO * (1 + g)
-    draw_noise((a, b, draw, philox.STREAM_NOISE[s]), numbers, low + first, count, how.rule, room)
+    address_of_noise, numbers = (a, b, draw, philox.STREAM_NOISE[s]), ECHO * (1 + g)
+    if speckle.number[g, s] > 0:
+        bins_of_noise(address_of_noise, numbers, (low + first, count), how, room)
+    else:
+        draw_noise(address_of_noise, numbers, low + first, count, how.rule, room)
     for k in range(count):
         real = is_end(low + first + k, how.ends)
         amplitude, deviation = speckled(run[first + k], speckle, g, s, k, real), 1.0

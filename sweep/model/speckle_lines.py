@@ -117,6 +117,7 @@ def line_fan(shots: "Shots") -> LineFan:
     size = 0 if lines is None else shots.size
     spread, turn = np.zeros((2, size, 3, 2)) if lines is None else lines
     padding = shots.fft_size / shots.window.length
+    spread, turn = _turned_to_steepest(spread, turn, padding)
     # Two bins' transforms together turn by 2 pi at the most for each bin of fs/L.
     phases = np.abs(turn[:, :, None] - turn[:, None]).max(axis=(1, 2))
     phases = phases + np.pi * np.abs(spread).max(axis=1) / padding
@@ -131,6 +132,25 @@ def line_fan(shots: "Shots") -> LineFan:
         np.ascontiguousarray(turn), rule.astype(np.int64), reach, node, weight, NODES,
         value, OVERSAMPLING / padding, REACH * padding,
     )  # fmt: skip
+
+
+def _turned_to_steepest(
+    spread: np.ndarray, turn: np.ndarray, padding: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Turn the beam's two coordinates until shifts and phases grow most along the first.
+
+    The beam is round, so that the law is the same; few lines are then needed along the second.
+    """
+    slopes = np.concatenate([turn - turn[:, :1], spread * (np.pi / padding)], axis=1)
+    y, x = slopes[..., 0], slopes[..., 1]
+    angle = 0.5 * np.arctan2(2 * (y * x).sum(axis=1), (y * y - x * x).sum(axis=1))
+    cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
+
+    def turned(vectors: np.ndarray) -> np.ndarray:
+        along, across = vectors[..., 0], vectors[..., 1]
+        return np.stack([cosine * along + sine * across, cosine * across - sine * along], axis=-1)
+
+    return turned(spread), turned(turn)
 
 
 def directions(shots: "Shots") -> np.ndarray:
@@ -217,6 +237,105 @@ def draw_lines(address, group, fan, i, middle, first, power, out):
         for k in range(out.shape[1]):
             if power[s, k] > 0.0:
                 out[s, k] /= math.sqrt(power[s, k])
+
+
+FACTORED_ROWS_MAX = 48
+"""Bins of all segments together of which the covariance is factored; of more, lines are drawn."""
+
+_LEAST_RESIDUAL = 1e-8
+"""Share of a bin's mean power that a factor may leave out."""
+
+
+@njit(cache=True, error_model="numpy")
+def factor_bins(fan, i, middle, first, power, factor):
+    """Factor the covariance of bins by :func:`draw_lines`, and return its rank.
+
+    Parameters
+    ----------
+    middle, first, power
+        As of :func:`draw_lines`.
+    factor
+        (rows, 3, bins) complex, with as many rows as there are bins in all, for the result: the
+        amplitudes of the bins are sums of its first rows with independent circular Gaussian numbers
+        of mean power 2.
+
+    Notes
+    -----
+    Lines that lie close together make much the same amplitudes: of a footprint within a bin two or
+    three numbers tell those of nine bins. By Cholesky's factorisation with pivots, until no bin
+    lacks more than 1e-8 of its mean power.
+    """
+    along, across = fan.rule[i]
+    segments, bins = power.shape
+    weight = np.empty(fan.number[along] * fan.number[across])
+    lines = np.zeros((segments, bins, weight.size), np.complex128)
+    number = 0
+    for a in range(fan.number[along]):
+        for c in range(fan.number[across]):
+            share = fan.weight[along, a] * fan.weight[across, c]
+            if share < _LEAST_WEIGHT:
+                continue
+            y, x = fan.node[along, a], fan.node[across, c]
+            for s in range(segments):
+                if np.isnan(middle[s]):
+                    continue
+                phase = fan.turn[i, s, 0] * y + fan.turn[i, s, 1] * x
+                turned = complex(math.sqrt(share), 0.0)
+                if phase != 0.0:
+                    turned = turned.real * complex(math.cos(phase), math.sin(phase))
+                place = middle[s] + fan.spread[i, s, 0] * y + fan.spread[i, s, 1] * x - first[s]
+                for k in range(bins):
+                    if power[s, k] > 0.0 and abs(k - place) <= fan.size:
+                        at = transform_at(k - place, fan) / math.sqrt(power[s, k])
+                        lines[s, k, number] = turned * at
+            number += 1
+    residual = np.where(power > 0.0, 1.0, 0.0)
+    for rank in range(factor.shape[0]):
+        pivot, most = (0, 0), _LEAST_RESIDUAL
+        for s in range(segments):
+            for k in range(bins):
+                if residual[s, k] > most:
+                    pivot, most = (s, k), residual[s, k]
+        if most == _LEAST_RESIDUAL:
+            return rank
+        own, scale = lines[pivot[0], pivot[1]], 1.0 / math.sqrt(most)
+        for s in range(segments):
+            for k in range(bins):
+                if not residual[s, k] > 0.0:
+                    factor[rank, s, k] = 0.0
+                    continue
+                shared = complex(0.0, 0.0)
+                for line in range(number):
+                    shared += lines[s, k, line] * own[line].conjugate()
+                for r in range(rank):
+                    shared -= factor[r, s, k] * factor[r, pivot[0], pivot[1]].conjugate() * 2.0
+                factor[rank, s, k] = shared * (scale * math.sqrt(0.5))
+        for s in range(segments):
+            for k in range(bins):
+                residual[s, k] -= 2.0 * abs(factor[rank, s, k]) ** 2
+        residual[pivot] = 0.0
+    return factor.shape[0]
+
+
+@njit(cache=True, error_model="numpy")
+def draw_factored(address, group, factor, rank, out):
+    """Draw amplitudes (3, bins) into ``out`` by the rows of :func:`factor_bins`.
+
+    ``address`` and ``group`` are those of :func:`draw_lines`.
+    """
+    out[:] = 0.0
+    first = FIRST_LINE * (1 + group)
+    for pair in range(0, rank, 2):
+        words = philox.words4(
+            address[0], address[1], address[2], philox.STREAM_SPECKLE, (first + pair) >> 1
+        )
+        for r in range(pair, min(pair + 2, rank)):
+            word, other = (words[0], words[1]) if r == pair else (words[2], words[3])
+            re, im = philox.to_normals(word, other)
+            amplitude = complex(re, im)
+            for s in range(out.shape[0]):
+                for k in range(out.shape[1]):
+                    out[s, k] += amplitude * factor[r, s, k]
 
 
 def drawn_speckle(
