@@ -68,6 +68,11 @@ class Echoes(NamedTuple):
     """(n,): true where its beats are read as another range or velocity."""
     walked: np.ndarray
     """(n,): true where the laser's phase walks further than the law of detection allows."""
+    exchanged: np.ndarray
+    """(n,): true where up and down beat alone are read with range and velocity exchanged, and would
+    be read right by the other assumption of two beats."""
+    other_exchanged: np.ndarray
+    """(n,): likewise by the other assumption, where this one is right."""
 
 
 def echoes_of(parameters: Mapping[str, Any]) -> Echoes:
@@ -77,7 +82,7 @@ def echoes_of(parameters: Mapping[str, Any]) -> Echoes:
     needed["target.range"] = np.broadcast_to(needed["target.range"], (number,))
     needed |= {path: DEFAULTS[path] for path in DEFAULTS if path not in needed}
     needed |= {"footprint.beamlets": 1}
-    found = Echoes(np.zeros(number), np.zeros(number), *np.zeros((2, number), bool))
+    found = Echoes(*np.zeros((2, number)), *np.zeros((4, number), bool))
     for index, p in categories(needed):
         shape = window(canonical_name(str(p[PROCESSING + "window"])), int(p["record"]))
         range_, velocity = (p[name] for name in ("target.range", "target.radial_velocity"))
@@ -90,7 +95,14 @@ def echoes_of(parameters: Mapping[str, Any]) -> Echoes:
         found.lost[index] = np.where(
             first >= shape.length, 1.0, np.minimum(missing_of(shape, first).lost, 1.0)
         )
-        found.misread[index] = _is_misread(p, range_, np.asarray(velocity))
+        velocity = np.asarray(velocity)
+        found.misread[index] = _is_misread(p, range_, velocity)
+        if str(p[RECORD]) != "complex":
+            assumed = str(p[waveform.TWO_BEATS])
+            (other,) = {waveform.FAR_TARGET, waveform.FAST_TARGET} - {assumed}
+            pair = {name: _is_misread(p, range_, velocity, name) for name in (assumed, other)}
+            found.exchanged[index] = pair[assumed] & ~pair[other]
+            found.other_exchanged[index] = pair[other] & ~pair[assumed]
         if str(p[LASER + "line_shape"]) == "lorentzian":
             delay, record = (
                 2 / SPEED_OF_LIGHT * range_,
@@ -101,13 +113,20 @@ def echoes_of(parameters: Mapping[str, Any]) -> Echoes:
     return found
 
 
-def _is_misread(p: Mapping[str, Any], range_: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-    """Return true where a target's beats, as a spectrum shows them, tell another target, (n,)."""
+def _is_misread(
+    p: Mapping[str, Any], range_: np.ndarray, velocity: np.ndarray, pair_by: str | None = None
+) -> np.ndarray:
+    """Return true where a target's beats, as a spectrum shows them, tell another target, (n,).
+
+    All its beats, or up and down beat alone, read by the assumption ``pair_by``.
+    """
     carriers, slopes = waveform.carriers_of(p), waveform.slopes_of(p)
     rate = p[CHIRP + "bandwidth"] / p[CHIRP + "duration"]
     sample_rate, signed = p[PROCESSING + "sample_rate"], str(p[RECORD]) == "complex"
     width = sample_rate / int(p[PROCESSING + "fft_size"])
     there = waveform.order_of(str(p[RECEIVER + "architecture"]), str(p[waveform.ORDER]))
+    if pair_by is not None:
+        there = tuple(name for name in there if name != "doppler")
     peaks = []
     for slope, carrier in zip(slopes, carriers, strict=True):
         beat = waveform.beat_frequency(
@@ -115,7 +134,7 @@ def _is_misread(p: Mapping[str, Any], range_: np.ndarray, velocity: np.ndarray) 
         )
         turned = beat - sample_rate * np.floor(beat / sample_rate + 0.5)
         peaks.append((turned if signed else np.abs(turned)) + 0 * range_)
-    assumed = str(p[waveform.TWO_BEATS])
+    assumed = pair_by or str(p[waveform.TWO_BEATS])
     if slopes == waveform.SIGNS:
         read = waveform.resolve(
             up=peaks[0], doppler=peaks[1] if "doppler" in there else None, down=peaks[2],
@@ -173,6 +192,9 @@ def warnings_of(study: GridStudy | FlightStudy) -> Iterator[str]:
             "largest 2R/c, and chirp.duration with it"
         )
     wrong = echoes.misread & ~none
+    if _reads_pairs(study):
+        yield from _exchanged(study, echoes, none, points)
+        wrong &= ~echoes.exchanged
     if wrong.any():
         yield (
             f"the peaks are read as another range or velocity at {_share(wrong)} of the {points}, "
@@ -197,6 +219,45 @@ def _phase_estimators(study: GridStudy | FlightStudy) -> list[str]:
     values = [m.values for axis in study.spec.axes for m in axis.members if m.path == path]
     kinds = values[0] if values else [study.spec.parameters().get(path)]
     return [kind for kind in PHASE_ESTIMATORS if kind in {str(name) for name in kinds}]
+
+
+def _reads_pairs(study: GridStudy | FlightStudy) -> bool:
+    """Return true if up and down beat alone tell range and velocity, always or now and then."""
+    spec = study.spec
+    p = DEFAULTS | dict(spec.parameters())
+    alone = "doppler" not in waveform.order_of(
+        str(p[RECEIVER + "architecture"]), str(p[waveform.ORDER])
+    )
+    return alone or isinstance(study, FlightStudy) or p[waveform.SHOT_DETECTION] == waveform.ANY_TWO
+
+
+def _exchanged(
+    study: GridStudy | FlightStudy, echoes: Echoes, none: np.ndarray, points: str
+) -> Iterator[str]:
+    """Yield at how many points the assumption of two beats is wrong, and whether to change it.
+
+    Not where the target is fast at some points and far at others, and is taken to be fast.
+    """
+    wrong, other_wrong = echoes.exchanged & ~none, echoes.other_exchanged & ~none
+    far = str((DEFAULTS | dict(study.spec.parameters()))[waveform.TWO_BEATS]) == waveform.FAR_TARGET
+    if not wrong.any() or (not far and other_wrong.any()):
+        return
+    relation, other = ("exceeds", "fast") if far else ("is below", "far")
+    if np.count_nonzero(other_wrong) < np.count_nonzero(wrong):
+        remedy = f"write processing.two_beats: {other}"
+        if other_wrong.any():
+            remedy += f", which is wrong at {_share(other_wrong)} of the {points}"
+    else:
+        remedy = (
+            f"{other} would be wrong at more of the {points}. Leave unconfirmed points out there, "
+            "or raise chirp.bandwidth over chirp.duration"
+        )
+    yield (
+        f"the Doppler shift {relation} the beat of the range at {_share(wrong)} of the {points}, "
+        f"{_where(wrong, echoes.range, none)}, and processing.two_beats is "
+        f"{'far' if far else 'fast'}: an up and a down beat that no Doppler beat confirms are read "
+        f"there with range and velocity exchanged (misread): {remedy}"
+    )
 
 
 def _share(some: np.ndarray) -> str:
@@ -252,5 +313,5 @@ def _of_flight(study: FlightStudy) -> Echoes:
     return (
         Echoes(*map(np.concatenate, zip(*found, strict=True)))
         if found
-        else Echoes(*[np.empty(0)] * 4)
+        else Echoes(*[np.empty(0)] * 6)
     )

@@ -161,3 +161,107 @@ def test_a_phase_that_walks_far_within_a_delay_is_told_but_of_drawn_spectra():
     assert told(along(*ranges, instrument=noisy, effects={"line_width": "off"})) == []
     drawn = {"number": 100, "method": "spectra"}
     assert told(along(*ranges, instrument=noisy, draws=drawn)) == []
+
+
+# Pairs that no Doppler beat confirms
+
+
+def flown(heights, speeds, record_kind="real", **processing):
+    """A descent of the small scene between heights at speeds, without its ball."""
+    instrument = record(acquisition_delay="8 us", **processing)
+    instrument["receiver"] = instrument["receiver"] | {"record": record_kind}
+    start, end = (["0 m", "0 m", height] for height in heights)
+    path = {"kind": "straight", "from": start, "to": end, "initial_speed": speeds[0],
+            "final_speed": speeds[1]}  # fmt: skip
+    ground = {"plane": {"kind": "plane", "size": "9 km", "reflectance": 0.1}}
+    return small_scene(
+        instrument=instrument,
+        scene={"origin": "plane", "objects": ground},
+        platform={"path": path, "attitude": {"kind": "nadir"}}, axes={},
+        scanners={"line": {"kind": "line", "half_angle": "1 deg", "line_rate": "1 Hz",
+                           "rate": "8 Hz"}},
+    )  # fmt: skip
+
+
+def exchanged(spec):
+    return [words for words in told(spec) if "exchanged" in words]
+
+
+@pytest.mark.parametrize(
+    ("heights", "speeds", "set_to", "share", "remedy"),
+    [
+        # The small study's chirp has the beat of 96.7 m/s at 9.3 km, 1.04e-2 m/s for a metre.
+        (("1500 m", "300 m"), ("100 m/s", "30 m/s"), "far", "at 100 % of", "two_beats: fast"),
+        (("1500 m", "300 m"), ("100 m/s", "30 m/s"), "fast", None, None),
+        (("1500 m", "1400 m"), ("5 m/s", "5 m/s"), "far", None, None),
+        (("1500 m", "1400 m"), ("5 m/s", "5 m/s"), "fast", "at 100 % of", "two_beats: far"),
+        (("1500 m", "1000 m"), ("40 m/s", "3 m/s"), "fast", None, None),
+    ],
+)
+def test_a_flight_is_told_where_its_pairs_are_read_wrong(heights, speeds, set_to, share, remedy):
+    words = exchanged(flown(heights, speeds, two_beats=set_to))
+    assert len(words) == (share is not None)
+    if share:
+        assert share in words[0] and remedy in words[0] and "misread" in words[0]
+
+
+@pytest.mark.parametrize(
+    ("speeds", "remedy"),
+    [(("40 m/s", "3 m/s"), "write processing.two_beats: fast, which is wrong at"),
+     (("20 m/s", "3 m/s"), "fast would be wrong at more of the shots")],
+)  # fmt: skip
+def test_a_flight_fast_in_part_is_told_the_assumption_that_is_right_more_often(speeds, remedy):
+    (words,) = exchanged(flown(("1500 m", "1000 m"), speeds))
+    assert remedy in words and "the Doppler shift exceeds the beat of the range at" in words
+
+
+@pytest.mark.parametrize(
+    ("changes", "number"),
+    [
+        ({}, 0),  # of both chirps and the Doppler segment all beats are known
+        ({"shot_detection": "any_two"}, 1),
+        ({"shot_detection": "any_two", "two_beats": "fast"}, 0),
+    ],
+)
+def test_a_grid_is_told_where_two_beats_decide(changes, number):
+    fast = WITHIN | {"radial_velocity": "60 m/s"}
+    spec = small(
+        target=fast, instrument=record(acquisition_delay="7 us", **changes),
+        axes={"target.range": ["1 km", "2 km"]},
+    )  # fmt: skip
+    words = exchanged(spec)
+    assert len(words) == number
+    if number:
+        assert "at 100 % of the points, at all ranges" in words[0]
+
+
+def test_two_chirps_without_a_doppler_segment_are_told_the_same_remedy():
+    chirp = STUDY["instrument"]["chirp"] | {"segments": "up down"}
+    instrument = record(acquisition_delay="7 us") | {"chirp": chirp}
+    fast = WITHIN | {"radial_velocity": "60 m/s"}
+    words = told(small(target=fast, instrument=instrument, axes={"target.range": ["1 km", "9 km"]}))
+    assert ["two_beats: fast" in text for text in words if "misread" in text] == [True]
+
+
+def test_records_of_i_and_q_have_signs_and_no_assumption():
+    assert exchanged(flown(("1500 m", "300 m"), ("100 m/s", "30 m/s")))
+    spec = flown(("1500 m", "300 m"), ("100 m/s", "30 m/s"), record_kind="complex")
+    assert not exchanged(spec)
+
+
+def test_exchanged_pairs_are_warned_of_in_plan_and_in_python(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    spec = flown(("1500 m", "300 m"), ("100 m/s", "30 m/s"))
+    Path("fast.yaml").write_text(spec.to_yaml() if hasattr(spec, "to_yaml") else spec.to_json())
+    planned = CliRunner().invoke(main, ["plan", "fast.yaml"])
+    assert planned.exit_code == 0, planned.output
+    assert "write processing.two_beats: fast" in " ".join(planned.stderr.split())
+    with pytest.warns(sweep.StudyWarning, match="two_beats: fast"):
+        sweep.run(spec, store=tmp_path / "fast.zarr", scheduler="none", progress=False)
+
+
+@pytest.mark.parametrize("name", ["lander_ndl", "chester_2017_table_5_1"])
+def test_instruments_of_landers_read_two_beats_as_of_a_fast_target(name):
+    spec = small_scene(instrument=name, axes={})
+    assert spec.parameters()["instrument.processing.two_beats"] == "fast"
+    assert not exchanged(spec)
