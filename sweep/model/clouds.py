@@ -148,7 +148,8 @@ def _groups(
     for effect in random_effects(effects):
         if effect.draw is not None:
             shots = effect.draw(shots, scene, Realisation(keys, np.zeros(shots.size, np.int64)))
-    found = groups(shots, most=most)
+    fades = shots.fading is not None and bool(shots.leakage)
+    found = groups(shots, most=most, leakage=not fades)
     if not seen.all():
         blind = ~seen
         for bins in found[:3]:
@@ -156,7 +157,7 @@ def _groups(
         found.neighbours[blind] = found.pd[blind] = np.nan
         found.exempted[blind] = found.leakage[blind] = 0.0
     listed: list[tuple[np.ndarray, LeakedPeaks]] | None = None
-    if shots.fading is not None and shots.leakage:
+    if fades:
         listed = [] if shots.leak_amplitude is None else None  # a line has a great many bins
         for part, leaks in leaked_peaks(shots, found, np.flatnonzero(seen)):
             found.leakage[part] = leaks.mean_leakage()

@@ -236,7 +236,7 @@ def seen_spectra(
     # Without leakage none but the peak is looked at.
     floor = shots.floor + np.zeros(shots.size) if shots.leakage else np.full(shots.size, np.inf)
     least = np.minimum(shots.threshold, floor * sigma)
-    for runs in runs_of(shots, points=points, least=least, leakage=False):
+    for runs in runs_of(shots, points=points, least=least, leakage=False, chances=False):
         count, start, peak = (c.T.ravel() for c in (runs.bins, runs.start, runs.peak))
         run = np.repeat(np.arange(count.size), count)  # of each bin, point by point
         number = np.arange(run.size) - (np.cumsum(count) - count)[run]

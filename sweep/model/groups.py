@@ -41,18 +41,18 @@ class Groups(NamedTuple):
         return self.neighbours[..., 1]
 
 
-def groups(shots: Shots, *, most: int = 4, every_bin: bool = False) -> Groups:
+def groups(shots: Shots, *, most: int = 4, every_bin: bool = False, leakage: bool = True) -> Groups:
     """Find the groups of each segment's spectrum without noise, the ``most`` strongest of them.
 
-    ``every_bin`` as of :func:`sweep.model.shot.find`.
+    ``every_bin`` as of :func:`sweep.model.shot.find`. Without ``leakage`` its probability is 0.
     """
     n = shots.size
     bins = np.full((3, n, 3, most), -1, np.int64)
     neighbours, pd = np.full((n, 3, most, 3), np.nan), np.full((n, 3, most), np.nan)
-    exempted, leakage = np.full((n, 3), np.nan), np.full((n, 3), np.nan)
+    exempted, leaked = np.full((n, 3), np.nan), np.full((n, 3), np.nan)
     levels = shots.bin_levels
     mirror = 0 if shots.complex_record else shots.fft_size // 2
-    for runs in runs_of(shots, every_bin=every_bin):
+    for runs in runs_of(shots, every_bin=every_bin, leakage=leakage, chances=False):
         count, magnitudes = (runs.bins, runs.magnitudes) if shots.band is None else _echoes(runs)
         _find_groups(
             runs.part, (runs.low, count, runs.peak, runs.start), (magnitudes, runs.exempt), levels,
@@ -64,8 +64,8 @@ def groups(shots: Shots, *, most: int = 4, every_bin: bool = False) -> Groups:
             pd[runs.part] = chances.T
         pd[runs.part, :, 0] = np.where(runs.inside.T | (count.T > 0), pd[runs.part, :, 0], 0.0)
         some = np.where((runs.bins > 0) | ~runs.inside, runs.exempted, np.nan)
-        exempted[runs.part], leakage[runs.part] = some.T, runs.leakage.T
-    return Groups(bins[BIN], bins[FIRST], bins[LAST], neighbours, pd, exempted, leakage)
+        exempted[runs.part], leaked[runs.part] = some.T, runs.leakage.T
+    return Groups(bins[BIN], bins[FIRST], bins[LAST], neighbours, pd, exempted, leaked)
 
 
 def _echoes(runs: Runs) -> tuple[np.ndarray, np.ndarray]:

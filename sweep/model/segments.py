@@ -159,12 +159,14 @@ def runs_of(
     every_bin: bool = False,
     keep: bool = True,
     whole: bool = False,
+    chances: bool = True,
 ) -> Iterator[Runs]:
     """Yield runs of all points, or of those in ``points``, some points at a time, in any order.
 
     Bins below ``least`` (n,) [V, summed over the record], by default the threshold, may be left
     out. With ``every_bin`` each bin is looked at by itself where leakage could be summed as an
     integral; ``keep`` hands magnitudes on; ``whole`` has bins that are not searched as well.
+    Without ``chances`` the probabilities of a detection are nan.
     """
     table = shots.point_table()
     levels = table[11] if least is None else np.broadcast_to(least, shots.size)
@@ -178,7 +180,7 @@ def runs_of(
         while done < together.part.size:
             held = keep or (shots.looks.several and bool(leaks))
             held |= shots.leak_amplitude is not None or shots.band is not None
-            runs, number = _some(shots, table, lowest, together, leaks, done, held)
+            runs, number = _some(shots, table, lowest, together, leaks, done, held, chances)
             runs = runs if whole else cut(shots, _without_echo(shots, runs))
             runs = _of_looks(shots, runs, bool(leaks)) if shots.looks.several else runs
             yield runs if shots.leak_amplitude is None else beside_leak(shots, runs)
@@ -231,8 +233,9 @@ def spectrum(shots: Shots, i: int, segment: int, *, level: float = 0.0) -> tuple
     """
     shots = replace(shots, leak_amplitude=None)
     (runs,) = runs_of(
-        shots, points=np.array([i]), least=np.array([level]), leakage=False, whole=True
-    )
+        shots, points=np.array([i]), least=np.array([level]), leakage=False, whole=True,
+        chances=False,
+    )  # fmt: skip
     low = int(runs.low[segment, 0])
     magnitude = runs.run(segment, 0).copy()
     return np.arange(low, low + magnitude.size), magnitude
@@ -449,7 +452,7 @@ def _phases(shots: Shots, points: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 def _some(
     shots: Shots, table: np.ndarray, levels: np.ndarray, together: Together, leaks: int,
-    first: int, keep: bool,
+    first: int, keep: bool, chances: bool,
 ) -> tuple[Runs, int]:  # fmt: skip
     """Compute runs of as many points from ``first`` on as there is room for; return how many."""
     part = together.part[first:]
@@ -475,7 +478,7 @@ def _some(
         shapes._replace(sizes=np.append(shapes.sizes, (view(shots), rule.beside))),
         (_node_limits(shots, together), tangents(shots.fft_size)),
         (shots.segments, levels[part], np.array([leaks * each.leaks for each in shots.waveform]),
-         shots.window.sum, rule, shots.speckle_table),
+         shots.window.sum, rule, shots.speckle_table, chances),
         (np.empty((segments, 2, places)), form),
         (np.empty((ROOM, width)), np.empty(width, np.bool_), np.empty(MOST_TERMS)),
         (numbers, values, magnitudes, exempt),
@@ -592,15 +595,15 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
     :class:`Together`, with shifts (m, segments, 2, k) and with sizes that end in the view and half
     of the echo's main lobe, in whose place a wider pedestal's reach comes; ``tables`` limits of
     nodes, and tangents; ``how`` segments that there are, levels below which bins may be left out,
-    each segment's way to look at leakage, the window's sum, the rule of detection, and the speckle
-    of all points. ``made`` and ``work`` are
+    each segment's way to look at leakage, the window's sum, the rule of detection, the speckle of
+    all points, and true if probabilities of a detection are asked for. ``made`` and ``work`` are
     room for shapes and for spectra. Results (``out``): low, count, peak, exempted and start (5,
     segments, m); pd, miss, magnitude and leakage (4, segments, m); magnitudes and exempt bins of
     runs, which may have no room at all.
     """
     centre, shifts = modes[0], modes[3]
     sizes, limits, tangent = shapes[0], tables[0], tables[1]
-    (segments, levels, leaks, window_sum, rule, speckle), (table, form) = how, made
+    (segments, levels, leaks, window_sum, rule, speckle, chances), (table, form) = how, made
     room, exempt, series = work
     numbers, values, magnitudes, exempts = out
     keep, at = magnitudes.size > 0, np.int64(0)
@@ -657,11 +660,13 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
                     return i
                 numbers[4, s, i] = at
                 at = _keep(at, count, room, exempt, magnitudes, exempts)
-            found, missed = found_pair(
-                room[OUT, :count], exempt[:count], peak, low, rule,
-                BinLevels(p[13], level, sigma, p[17], pedestal),
-                speckle_of(speckle, s, where[2, i]),
-            )  # fmt: skip
+            found, missed = np.nan, np.nan
+            if chances:
+                found, missed = found_pair(
+                    room[OUT, :count], exempt[:count], peak, low, rule,
+                    BinLevels(p[13], level, sigma, p[17], pedestal),
+                    speckle_of(speckle, s, where[2, i]),
+                )  # fmt: skip
             if leaks[s] == BIN_BY_BIN:
                 if fades:
                     least = p[12] / math.sqrt(LOUDEST)
