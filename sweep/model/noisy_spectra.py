@@ -330,6 +330,8 @@ def speckle_of(
     fan = line_fan(shots) if fan is None else fan
     size, zero = signal.spectrum.size, index_of_zero(shots)
     found = np.empty((draws.size, size), complex)
+    at_ends = np.zeros(size, bool)  # one part is left, which has all of the power
+    at_ends[[0, -1]] = shots.real_ends > 0
     echoes = [(signal.strongest, signal.frequency + zero, signal.first, signal.last)]
     if signal.echo is not None and signal.others is not None:
         echoes = [
@@ -353,9 +355,17 @@ def speckle_of(
             there &= (bins >= 0) & (bins < size)
         if signal.echo is not None:
             there &= signal.echo[bins % size] == number
-        found[:, bins[there] % size] = amplitudes[:, there]
-    if shots.real_ends:  # one part is left, which has all of the power
-        found[:, [0, -1]] = math.sqrt(2) * found[:, [0, -1]].real
+        bins = bins[there] % size
+        found[:, bins] = amplitudes[:, there]
+        if shots.real_ends and shots.speckle_table.row[segment, i] > 0:
+            # Their phases are those about the record's middle, as the noise's are.
+            begun = 0 if shots.first_sample is None else int(shots.first_sample[segment, i])
+            turns = np.exp(-1j * np.pi * bins * ((shots.window.length + begun) / shots.fft_size))
+            magnitude = np.abs(signal.spectrum[bins])
+            tone = signal.spectrum[bins] / np.where(magnitude > 0, magnitude, 1.0)
+            found[:, bins] *= turns * np.where(magnitude > 0, tone, 1.0).conj()
+            at_ends[bins] = False
+    found[:, at_ends] = math.sqrt(2) * found[:, at_ends].real
     return found
 
 

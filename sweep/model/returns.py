@@ -47,6 +47,7 @@ import numpy as np
 
 from sweep.kernels import njit
 from sweep.model import philox, waveform
+from sweep.model.alarms import TAPS, noise_filter
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detection import echo_of, is_end, levels_of, pedestal_of_bins
 from sweep.model.draws import (
@@ -63,6 +64,7 @@ from sweep.model.draws import (
 )
 from sweep.model.estimators import Deviation, resolved_deviation
 from sweep.model.groups import BIN, FIRST, LAST, Groups
+from sweep.model.hoyt import bin_share, hoyt_pair
 from sweep.model.interpolation import (
     drift_error,
     interpolator,
@@ -93,6 +95,7 @@ from sweep.model.pairing import (
     pair_peaks,
 )
 from sweep.model.preparation import Shots
+from sweep.model.quadratures import noise_quadratures
 from sweep.model.search import beamlet_lines, columns
 from sweep.model.shot import fit
 from sweep.model.speckle_lines import (
@@ -177,10 +180,22 @@ def draw_returns(
         own = Drawn(*(column[part] for column in drawn))
         rule = echo_filter(shots, seen, 0 if noisy else around)
         filtered = how._replace(rule=rule, root=noise_root(rule))
+        if shots.real_ends and shots.fading is not None and (shots.speckle_table.row > 0).any():
+            quadratures = noise_quadratures(shots.window, shots.fft_size)
+            near = 1 + int(np.flatnonzero(np.abs(quadratures) > _ALIKE)[-1])
+            bins = 2 * (near + around + int(seen.bins.max(initial=0)))
+            end_rule = *noise_filter(shots.window, shots.fft_size, bins), shots.real_ends
+            filtered = filtered._replace(
+                end_rule=end_rule, noise_quadratures=np.ascontiguousarray(quadratures[:near])
+            )
         _draw(keys[part], filtered, of_part, seen, of_signal, tables, own)
         for column, values in zip(drawn, own, strict=True):
             column[part] = values
     return measured(shots, known, drawn, motion)
+
+
+_ALIKE = 1e-3
+"""Pseudo-variance of a bin's noise over its power below which its quadratures are alike."""
 
 
 def _spectra(
@@ -234,6 +249,12 @@ class How(NamedTuple):
     """:func:`sweep.model.draws.echo_filter`"""
     root: np.ndarray
     """:func:`sweep.model.draws.noise_root` of it."""
+    end_rule: tuple[np.ndarray, np.ndarray, int]
+    """Filter likewise of bins from DC or Nyquist on; of no bins where no echo in developed speckle
+    lies near."""
+    noise_quadratures: np.ndarray
+    """(bins,): of :func:`sweep.model.quadratures.noise_quadratures`, from DC or Nyquist on, as far
+    as the noise's quadratures differ; none where no echo in developed speckle lies near."""
     looks: int
     """Records whose powers are averaged."""
     apart: bool
@@ -255,8 +276,8 @@ class How(NamedTuple):
         return cls(
             int(first_draw), noisy, shots.incoherent, bool(shots.segments[1]), shots.fft_size // 2,
             signed, alone, shots.real_ends, shots.echo_rule[1], echo_filter(shots, Seen.nothing(0)),
-            np.zeros((0, 0)), shots.looks.number if shots.looks.several else 1,
-            shots.looks.independent, votes,
+            np.zeros((0, 0)), echo_filter(shots, Seen.nothing(0)), np.empty(0),
+            shots.looks.number if shots.looks.several else 1, shots.looks.independent, votes,
         )  # fmt: skip
 
 
@@ -378,8 +399,8 @@ def _speckle_shares(shots: Shots, found: Groups) -> tuple[np.ndarray, np.ndarray
         # As if one bin were detected as often: fading_together has the same share.
         share = 1 + np.log(found.pd) * 2 * (line / level) ** 2
         signal = np.square(found.magnitude / line)
-        at_end = np.isin(found.bin, (0, shots.real_ends // 2)) & (shots.real_ends > 0)
-        share = np.where(at_end, signal / (2 + signal), share)
+        near_end = (shots.speckle_table.row.T > 0)[:, :, None] & (shots.real_ends > 0)
+        share = np.where(near_end, signal / (2 + signal), share)
     widest = np.sqrt((shots.speckle_lines.spread**2).sum(axis=-1))
     looks = shots.looks.number if shots.looks.several and shots.looks.independent else 1
     wander = widest[..., None] * found.magnitude / sigma / math.sqrt(2 * looks)
@@ -790,6 +811,8 @@ class Speckle(NamedTuple):
     """(most, 3) int64: number of bins, 0 where a segment lacks the group."""
     power: np.ndarray
     """(most, 3, bins): mean power by the lines of the footprint."""
+    pseudo: np.ndarray
+    """(most, 3, bins): pseudo-variance over that power."""
     drawn: np.ndarray
     """(most, looks, 3, bins): complex amplitudes of a mean power of 1; of one look where all have
     the same."""
@@ -804,7 +827,8 @@ def no_speckle(most):
     """Return the record of a point whose echoes do not fade."""
     bins = np.zeros((most, 3), np.int64)
     nothing = np.zeros((most, 1, 3, 0), np.complex128)
-    return Speckle(bins, bins, np.zeros((most, 3, 0)), nothing, np.zeros(most, np.int64), nothing)
+    powers = np.zeros((most, 3, 0))
+    return Speckle(bins, bins, powers, powers, nothing, np.zeros(most, np.int64), nothing)
 
 
 @njit(cache=True, error_model="numpy")
@@ -828,20 +852,20 @@ def speckled_bins(i, how, known, seen):
                 first[g, s] = centre - known.fan.reach[i]
                 count[g, s] = 2 * known.fan.reach[i] + 1
             widest = max(widest, count[g, s])
-    power = np.zeros((most, 3, widest))
+    power, pseudo = np.zeros((most, 3, widest)), np.zeros((most, 3, widest))
     looks = how.looks if how.apart else 1
     rows = 3 * widest if 3 * widest <= FACTORED_ROWS_MAX else 0
     rank, factor = np.zeros(most, np.int64), np.empty((most, rows, 3, widest), np.complex128)
     for g in range(most):
         if count[g].max() == 0:
             continue
-        line_powers(known.fan, i, known.middle[i, :, g], first[g], power[g])
-        if rows > 0:
+        imaged = line_powers(known.fan, i, known.middle[i, :, g], first[g], power[g], pseudo[g])
+        if rows > 0 and not imaged:
             rank[g] = factor_bins(
                 known.fan, i, known.middle[i, :, g], first[g], power[g], factor[g]
             )
     drawn = np.zeros((most, looks, 3, widest), np.complex128)
-    return Speckle(first, count, power, drawn, rank, factor)
+    return Speckle(first, count, power, pseudo, drawn, rank, factor)
 
 
 @njit(cache=True, error_model="numpy")
@@ -1024,7 +1048,12 @@ def look(address, at, g, how, known, seen, speckle, tables, peak):
         re, im = math.sqrt(2.0) * re, 0.0
     re, im = re * under_lines, im * under_lines
     m = known.magnitude[i, s, g] / sigma
-    echo = speckled(m[1], speckle, g, s, 1, real)
+    near_end = speckle.number[g, s] > 0 and is_near_end(centre - 1, 3, how)
+    room = np.empty((4, how.end_rule[0].shape[0] + TAPS if near_end else 0))
+    if near_end:
+        noise_near_end((a, b, draw, stream), ECHO * (1 + g), (centre - 1, 3), how, room)
+        re, im = under_lines * room[0, 1], under_lines * room[1, 1]
+    echo = speckled(m[1], speckle, g, s, 1)
     if (echo.real + re) ** 2 + (echo.imag + im) ** 2 < beta * beta:
         return False
     # Neighbours are exempt from false alarms, so their bins' own numbers are free.
@@ -1033,7 +1062,7 @@ def look(address, at, g, how, known, seen, speckle, tables, peak):
     re_below, im_below = re_below * under_lines, im_below * under_lines
     re_above, im_above = re_above * under_lines, im_above * under_lines
     near, rest, across, own = tables.mixing
-    low, high = speckled(m[0], speckle, g, s, 0, False), speckled(m[2], speckle, g, s, 2, False)
+    low, high = speckled(m[0], speckle, g, s, 0), speckled(m[2], speckle, g, s, 2)
     below = math.hypot(
         low.real + (near * re + across * re_above + own * re_below),
         low.imag + (near * im + across * im_above + own * im_below),
@@ -1042,6 +1071,9 @@ def look(address, at, g, how, known, seen, speckle, tables, peak):
     above = math.hypot(
         high.real + (near * re + rest * re_above), high.imag + (near * im + rest * im_above)
     )
+    if near_end:
+        below = abs(low + under_lines * complex(room[0, 0], room[1, 0]))
+        above = abs(high + under_lines * complex(room[0, 2], room[1, 2]))
     delta = sub_bin(below, middle, above, tables)
     shift = 0
     if max(below, above) > middle:
@@ -1052,16 +1084,11 @@ def look(address, at, g, how, known, seen, speckle, tables, peak):
 
 
 @njit(cache=True, error_model="numpy")
-def speckled(magnitude, speckle, g, s, k, real):
-    """Complex amplitude of bin k of a group in a draw, of a mean square magnitude.
-
-    The spectrum of a real record is ``real`` at its ends: of a faded echo one part is left, which
-    has all of its power.
-    """
+def speckled(magnitude, speckle, g, s, k):
+    """Complex amplitude of bin k of a group in a draw, of a mean square magnitude."""
     if speckle.number[g, s] == 0:
         return complex(magnitude, 0.0)
-    amplitude = magnitude * speckle.drawn[g, 0, s, k]
-    return complex(math.sqrt(2.0) * amplitude.real, 0.0) if real else amplitude
+    return magnitude * speckle.drawn[g, 0, s, k]
 
 
 @njit(cache=True, error_model="numpy")
@@ -1077,15 +1104,16 @@ def detect_faded(address, at, g, how, known, speckle, tables, peak):
     sigma, beta, under_lines = known.levels[i]
     centre, first = known.bins[i, s, BIN, g], speckle.first[g, s]
     middle, count, chance = centre - first, speckle.number[g, s], known.pd[i, s, g]
-    real, share = is_end(centre, how.ends), known.share[i, s, g]
+    share, near_end = known.share[i, s, g], is_near_end(first, count, how)
     if not chance > 0.0:
         return False
-    power, room = np.zeros(count), np.empty((4, count + how.rule[0].shape[1]))
+    power = np.zeros(count)
+    room = np.empty((4, TAPS + (how.end_rule[0].shape[0] if near_end else count)))
     scale, votes, total = known.magnitude[i, s, g] / sigma, 0, complex(0.0, 0.0)
     for look in range(how.looks):
         own = draw + look * NEXT_LOOK
         address_of_noise = a, b, own, philox.STREAM_NOISE[s]
-        if count == 3:
+        if count == 3 and not near_end:
             three_bins_of_noise(address_of_noise, 3 * g, tables, room)
         else:
             bins_of_noise(address_of_noise, ECHO * (1 + g), (first, count), how, room)
@@ -1100,14 +1128,14 @@ def detect_faded(address, at, g, how, known, speckle, tables, peak):
             if k == middle and look == 0:
                 total = math.sqrt(share) * echo[k] + math.sqrt(0.5 * (1.0 - share)) * noise
             if k == middle:
-                if real:
-                    amplitude = complex(math.sqrt(2.0) * amplitude.real, 0.0)
                 votes += abs(amplitude) >= beta
             power[k] += abs(amplitude) ** 2 / how.looks
     if how.looks > 1 and how.votes >= 0:
         there = votes >= how.votes if how.votes > 0 else power[middle] >= beta * beta
-    elif real:
-        there = math.erfc(abs(total.real)) < chance
+    elif near_end:
+        pseudo = share * speckle.pseudo[g, s, middle]
+        pseudo += (1.0 - share) * bin_share(abs(centre), how.half, how.noise_quadratures)
+        there = hoyt_pair(1.0, pseudo, abs(total))[0] < chance
     else:
         there = math.exp(-(abs(total) ** 2)) < chance
     if not there:
@@ -1134,15 +1162,44 @@ def detect_faded(address, at, g, how, known, speckle, tables, peak):
 def bins_of_noise(address, number, bins, how, room):
     """Noise of adjacent bins over sigma, to rows 0 and 1 of ``room`` (4, >= bins + TAPS).
 
+    It has room for all bins of ``how.end_rule`` and TAPS where bins are near DC or Nyquist.
+
     ``address``: key, draw, stream; independent numbers count from ``number``. ``bins``: the first
     bin, and their number.
     """
     first, count = bins
     at_end = how.ends > 0 and (first == 0 or 2 * (first + count - 1) == how.ends)
-    if count <= how.root.shape[0] and not at_end:
+    if is_near_end(first, count, how):
+        noise_near_end(address, number, bins, how, room)
+    elif count <= how.root.shape[0] and not at_end:
         draw_noise_by_root(address, number, count, how.root, room)
     else:
         draw_noise(address, number, first, count, how.rule, room)
+
+
+@njit(cache=True, error_model="numpy")
+def is_near_end(first, count, how):
+    """Return true of adjacent bins so near to DC or Nyquist that the noise's quadratures differ."""
+    near = how.noise_quadratures.size
+    return near > 0 and (first < near or first + count - 1 > how.half - near)
+
+
+@njit(cache=True, error_model="numpy")
+def noise_near_end(address, number, bins, how, room):
+    """Noise of :func:`bins_of_noise` near DC or Nyquist, beyond which bins are conjugate."""
+    first, count = bins
+    last = first + count - 1
+    low, high = 0, max(last, -first)
+    if first >= how.noise_quadratures.size:
+        low, high = min(first, 2 * how.half - last), how.half
+    draw_noise(address, number, low, high - low + 1, how.end_rule, room)
+    for k in range(high - low + 1):
+        room[2, k], room[3, k] = room[0, k], room[1, k]
+    for k in range(count):
+        bin_ = abs(first + k)
+        sign = -1.0 if first + k < 0 or bin_ > how.half else 1.0
+        bin_ = min(bin_, 2 * how.half - bin_) - low
+        room[0, k], room[1, k] = room[2, bin_], sign * room[3, bin_]
 
 
 @njit(cache=True, error_model="numpy")
@@ -1181,17 +1238,16 @@ def look_at_all(address, at, g, how, known, seen, speckle, tables, peak):
         pedestal_of_bins(
             sigma * run[first : last + 1], echo, levels_of(known.of_bins.T, i), pedestal
         )
-    room = np.empty((4, count + how.rule[0].shape[1]))
+    room = np.empty((4, max(count, how.end_rule[0].shape[0]) + TAPS))
     address_of_noise, numbers = (a, b, draw, philox.STREAM_NOISE[s]), ECHO * (1 + g)
     if speckle.number[g, s] > 0:
         bins_of_noise(address_of_noise, numbers, (low + first, count), how, room)
     else:
         draw_noise(address_of_noise, numbers, low + first, count, how.rule, room)
     for k in range(count):
-        real = is_end(low + first + k, how.ends)
-        amplitude, deviation = speckled(run[first + k], speckle, g, s, k, real), 1.0
+        amplitude, deviation = speckled(run[first + k], speckle, g, s, k), 1.0
         if pedestal[k] > 0.0:  # fades as the lines do
-            power = pedestal[k] * abs(speckled(1.0, speckle, g, s, k, False)) ** 2
+            power = pedestal[k] * abs(speckled(1.0, speckle, g, s, k)) ** 2
             deviation = math.sqrt(1.0 + power)
         re, im = amplitude.real + deviation * room[0, k], amplitude.imag + deviation * room[1, k]
         room[0, k] = math.hypot(re, im)

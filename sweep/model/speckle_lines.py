@@ -8,10 +8,12 @@ of the echo, and its phase is t_s . (y, x) against the first segment, by equatio
 
     A_s,k = sum a z e^(i t_s . (y, x)) G(k - middle_s - b_s . (y, x))                            (1)
 
-with the window's transform G. Bins of all segments are jointly circular Gaussian, as sums of such
-numbers are. Their covariances are the Gaussian means that the rule integrates, so that the peak
-bins of two segments have the correlation mu of that module. Amplitudes are returned over their root
-mean squares: whoever draws gives a bin the mean power that the spectrum has there.
+with the window's transform G. Near DC and Nyquist of a real record the conjugate amplitudes of the
+lines' images add to it (:mod:`sweep.model.quadratures`): at DC the sum is real. Bins of all
+segments are jointly circular Gaussian, as sums of such numbers are. Their covariances are the
+Gaussian means that the rule integrates, so that the peak bins of two segments have the correlation
+mu of that module. Amplitudes are returned over their root mean squares: whoever draws gives a bin
+the mean power that the spectrum has there.
 
 Places wander with speckle. If the footprint spreads over less than a bin, (1) is to first order in
 b the bin of a lone tone that lies
@@ -89,6 +91,9 @@ class LineFan(NamedTuple):
     """Of these for a bin."""
     size: float
     """Bins on either side of a line that see it."""
+    half: int
+    """N/2 of a real record whose bins near DC and Nyquist see the conjugate images of lines,
+    else 0."""
 
     def of(self, part: np.ndarray) -> "LineFan":
         """Lines of some points by their numbers."""
@@ -130,7 +135,7 @@ def line_fan(shots: "Shots") -> LineFan:
     return LineFan(
         np.ascontiguousarray(spread * directions(shots)[..., None][:size]),
         np.ascontiguousarray(turn), rule.astype(np.int64), reach, node, weight, NODES,
-        value, OVERSAMPLING / padding, REACH * padding,
+        value, OVERSAMPLING / padding, REACH * padding, shots.real_ends // 2,
     )  # fmt: skip
 
 
@@ -177,13 +182,22 @@ def transform_at(distance, fan):
 
 
 @njit(cache=True, error_model="numpy")
-def line_powers(fan, i, middle, first, power):
+def image_of(place, half):
+    """Place [bins] of the nearer image of a line of a real record, about DC or Nyquist."""
+    return -place if place < 0.5 * half else 2.0 * half - place
+
+
+@njit(cache=True, error_model="numpy")
+def line_powers(fan, i, middle, first, power, pseudo):
     """Mean powers (3, bins) of bins by lines of a total power of 1, into ``power``.
 
     ``middle`` (3,) is the echo's middle in each segment, nan for none, and ``first`` (3,) the first
-    of the bins, in the same numbers.
+    of the bins, in the same numbers. ``pseudo`` takes the pseudo-variances over these powers, which
+    images of lines make (:mod:`sweep.model.quadratures`). Returns true if there are any.
     """
     power[:] = 0.0
+    pseudo[:] = 0.0
+    imaged = False
     along, across = fan.rule[i]
     for s in range(3):
         if np.isnan(middle[s]):
@@ -199,11 +213,25 @@ def line_powers(fan, i, middle, first, power):
                 for k in range(low, min(power.shape[1], math.floor(place + fan.size) + 1)):
                     at = transform_at(k - place, fan)
                     power[s, k] += weight * at * at
+                if fan.half == 0:
+                    continue
+                image = image_of(place + first[s], fan.half) - first[s]
+                low = max(0, math.ceil(image - fan.size))
+                for k in range(low, min(power.shape[1], math.floor(image + fan.size) + 1)):
+                    at = transform_at(k - image, fan)
+                    power[s, k] += weight * at * at
+                    pseudo[s, k] += 2.0 * weight * at * transform_at(k - place, fan)
+                    imaged = True
+        for k in range(power.shape[1]):
+            pseudo[s, k] /= max(power[s, k], 1e-300)
+    return imaged
 
 
 @njit(cache=True, error_model="numpy")
 def draw_lines(address, group, fan, i, middle, first, power, out):
     """Draw complex amplitudes (3, bins) of bins, of mean power 1, into ``out``.
+
+    They are those of the transform about the record's middle.
 
     ``address``: key of the point and number of the draw; ``group``: number of the echo; ``power``:
     :func:`line_powers` of the same bins.
@@ -233,6 +261,12 @@ def draw_lines(address, group, fan, i, middle, first, power, out):
                 low = max(0, math.ceil(place - fan.size))
                 for k in range(low, min(out.shape[1], math.floor(place + fan.size) + 1)):
                     out[s, k] += turned * transform_at(k - place, fan)
+                if fan.half == 0:
+                    continue
+                image = image_of(place + first[s], fan.half) - first[s]
+                low = max(0, math.ceil(image - fan.size))
+                for k in range(low, min(out.shape[1], math.floor(image + fan.size) + 1)):
+                    out[s, k] += turned.conjugate() * transform_at(k - image, fan)
     for s in range(3):
         for k in range(out.shape[1]):
             if power[s, k] > 0.0:
@@ -365,7 +399,7 @@ def drawn_speckle(
     (segment,) = np.flatnonzero(np.isfinite(middle))
     first = np.full(3, bins[0])
     power = np.empty((3, bins[1]))
-    line_powers(fan, i, middle, first, power)
+    line_powers(fan, i, middle, first, power, np.empty((3, bins[1])))
     out = np.zeros((3, bins[1]), complex)
     found = np.empty((draws.size, bins[1]), complex)
     for row, draw in enumerate(draws):

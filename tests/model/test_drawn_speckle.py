@@ -106,7 +106,7 @@ def fan_of(spread, turn, shape="hann"):
     rule = np.array([[3, 3]])  # of 15 lines along either coordinate
     return speckle_lines.LineFan(
         np.array([spread]), np.array([turn]), rule, np.ones(1, np.int64), node, weight,
-        speckle_lines.NODES, transform, float(speckle_lines.OVERSAMPLING), 6.0,
+        speckle_lines.NODES, transform, float(speckle_lines.OVERSAMPLING), 6.0, 0,
     )  # fmt: skip
 
 

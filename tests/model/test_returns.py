@@ -263,7 +263,7 @@ def test_the_largest_of_many_noise_bins_has_its_order_statistic():
 
 NO_LINES = LineFan(
     *np.zeros((2, 0, 3, 2)), np.zeros((0, 2), np.int64), np.zeros(0, np.int64), np.ones((1, 1)),
-    np.ones((1, 1)), np.ones(1, np.int64), np.ones(2), 1.0, 1.0,
+    np.ones((1, 1)), np.ones(1, np.int64), np.ones(2), 1.0, 1.0, 0,
 )  # fmt: skip
 """Lines of points whose echoes do not fade."""
 
@@ -271,7 +271,24 @@ NO_LINES = LineFan(
 def _up_in_noise(centre, magnitude, levels, tables, half, *, low=0, others=0.0, alarm=0.0):
     """Draws of the up-chirp segment of one point: from number to strongest peak, or None."""
     rule = np.empty((0, 17)), np.empty(0, np.int64), 0
-    how = How(0, True, True, True, half, 0.0, 0, 0, 0, rule, np.zeros((0, 0)), 1, False, 0)
+    how = How(
+        0,
+        True,
+        True,
+        True,
+        half,
+        0.0,
+        0,
+        0,
+        0,
+        rule,
+        np.zeros((0, 0)),
+        rule,
+        np.empty(0),
+        1,
+        False,
+        0,
+    )
     known = Known(
         np.full((1, 3, 3, 1), centre), np.ones((1, 3, 1)), np.full((1, 3, 1, 3), magnitude),
         np.zeros((1, 3, 1)), np.zeros((1, 3, 1)), np.ones((1, 1)), np.array([levels]),
