@@ -480,15 +480,15 @@ def measured(
     """
     fitted = shots.slopes != waveform.SIGNS
     drawn = _with_drift(shots, drawn, motion)
+    read = _fitted if fitted else _read
+    if from_three_bins and shots.first_sample is not None:  # errors by noise
+        drawn = _with_late_echo(shots, drawn, read(shots, drawn, None))
     wander = _wander(shots, known, drawn)
     if wander is not None:
         peaks = drawn.peaks.copy()
         alone = np.diagonal(wander, axis1=-2, axis2=-1)
         peaks[..., ERROR] = np.sqrt(peaks[..., ERROR] ** 2 + alone)
         drawn = drawn._replace(peaks=peaks)
-    read = _fitted if fitted else _read
-    if from_three_bins and shots.first_sample is not None:
-        drawn = _with_late_echo(shots, drawn, read(shots, drawn, wander))
     told = read(shots, drawn, wander)
     point, group = np.arange(shots.size)[:, None, None], np.maximum(drawn.group, 0)
     sizes = (known.bins[:, :, LAST] - known.bins[:, :, FIRST])[
