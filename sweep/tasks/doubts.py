@@ -70,6 +70,19 @@ def tell_doubts(study: GridStudy | FlightStudy, say: Callable[[str], None]) -> N
             if is_command():
                 say(f"warning: {doubt}")
             else:
-                warnings.warn(doubt, StudyWarning, stacklevel=level)
+                issue_warning(doubt, level + 1)
     for sentence in study.spec.unstated_errors():
         say(f"note: {sentence}")
+
+
+def issue_warning(doubt: str, level: int) -> None:
+    """Issue a `StudyWarning` at a frame's line; only a filter of the user's raises it.
+
+    A standard error that is closed or broken ends no computation.
+    """
+    try:
+        warnings.warn(doubt, StudyWarning, stacklevel=level)
+    except StudyWarning:
+        raise
+    except Exception:  # what writing to the user's own `sys.stderr` or `showwarning` raises
+        pass
