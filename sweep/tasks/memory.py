@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import CancelledError
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -81,8 +82,17 @@ def worker_memory(client: Client | None, cluster: AnyCluster | None) -> WorkerMe
 
 
 def _smallest_worker(client: Client) -> float:
-    """Return the least memory of a client's workers [bytes]; inf if there is none, or no limit."""
-    workers = client.scheduler_info(n_workers=-1).get("workers", {}).values()
+    """Return the least memory of a client's workers [bytes]; inf if there is none, or no limit.
+
+    Of a client that is closed, or whose scheduler is gone, nothing is known: a study with blocks
+    left says so when it reaches for the workers, and a complete one needs none.
+    """
+    if client.status != "running":
+        return np.inf
+    try:
+        workers = client.scheduler_info(n_workers=-1).get("workers", {}).values()
+    except (OSError, RuntimeError, CancelledError):  # gone meanwhile
+        return np.inf
     return min((worker.get("memory_limit") or np.inf for worker in workers), default=np.inf)
 
 

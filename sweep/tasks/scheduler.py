@@ -135,9 +135,11 @@ class Scheduler:
             while True:
                 try:
                     self._fill(sending=not stopping())
-                except (OSError, CancelledError, RuntimeError) as error:
+                except Exception as error:  # of a client that is closed, of any kind
                     self._check()
-                    raise SchedulerLost(str(error)) from error
+                    if isinstance(error, OSError | CancelledError | RuntimeError):
+                        raise SchedulerLost(str(error)) from error
+                    raise
                 if stopping() and not (self._flying and self._fit()):
                     return  # nothing that is out will ever come
                 if not (self._flying or self._unseen or self._waits):

@@ -8,7 +8,7 @@ import signal
 import socket
 import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 
 import dask
 import pytest
@@ -16,7 +16,7 @@ from distributed import Client
 from small import copied, receipts, small, threads, tree
 
 from sweep.storage.opening import NotAStoreError
-from sweep.tasks import cluster, progress, scheduler, session, store, worker
+from sweep.tasks import cluster, memory, progress, scheduler, session, store, worker
 from sweep.tasks.driver import resume, run
 from sweep.tasks.grid_study import GridStudy
 from sweep.tasks.progress import ClusterError, Progress, StoreError
@@ -151,6 +151,36 @@ def test_blocks_of_a_silent_worker_are_computed_by_others_and_committed_once(
     else:
         assert outcome.complete and outcome.blocks_computed == 12
     assert tree(outcome.store) == tree(undisturbed)
+
+
+@pytest.mark.parametrize("lost", ["client", "cluster"])
+def test_a_client_closed_before_is_told_in_words_where_blocks_are_left(undisturbed, tmp_path, lost):
+    with threads(1) as client:
+        (client if lost == "client" else client.cluster).close()
+        outcome = run(small(), store=tmp_path / "s.zarr", client=client, progress=False)
+        assert outcome.stopped == "the scheduler is gone (the client is closed)"
+        assert outcome.blocks_done == 0
+        whole = resume(copied(undisturbed, tmp_path), client=client, progress=False)
+    assert whole.complete and not whole.blocks_computed
+
+
+class Leaving:
+    """A client whose scheduler goes as it is asked."""
+
+    status = "running"
+
+    def __init__(self, error):
+        self.error = error
+
+    def scheduler_info(self, n_workers):
+        raise self.error
+
+
+@pytest.mark.parametrize(
+    "error", [OSError("gone"), TimeoutError(), RuntimeError("IOLoop is closed"), CancelledError()]
+)
+def test_nothing_is_known_of_the_memory_of_workers_that_go(error):
+    assert memory.worker_memory(Leaving(error), None).limit == float("inf")
 
 
 def test_a_scheduler_that_goes_away_ends_the_run_in_words(undisturbed, tmp_path, two_workers):

@@ -31,7 +31,7 @@ def test_an_fft_that_no_machine_holds_is_refused(use, tmp_path, monkeypatch):
 class ClientOf:
     """A client whose workers have so many bytes."""
 
-    asynchronous = False
+    asynchronous, status = False, "running"
 
     def __init__(self, *limits):
         self.limits = limits
