@@ -36,8 +36,10 @@ def deviate(pd: xr.DataArray, miss: xr.DataArray | None = None) -> xr.DataArray:
         if (np.abs(p + q - 1) > _COMPLEMENT_ERROR_MAX).any():
             raise ValueError(
                 "the probabilities of detection and of a miss do not add to 1, as after a maximum "
-                "or minimum of the dataset: reduce the answer instead, "
-                "ds.sweep.maximum_range().max('power')"
+                "or minimum of the dataset: ask for the answer first, of the whole dataset, and "
+                "compare its values then. A value without a limit is nan, for the reason in "
+                "unbroken_reason (such as never_lost: beyond the last value), and max() and min() "
+                "pass over it"
             )
         z = np.where(p < 0.5, p, q)
         ndtri(z, out=z)
