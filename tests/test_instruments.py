@@ -126,7 +126,7 @@ def test_an_unknown_name_is_told_what_there_is():
     assert "is no field" in refusal({"like": "rogers_2021", "path": "a.yaml"})
 
 
-def test_the_command_lists_the_library_and_tells_of_each():
+def test_the_command_lists_the_library_and_tells_of_each(tmp_path):
     listed = CliRunner().invoke(main, ["instruments"])
     assert [line.split()[0] for line in listed.output.splitlines()] == NAMES
     for name in NAMES:
@@ -136,6 +136,10 @@ def test_the_command_lists_the_library_and_tells_of_each():
         assert yaml.safe_load(told[told.index("\ninstrument:") :])["instrument"].keys() == (
             own["instrument"].keys()
         )
+        file = tmp_path / "own.yaml"
+        file.write_text(told)
+        assert read_document(file).value["instrument"] == own["instrument"]
+        assert spec({"file": str(file)}).id == spec(name).id
     wrong = CliRunner().invoke(main, ["instruments", "rogers"])
     assert wrong.exit_code == 2 and "did you mean 'rogers_2021'?" in wrong.output
 

@@ -482,11 +482,12 @@ def instruments(name: str | None) -> None:
         laser: {power: 1 mW}
 
     A store holds all fields of the instrument. The study is the same as with all fields in the
-    spec.
+    spec. The description of NAME is a file to begin one's own with, `instrument: {file: own.yaml}`.
 
     \b
       sweep instruments
       sweep instruments settembrini_2026
+      sweep instruments lander_ndl > own.yaml
     """  # noqa: D301
     from sweep.cli.terminal import instrument_lines
     from sweep.spec.reading import library, read_document

@@ -209,14 +209,14 @@ def computing(command: Callable[..., Any]) -> Callable[..., Any]:
     return command
 
 
-def folded(text: str, hanging: int = 2, *, err: bool = False) -> str:
-    """Text in lines of the terminal's width; unchanged where the output is no terminal.
+def folded(text: str, hanging: int = 2, *, err: bool = False, narrower: int = 0) -> str:
+    """Text in lines of the terminal's width, or so much narrower; unchanged for no terminal.
 
     Lines break between words, and commands in backquotes, which are copied, stay whole.
     """
     if not is_terminal(sys.stderr if err else sys.stdout):
         return text
-    width = shutil.get_terminal_size().columns
+    width = max(shutil.get_terminal_size().columns - narrower, 1)
     whole = re.sub(r"`[^`]*`", lambda found: found[0].replace(" ", "\xa0"), text)
     lines = (
         textwrap.fill(
@@ -234,19 +234,25 @@ def tell(text: str, *, err: bool = False) -> None:
 
 
 def instrument_lines(own: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what the file of an instrument of the library says."""
+    """Yield what the file of an instrument of the library says, as a file that a spec may name.
+
+    Words are comments of its YAML.
+    """
     import yaml
 
-    yield folded(own["title"])
-    yield folded(own["source"] + (f", https://doi.org/{own['doi']}" if own["doi"] else ""))
+    words = [
+        own["title"],
+        own["source"] + (f", https://doi.org/{own['doi']}" if own["doi"] else ""),
+    ]
     for what in ("published", "assumed"):
-        yield f"\n{what}:"
-        yield from (folded(f"- {each}") for each in own[what] or ["nothing"])
-    yield "\nmust reproduce (docs/instruments.md has what is simulated):"
+        words += ["", f"{what}:", *(f"- {each}" for each in own[what] or ["nothing"])]
+    words += ["", "must reproduce (docs/instruments.md has what is simulated):"]
     for number in own["numbers"].values():
-        words = isinstance(number["published"], str)  # which have their unit
-        unit = "" if words else f" {number['unit']}"
-        yield folded(f"- {number['about']}: {number['published']}{unit}".rstrip())
+        in_words = isinstance(number["published"], str)  # which have their unit
+        unit = "" if in_words else f" {number['unit']}"
+        words.append(f"- {number['about']}: {number['published']}{unit}".rstrip())
+    for text in words:
+        yield from (f"# {line}".rstrip() for line in (folded(text, narrower=2) or " ").splitlines())
     sections = {name: own[name] for name in ("error_floor", "instrument") if name in own}
     yield "\n" + yaml.safe_dump(sections, sort_keys=False).rstrip()
 

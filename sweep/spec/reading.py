@@ -11,7 +11,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import yaml
 from pydantic import BaseModel, ValidationError
@@ -47,6 +47,10 @@ _INSTRUMENT: Location = ("instrument",)
 _EXAMPLE = "settembrini_2026"
 """Instrument of the library that remedies name."""
 _FLOOR = "error_floor"
+_SECTIONS_OF_A_FILE = frozenset(
+    {"title", "source", "doi", "published", "assumed", "numbers", _FLOOR, "instrument"}
+)
+"""Sections of an instrument's file; a study takes the last two."""
 _LIBRARY = Path(__file__).parents[1] / "instruments"
 _THRESHOLDS = {way.removeprefix(PROCESSING) for way in WAYS}
 
@@ -75,6 +79,15 @@ _EXTENSION = "x-"
 """Beginning of the names of sections that hold anchors for others, and are no part of a spec."""
 
 
+class InstrumentFloor(NamedTuple):
+    """Fields of a floor of errors that a study has from its instrument."""
+
+    instrument: str
+    """Name in the library, or path as written, of the instrument."""
+    fields: dict[str, Any]
+    """Fields that the study does not state, as the instrument's file has them."""
+
+
 @dataclass
 class Document:
     """A spec as written: values, their places and what is already known to be wrong."""
@@ -90,6 +103,8 @@ class Document:
     """YAML's nodes read, each as often as an alias repeats it."""
     open_nodes: list[yaml.Node] = field(default_factory=list)
     """Mappings being read, each within the one before."""
+    instrument_floor: InstrumentFloor | None = None
+    """Floor of errors that comes with the instrument; None where the study states all of it."""
 
     @classmethod
     def from_plain(cls, value: dict[str, Any]) -> Document:
@@ -346,8 +361,8 @@ class _Loader(yaml.SafeLoader):
 def resolve_instrument(document: Document, base: Path, *, has_floor: bool = False) -> bool:
     """Put an instrument of the library or of a file in the place of its name; False without one.
 
-    With ``has_floor`` an instrument of the library brings its ``error_floor`` too, to a study that
-    may have one; fields that the study states itself take its place.
+    With ``has_floor`` an instrument whose file has an ``error_floor`` brings that too, to a study
+    that may have one; fields that the study states itself take its place.
     """
     written = document.value.get("instrument")
     reference, location = written, _INSTRUMENT
@@ -373,14 +388,32 @@ def resolve_instrument(document: Document, base: Path, *, has_floor: bool = Fals
     own = read.value["instrument"]
     _read_error_table(document, own, Path(read.file).parent)
     document.value["instrument"] = merged(_without_threshold(own, overrides), overrides)
-    stated = document.value.get(_FLOOR, {})
-    if has_floor and _FLOOR in read.value and isinstance(stated, Mapping):
-        document.value[_FLOOR] = merged(read.value[_FLOOR], stated)
+    if has_floor and _FLOOR in read.value:
+        _bring_floor(document, read.value[_FLOOR], str(reference))
     kept = {place: at for place, at in document.places.items() if _is_leaf(document.value, place)}
-    within = {place: at for place, at in read.places.items() if place[:1] == _INSTRUMENT != place}
+    within = {
+        place: at
+        for place, at in read.places.items()
+        if place[:1] in (_INSTRUMENT, (_FLOOR,)) and place != _INSTRUMENT
+    }
     document.places = document.places | within | kept
     document.findings += read.findings
     return True
+
+
+def _bring_floor(document: Document, brought: object, instrument: str) -> None:
+    """Put an instrument's floor of errors where a study does not state its own."""
+    stated = document.value.get(_FLOOR, {})
+    if not isinstance(stated, Mapping):  # which is told
+        return
+    if not isinstance(brought, Mapping):
+        document.value.setdefault(
+            _FLOOR, brought
+        )  # what is wrong with it is told as of the study's
+        return
+    document.value[_FLOOR] = merged(brought, stated)
+    if fields := {name: value for name, value in brought.items() if name not in stated}:
+        document.instrument_floor = InstrumentFloor(instrument, fields)
 
 
 def _read_error_table(document: Document, instrument: dict[str, Any], base: Path) -> None:
@@ -424,9 +457,34 @@ def _instrument_of(reference: object, location: Location, base: Path) -> Documen
     except SpecError as error:
         rule = f"names a file that {error.mistakes[0].rule}"
         raise rejected(location, rule, error.mistakes[0].suggestion, reference) from None
-    places = {(*_INSTRUMENT, *place): at for place, at in read.places.items()}
-    findings = [replace(f, location=(*_INSTRUMENT, *f.location)) for f in read.findings]
-    return Document({"instrument": read.value}, places, findings, read.file)
+    return _with_sections(read)
+
+
+def _with_sections(read: Document) -> Document:
+    """Document of a user's instrument, in the sections that a file of the library has.
+
+    Its file has them as well, or the instrument's fields at its root.
+    """
+    if "instrument" not in read.value:
+        floor = {_FLOOR: read.value.pop(_FLOOR)} if _FLOOR in read.value else {}
+
+        def moved(place: Location) -> Location:
+            return place if place[:1] == (_FLOOR,) else (*_INSTRUMENT, *place)
+
+        places = {moved(place): at for place, at in read.places.items()}
+        findings = [replace(f, location=moved(f.location)) for f in read.findings]
+        return Document({"instrument": read.value, **floor}, places, findings, read.file)
+    findings, places = list(read.findings), dict(read.places)
+    for name in sorted(read.value.keys() - _SECTIONS_OF_A_FILE):
+        rule = "is no section of an instrument's file"
+        remedy = near_miss(name, _SECTIONS_OF_A_FILE, otherwise="leave it out of that file")
+        findings.append(Finding((*_INSTRUMENT, name), rule, remedy))
+        places[(*_INSTRUMENT, name)] = places[(name,)]
+    fields = read.value["instrument"]
+    if not isinstance(fields, dict):
+        rule = "must be a mapping of fields to values in an instrument's file"
+        raise rejected(_INSTRUMENT, rule, f"write them below 'instrument:' in {read.file}", fields)
+    return Document(read.value, places, findings, read.file)
 
 
 def library() -> dict[str, Path]:

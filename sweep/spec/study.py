@@ -66,6 +66,7 @@ from sweep.spec.parts import (
 )
 from sweep.spec.reading import (
     Document,
+    InstrumentFloor,
     findings_of,
     instrument_remedy,
     parsed,
@@ -125,6 +126,7 @@ class Study(Part):
     _written: dict[str, Any] = PrivateAttr(default_factory=dict)
     _base: Path = PrivateAttr(default=Path())
     _digests: dict[str, str] = PrivateAttr(default_factory=dict)
+    _instrument_floor: InstrumentFloor | None = PrivateAttr(default=None)
 
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, Any], *, base: Path | str = ".") -> Self:
@@ -204,6 +206,7 @@ class Study(Part):
         if findings or spec is None:
             raise SpecError(document.mistakes(findings))
         spec._written = spec._completed(written)
+        spec._instrument_floor = document.instrument_floor
         return spec
 
     @classmethod
@@ -293,7 +296,7 @@ class Study(Part):
         return in_units(rule, written, member.units)
 
     def unstated_errors(self) -> list[str]:
-        """Return sentences on errors whose size the spec does not state; a grid states all."""
+        """Return sentences on errors whose size the spec does not state itself: none of a grid."""
         return []
 
     def identity(self) -> dict[str, Any]:
@@ -566,10 +569,23 @@ class SceneSpec(Study):
         return any(self.shots_a_cycle(name) >= LEAST_BEAMS for name in self.scanners)
 
     def unstated_errors(self) -> list[str]:
-        """Return sentences on errors of navigation whose size the spec does not state."""
-        if not self.navigates:
-            return []
+        """Return sentences on errors whose size the spec does not state itself.
+
+        Those are the floor that its instrument brings, and errors that a navigation lacks.
+        """
         sentences = []
+        errors, rules = dict(self.error_floor), of.rules_of(scenes.ErrorFloor, "")
+        floor = self._instrument_floor
+        if floor and any(errors[name] for name in floor.fields):
+            fields = {n: written for n, written in floor.fields.items() if errors[n]}
+            brought = ", ".join(f"{name} {written}" for name, written in fields.items())
+            off = ", ".join(f"{name}: {_least(rules[name])}" for name in fields)
+            sentences.append(
+                f"the instrument {floor.instrument} brings a floor of errors: {brought}. State "
+                f"error_floor in the study to change it; 'error_floor: {{{off}}}' switches it off"
+            )
+        if not self.navigates:
+            return sentences
         if not any(value for _, value in self.error_floor):
             sentences.append(
                 "no floor of errors is stated (error_floor): velocity, altitude and their "
@@ -738,3 +754,8 @@ def written(fields: Mapping[str, str]) -> dict[str, Any]:
     if document.findings:
         raise SpecError(map(document.mistake, document.findings))
     return document.value
+
+
+def _least(rule: Rule) -> str:
+    """Least value of a field, as a user would write it."""
+    return rule.bounds.get("at_least", "0") if isinstance(rule, Numeric) else "0"

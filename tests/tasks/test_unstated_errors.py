@@ -1,5 +1,7 @@
 """Floors of errors that instruments bring, and notes on errors that a flight does not state."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import yaml
@@ -10,8 +12,10 @@ from sweep.analysis.consistency import consistency
 from sweep.cli import main
 from sweep.report.writing import write
 from sweep.spec import Spec, SpecError
+from sweep.spec.reading import library
 from sweep.spec.study import SceneSpec
 from sweep.tasks import driver
+from sweep.tasks.studies import study_of
 
 SLOPE = {"kind": "plane", "size": "6 km", "slope": "11 deg", "uphill": "30 deg", "reflectance": 0.1}
 CRATERED = SLOPE | {"spacing": "20 m", "craters": {"smallest": "60 m", "largest": "300 m"}}
@@ -21,6 +25,11 @@ CORNERS = {"kind": "corners", "angle": "22.5 deg", "rate": "4 Hz"}
 LINE = {"kind": "line", "half_angle": "10 deg", "line_rate": "1 Hz", "rate": "2 Hz"}
 STATED = {"vibration": "1 cm/s"}
 FLOOR_NOTE, RELIEF_NOTE = "o floor of errors is stated", "o relief is stated"
+LANDERS = (
+    "the instrument lander_ndl brings a floor of errors: range_noise 2 m, vibration 2 cm/s. State "
+    "error_floor in the study to change it; 'error_floor: {range_noise: 0 m, vibration: 0 m/s}' "
+    "switches it off"
+)
 
 
 def descent(instrument="chester_2017_table_5_1", ground=SLOPE, scanner=CORNERS, **sections):
@@ -47,8 +56,14 @@ def spec_of(**changes):
     ({"ground": HILLS, "error_floor": STATED, "navigation": {"relief": "10 m"}}, []),
     ({"ground": HILLS}, [FLOOR_NOTE, RELIEF_NOTE]),
     ({"ground": CRATERED, "error_floor": STATED}, [RELIEF_NOTE]),
-    ({"instrument": "lander_ndl"}, []),
-    ({"instrument": {"like": "automotive_fmcw", "laser": {"power": "1 W"}}}, []),
+    ({"instrument": "lander_ndl"}, [LANDERS]),
+    ({"instrument": "lander_ndl", "scanner": LINE}, [LANDERS]),
+    ({"instrument": {"like": "automotive_fmcw", "laser": {"power": "1 W"}}},
+     ["automotive_fmcw brings a floor of errors: vibration 2 cm/s"]),
+    ({"instrument": "lander_ndl", "error_floor": STATED}, ["errors: range_noise 2 m. State"]),
+    ({"instrument": "lander_ndl", "error_floor": STATED | {"range_noise": "1 m"}}, []),
+    ({"instrument": "lander_ndl", "error_floor": {"range_noise": "0 m", "vibration": "0 m/s"}},
+     [FLOOR_NOTE]),
 ])  # fmt: skip
 def test_errors_of_navigation_that_are_not_stated_are_named(changes, notes):
     sentences = spec_of(**changes).unstated_errors()
@@ -90,6 +105,71 @@ def test_an_instruments_floor_is_a_flights_unless_it_states_its_own():
         spec_of(instrument="lander_ndl", error_floor={"vibration": "1 kg"})
     with pytest.raises(SpecError, match="error_floor"):
         spec_of(instrument="lander_ndl", error_floor="none")
+
+
+def test_a_floor_that_is_stated_as_zero_is_off():
+    spec = spec_of(
+        instrument="lander_ndl", error_floor={"range_noise": "0 m", "vibration": "0 m/s"}
+    )
+    assert not any(value for _, value in spec.error_floor)
+    assert not any(study_of(spec, Path("nowhere.zarr")).error_floor)
+
+
+@pytest.mark.parametrize("command", ["plan", "run"])
+def test_plan_and_run_tell_of_the_floor_that_an_instrument_brings(command, tmp_path):
+    file = tmp_path / "lander.yaml"
+    file.write_text(yaml.safe_dump(descent("lander_ndl", scanner=LINE)))
+    options = ["--scheduler", "none", "--store", str(tmp_path / "s.zarr")]
+    ran = CliRunner().invoke(main, [command, str(file), *(options if command == "run" else [])])
+    assert ran.exit_code == 0
+    assert ran.stderr.count(f"note: {LANDERS}") == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "floor"),
+    [
+        ("error_floor: {vibration: 3 cm/s}\ninstrument:\n{fields}", {"vibration": 0.03}),
+        ("error_floor: {vibration: 3 cm/s}\n{root}", {"vibration": 0.03}),
+        ("title: Mine\nsource: own\ninstrument:\n{fields}", {}),
+        ("{root}", {}),
+    ],
+)
+def test_a_file_of_an_instrument_may_have_a_floor(text, floor, tmp_path):
+    fields = yaml.safe_load(library()["lander_ndl"].read_text())["instrument"]
+    root = yaml.safe_dump(fields)
+    indented = "".join(f"  {line}\n" for line in root.splitlines())
+    (tmp_path / "own.yaml").write_text(text.replace("{fields}", indented).replace("{root}", root))
+    spec = SceneSpec.from_mapping(descent({"file": "own.yaml"}), base=tmp_path)
+    assert {name: value for name, value in spec.error_floor if value} == floor
+    assert spec.instrument == spec_of(instrument="lander_ndl").instrument
+    brought = [s for s in spec.unstated_errors() if "brings" in s]
+    assert len(brought) == len(floor) and all("own.yaml brings" in s for s in brought)
+
+
+@pytest.mark.parametrize(
+    ("written", "told"),
+    [
+        ("error_floor: {vibraton: 2 cm/s}", "own.yaml:1: error_floor.vibraton: is no field"),
+        ("error_floor: 3", "own.yaml:1: error_floor: must be a mapping"),
+        ("error_floor: {vibration: 2}", "own.yaml:1: error_floor.vibration: "),
+        ("axes: {}", "own.yaml:1: instrument.axes: is no section of an instrument's file"),
+        ("eror_floor: {}", "did you mean 'error_floor'"),
+    ],
+)
+def test_mistakes_in_the_floor_of_a_file_are_told_where_they_stand(written, told, tmp_path):
+    fields = yaml.safe_load(library()["lander_ndl"].read_text())["instrument"]
+    text = f"{written}\n{yaml.safe_dump({'instrument': fields})}"
+    (tmp_path / "own.yaml").write_text(text)
+    with pytest.raises(SpecError) as refused:
+        SceneSpec.from_mapping(descent({"file": "own.yaml"}), base=tmp_path)
+    assert told in str(refused.value) and len(refused.value.mistakes) == 1
+
+
+@pytest.mark.parametrize("own", ["lander_ndl", ["lander_ndl"], 3])
+def test_a_file_whose_instrument_is_no_mapping_is_refused(own, tmp_path):
+    (tmp_path / "own.yaml").write_text(yaml.safe_dump({"instrument": own}))
+    with pytest.raises(SpecError, match="must be a mapping of fields to values in an instrument"):
+        SceneSpec.from_mapping(descent({"file": "own.yaml"}), base=tmp_path)
 
 
 def test_a_grid_of_an_instrument_with_a_floor_has_none():
