@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import hashlib
 import json
 import re
@@ -34,6 +35,8 @@ def existing(path: str | Path) -> Path:
         raise SceneError(path, "is no file of this machine", "fetch it, and name the file")
     if path.is_dir():
         raise SceneError(path, "is a folder", "name the file in it")
+    if _is_loop(path):
+        raise SceneError(path, "is reached by a link that leads back to itself", "mend the link")
     if not path.exists():
         remedy = "check the path, which is relative to the file that names it"
         if path.parent.is_dir():
@@ -43,6 +46,15 @@ def existing(path: str | Path) -> Path:
     if not path.is_file():
         raise SceneError(path, "is a pipe or a device", "name a plain file")
     return path
+
+
+def _is_loop(path: Path) -> bool:
+    """Return true if symbolic links on the way to a file lead in a circle."""
+    try:
+        path.stat()
+    except OSError as error:
+        return error.errno == errno.ELOOP
+    return False
 
 
 def file_digest(path: str | Path) -> str:
@@ -70,11 +82,19 @@ def require_memory(path: str | Path, needed: float, remedy: str) -> None:
 
 def read_companion(path: Path, name: str) -> bytes:
     """Content of a plain file that another one names; SceneError for what is none."""
-    companion = existing(path.parent / unquote(name))
+    companion = existing(_companion(path, name))
     size = companion.stat().st_size
     require_memory(companion, 4 * size, "reduce it")
     with companion.open("rb") as file:
         return file.read(size)
+
+
+def _companion(path: Path, name: str) -> Path:
+    """Path of a file that another one names; SceneError for an address of the network."""
+    if "://" in name:
+        rule = f"needs {name}, and nothing is fetched over the network"
+        raise SceneError(path, rule, "fetch that, or export it in one file (GLB)")
+    return path.parent / unquote(name)
 
 
 def _companions(path: Path) -> list[Path]:
@@ -89,7 +109,7 @@ def _companions(path: Path) -> list[Path]:
     buffers = buffers if isinstance(buffers, list) else []
     names = [b.get("uri", "") for b in buffers if isinstance(b, dict)]
     return [
-        path.parent / unquote(name)
+        _companion(path, name)
         for name in names
         if isinstance(name, str) and name and not name.startswith("data:")
     ]

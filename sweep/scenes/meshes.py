@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import re
 import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -274,6 +275,8 @@ def _read_triangle_file(path: Path) -> tuple[list[Facets], str | None]:
 
     if path.suffix.lower() in _Y_UP_FORMATS:
         _check_gltf(path)
+    else:
+        _check_stl(path)
     with path.open("rb") as file:
         scene: Any = trimesh.load_scene(
             file,
@@ -319,6 +322,30 @@ def _companions_of(path: Path) -> Any:
     return PlainFiles()
 
 
+_STL_HEADER = struct.Struct("<80sI")
+_STL_TRIANGLE_BYTES = 50
+_TEXT_BYTES = 1000
+"""Bytes at the beginning of an STL that tell text from numbers."""
+
+
+def _check_stl(path: Path) -> None:
+    """Refuse a binary STL whose size is not that of its triangles; text has no zero bytes."""
+    with path.open("rb") as file:
+        start = file.read(_TEXT_BYTES)
+    if b"\0" not in start and re.search(rb"^\W*solid|\bfacet\b", start, re.I):
+        return
+    head = start[: _STL_HEADER.size]
+    if len(head) < _STL_HEADER.size:
+        raise ValueError(f"it has {len(head)} bytes, and a binary STL has 84 or more")
+    count, size = _STL_HEADER.unpack(head)[1], path.stat().st_size
+    needed = _STL_HEADER.size + _STL_TRIANGLE_BYTES * count
+    if size != needed:
+        raise ValueError(
+            f"its header counts {count:,} triangles, which take {needed:,} bytes, and it has "
+            f"{size:,}{': it is cut off' if size < needed else ''}"
+        )
+
+
 _GLB_HEADER = struct.Struct("<4sIIII")
 _ACCESSOR_BYTES = 64
 """Most bytes of an element of an accessor: a matrix of 16 floats."""
@@ -339,8 +366,11 @@ def _check_gltf(path: Path) -> None:
     if accessors is None:
         raise ValueError("it is no JSON object")
     buffers = sum(int(buffer["byteLength"]) for buffer in document.get("buffers", []))
-    elements = sum(int(accessor["count"]) for accessor in accessors)
-    if elements > max(buffers, 1) or elements < 0:
+    counts = [int(accessor["count"]) for accessor in accessors]
+    if min(counts, default=0) < 0:
+        raise ValueError(f"it declares an array of {min(counts):,} elements")
+    elements = sum(counts)
+    if elements > max(buffers, 1):
         raise ValueError(f"its arrays have {elements:,} elements in {buffers:,} bytes")
     remedy = "reduce the mesh, or cut a part out of it"
     require_memory(path, elements * _ACCESSOR_BYTES + buffers, remedy)

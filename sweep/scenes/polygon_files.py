@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -56,7 +57,7 @@ def _read_off(path: Path) -> Polygons:
     try:
         n_vertices, n_faces = int(counts[0]), int(counts[1])
         if min(n_vertices, n_faces) < 0:
-            raise ValueError("a number below 0")
+            raise ValueError(f"it declares {n_vertices:,} vertices and {n_faces:,} faces")
         # Normals and colours follow the position; texture coordinates too, in most files.
         vertices = [
             [float(word) for word in line[:3]] for _, line in _next(lines, n_vertices, "vertices")
@@ -130,17 +131,24 @@ def _read_ply(path: Path) -> Polygons:
 
 
 _HEADER_BYTES_MAX = 1 << 20
+_WHOLE = re.compile(rb"[-+]?\d{1,4000}")
 
 
 def _require_rows(path: Path) -> None:
-    """Refuse a header that declares more rows than the file has bytes."""
+    """Refuse a header that declares fewer rows than none, or more than the file has bytes."""
     size = path.stat().st_size
     with path.open("rb") as file:
         header, found, _ = file.read(_HEADER_BYTES_MAX).partition(b"end_header")
     if not found:
         raise ValueError("its header does not end")
     words = [line.split() for line in header.splitlines() if line.startswith(b"element")]
-    rows = sum(int(word[2]) for word in words if len(word) == 3 and word[2].isdigit())
+    counts = [(w[1], int(w[2])) for w in words if len(w) == 3 and _WHOLE.fullmatch(w[2])]
+    for name, count in counts:
+        if count < 0:
+            raise ValueError(
+                f"it declares {count:,} of the element '{name.decode(errors='replace')}'"
+            )
+    rows = sum(count for _, count in counts)
     if rows > size:
         raise ValueError(f"it declares {rows:,} vertices and faces in {size:,} bytes")
 

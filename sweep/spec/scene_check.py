@@ -132,10 +132,13 @@ def _file_findings(
     things += [] if platform is None else [(("platform",), platform)]
     for location, thing in things:
         for key, rule, file in named_files(thing):
+            path = Files(base).path(file)
             try:
-                rule.digest(Files(base).path(file))
+                rule.digest(path)
             except SceneError as error:
-                broken = f"names a file that {error.rule}"
+                is_companion = error.file != str(path)
+                needs = f"needs {error.file}, which " if is_companion else ""
+                broken = f"names a file that {needs}{error.rule}"
                 yield Finding((*location, *key), broken, error.remedy, file)
 
 

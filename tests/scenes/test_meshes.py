@@ -104,6 +104,59 @@ def test_files_that_are_no_mesh_are_refused(tmp_path):
         read_mesh(tmp_path / "gone.stl")
 
 
+@pytest.mark.parametrize(
+    ("size", "told"),
+    [
+        (60, "it has 60 bytes, and a binary STL has 84 or more"),
+        (84, "counts 12 triangles, which take 684 bytes, and it has 84: it is cut off"),
+        (683, "and it has 683: it is cut off"),
+        (700, r"which take 684 bytes, and it has 700\)"),
+    ],
+)
+def test_a_binary_stl_of_another_size_than_its_triangles_is_refused(file, size, told):
+    path = file(BOX, "box.stl")
+    whole = path.read_bytes()
+    assert len(whole) == 684
+    path.write_bytes(whole[:size] + bytes(max(0, size - 684)))
+    with pytest.raises(SceneError, match=told):
+        read_mesh(path)
+
+
+@pytest.mark.parametrize("start", ["solid box\n", "\ufeffsolid\n", "SOLID\n"])
+def test_an_stl_of_text_is_read_however_it_begins(tmp_path, start):
+    text = trimesh.exchange.stl.export_stl_ascii(BOX)
+    path = tmp_path / "box.stl"
+    path.write_text(start + text.partition("\n")[2])
+    assert len(read_mesh(path).faces) == 12
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "told"),
+    [
+        ("a.ply", "ply\nformat ascii 1.0\nelement vertex -1\nend_header\n",
+         "declares -1 of the element 'vertex'"),
+        ("b.ply", "ply\nformat ascii 1.0\nelement vertex 3\nelement face -20\nend_header\n",
+         "declares -20 of the element 'face'"),
+        ("a.off", "OFF\n-3 1 0\n0 0 0\n", "declares -3 vertices and 1 faces"),
+        ("a.gltf", '{"accessors": [{"count": -3}, {"count": 9}]}', "an array of -3 elements"),
+    ],
+)  # fmt: skip
+def test_counts_below_zero_are_told(tmp_path, name, content, told):
+    (tmp_path / name).write_text(content)
+    with pytest.raises(SceneError, match=told):
+        read_mesh(tmp_path / name)
+
+
+def test_a_link_that_leads_to_itself_is_told(tmp_path):
+    (tmp_path / "self.stl").symlink_to("self.stl")
+    (tmp_path / "there.stl").symlink_to("back.stl")
+    (tmp_path / "back.stl").symlink_to("there.stl")
+    (tmp_path / "folder").symlink_to("folder")
+    for name in ("self.stl", "there.stl", "folder/box.stl"):
+        with pytest.raises(SceneError, match="is reached by a link that leads back to itself"):
+            read_mesh(tmp_path / name)
+
+
 CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
 CUBE = np.array(
     [

@@ -1,6 +1,7 @@
 """Users' mistakes in scene studies: each told once, with its path, its rule and a remedy."""
 
 import copy
+import json
 import math
 import pickle
 
@@ -281,6 +282,28 @@ def test_figures_hold_what_was_written_in_si():
     assert (cloud.x, cloud.time, cloud.y) == ((1000.0, 2000.0), (0.0, 0.09), None)
     assert cloud.view == pytest.approx({"azimuth": -math.pi / 2, "elevation": math.pi / 6})
     assert spectra.shot == 12
+
+
+@pytest.mark.parametrize(
+    ("uri", "told"),
+    [
+        ("gone.bin", "names a file that needs {folder}/gone.bin, which does not exist"),
+        ("folder", "names a file that needs {folder}/folder, which is a folder"),
+        ("loop", "needs {folder}/loop, which is reached by a link that leads back to itself"),
+        ("/dev/zero", "names a file that needs /dev/zero, which is a pipe or a device"),
+        ("http://a.org/x.bin", "needs http://a.org/x.bin, and nothing is fetched over the network"),
+    ],
+)
+def test_what_is_wrong_with_a_companion_of_a_mesh_is_told_of_it(uri, told, tmp_path):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "loop").symlink_to("loop")
+    buffers = [{"byteLength": 36, "uri": uri}]
+    (tmp_path / "a.gltf").write_text(json.dumps({"asset": {"version": "2.0"}, "buffers": buffers}))
+    thing = {"kind": "mesh", "file": "a.gltf", "reflectance": 0.1}
+    with pytest.raises(SpecError) as refused:
+        SceneSpec.from_mapping(written({"scene.objects.thing": thing}), base=tmp_path)
+    assert told.format(folder=tmp_path) in str(refused.value)
+    assert "scene.objects.thing.file" in str(refused.value)
 
 
 MANY = """\
