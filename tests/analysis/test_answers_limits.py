@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+import xarray as xr
 from drawn_studies import INSTRUMENT, stored, study
 from hypothesis import given
 from hypothesis import strategies as st
@@ -116,6 +117,24 @@ def test_the_answer_is_lazy_and_the_same_in_any_chunks(chunks):
     lazy = whole.chunk(chunks).sweep.maximum_range()
     assert all(array.chunks is not None for array in lazy.data_vars.values())
     assert lazy.compute().identical(whole.sweep.maximum_range())
+
+
+@pytest.mark.parametrize("pd", ["90 %", "0.9", "90%", np.float64(0.9), np.float32(0.9)])
+def test_a_level_of_pd_is_a_share_or_in_percent(pd):
+    angles = np.array([20.0, 40.0])
+    z = LEVEL + (640.0 - RANGES[:, None]) / 1000 * [1.0, 2.0]
+    dataset = made(z, range=RANGES, grazing_angle=angles)
+    for ask in ("maximum_range", "contour"):
+        expected, found = (getattr(dataset.sweep, ask)(each) for each in (0.9, pd))
+        xr.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("pd", ["0.9 W", "high", [0.5, 0.9], None, True, "90", 0, 1, "100 %", 1.5])
+@pytest.mark.parametrize("ask", ["maximum_range", "contour"])
+def test_what_is_no_level_of_pd_is_refused_in_words(ask, pd):
+    dataset = made(np.zeros((5, 2)), range=RANGES, grazing_angle=np.array([20.0, 40.0]))
+    with pytest.raises(ValueError, match="a level of pd"):
+        getattr(dataset.sweep, ask)(pd)
 
 
 def test_what_cannot_be_walked_is_refused():

@@ -12,7 +12,7 @@ import xarray as xr
 from contourpy import contour_generator
 from scipy.special import ndtri
 
-from sweep.analysis.answers.physical import coordinate, require_variables
+from sweep.analysis.answers.physical import coordinate, probability_level, require_variables
 from sweep.analysis.answers.probability import confidence, half_width, named
 
 FOUND, NEVER, ALWAYS, NOT_COMPUTED = range(4)
@@ -52,7 +52,7 @@ def deviate(pd: xr.DataArray, miss: xr.DataArray | None = None) -> xr.DataArray:
 def limit(
     dataset: xr.Dataset,
     along: str,
-    pd: float = 0.9,
+    pd: float | str = 0.9,
     *,
     segment: str = "shot",
     from_highest: bool = False,
@@ -66,7 +66,7 @@ def limit(
     along
         Coordinate, each value of it once; those of a zipped axis after a selection.
     pd
-        The level, 0 < pd < 1.
+        The level, 0 < pd < 1, as 0.9 or "90 %".
     segment
         ``shot``, ``up``, ``doppler`` or ``down``.
     from_highest
@@ -91,31 +91,32 @@ def limit(
     ValueError
         No such coordinate or level, one value only, or one that comes more than once.
     """
-    if not 0 < pd < 1:
-        raise ValueError(f"a level of pd lies between 0 and 1, and {pd!r} does not")
+    level = probability_level(pd)
     x = coordinate(dataset, along)
     name = named("pd", segment)
     require_variables(dataset, name)
     ordered, dim = _ordered(dataset, x, from_highest)
     lost = ordered.get(named("miss", segment))
-    found = _answers(ordered[name], lost, ordered[x.name], dim, pd)
+    found = _answers(ordered[name], lost, ordered[x.name], dim, level)
     reach = half_width(ordered, segment)
     if reach is not None:
         for end, sign in (("low", -1), ("high", 1)):
             moved = (ordered[name] + sign * reach).clip(0, 1)
-            ends = _answers(moved, None, ordered[x.name], dim, pd)
+            ends = _answers(moved, None, ordered[x.name], dim, level)
             found |= {f"{key}_{end}": a for key, a in ends.items() if not key.endswith("reason")}
     result = xr.Dataset(found).assign_attrs(dataset.attrs)
-    return _described(result, x, segment, pd, confidence(dataset, reach))
+    return _described(result, x, segment, level, confidence(dataset, reach))
 
 
-def maximum_range(dataset: xr.Dataset, pd: float = 0.9, *, segment: str = "shot") -> xr.Dataset:
+def maximum_range(
+    dataset: xr.Dataset, pd: float | str = 0.9, *, segment: str = "shot"
+) -> xr.Dataset:
     """Range up to which pd keeps to a level, unbroken and at all: :func:`limit`."""
     return limit(dataset, "target.range", pd, segment=segment)
 
 
 def minimum_grazing_angle(
-    dataset: xr.Dataset, pd: float = 0.9, *, segment: str = "shot"
+    dataset: xr.Dataset, pd: float | str = 0.9, *, segment: str = "shot"
 ) -> xr.Dataset:
     """Least grazing angle down to which pd keeps to a level: :func:`limit`."""
     return limit(dataset, "target.grazing_angle", pd, segment=segment, from_highest=True)
@@ -209,7 +210,7 @@ def _described(
 
 def contour(
     dataset: xr.Dataset,
-    pd: float = 0.9,
+    pd: float | str = 0.9,
     *,
     x: str = "range",
     y: str = "grazing_angle",
@@ -222,7 +223,7 @@ def contour(
     dataset
         As `sweep.open` gives it; of any dimension other than the two one value selected.
     pd
-        The level, 0 < pd < 1.
+        The level, 0 < pd < 1, as 0.9 or "90 %".
     x, y
         Coordinates, each with a dimension of its own.
     segment
@@ -240,8 +241,7 @@ def contour(
     ValueError
         A coordinate that is not there, or further dimensions.
     """
-    if not 0 < pd < 1:
-        raise ValueError(f"a level of pd lies between 0 and 1, and {pd!r} does not")
+    level = probability_level(pd)
     across, up = coordinate(dataset, x), coordinate(dataset, y)
     name = named("pd", segment)
     require_variables(dataset, name)
@@ -255,7 +255,7 @@ def contour(
     z = deviate(array, dataset.get(named("miss", segment))).transpose(up.name, across.name)
     found = contour_generator(
         across.values, up.values, np.ma.masked_invalid(z.values)
-    ).lines(float(ndtri(pd)))  # fmt: skip
+    ).lines(float(ndtri(level)))  # fmt: skip
     lines = [np.asarray(line) for line in found]
     vertices = np.concatenate(lines) if lines else np.empty((0, 2))
     numbers = np.repeat(np.arange(len(lines)), [len(line) for line in lines])

@@ -16,7 +16,7 @@ from sweep.spec import SceneSpec, Spec, from_stored
 from sweep.spec.axes import in_units
 from sweep.spec.rules import Numeric
 from sweep.spec.sections import parameter_rules
-from sweep.units import QuantityError, read_quantity
+from sweep.units import QuantityError, read_number, read_quantity
 
 CLOSE = 1e-9
 """Relative difference up to which a value is one on the grid."""
@@ -127,6 +127,19 @@ def quantity(written: object, *, si_unit: str, name: str) -> float:
     except QuantityError as error:
         raise ValueError(f"{name} {error}") from None
     return unit.to_si(value)
+
+
+def probability_level(written: object) -> float:
+    """Level of pd as a number, ``0.9`` or ``"90 %"``; ValueError unless it is between 0 and 1."""
+    is_number = isinstance(written, np.number) and np.ndim(written) == 0
+    try:
+        value, unit = read_number(written.item() if is_number else written)  # type: ignore[attr-defined]
+        level = unit.to_si(value)
+    except QuantityError as error:
+        raise ValueError(f"a level of pd, {written!r:.60}, {error}") from None
+    if not 0 < level < 1:
+        raise ValueError(f"a level of pd lies between 0 and 1, and {written!r} does not")
+    return level
 
 
 def coordinate(dataset: xr.Dataset, name: str) -> xr.DataArray:
