@@ -34,7 +34,8 @@ NONE = "none"
 """Text of a share or number of nothing, which has no value."""
 
 _NUMBER = r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d{1,4})?"
-_POWER = r"(?P<base>\d{1,6})(?:\^|\*\*)(?P<exponent>\d{1,3})"
+_POWER = r"(?P<base>\d{1,6})(?:\^|\*\*)(?P<exponent>[+-]?\d+(?:\.\d*)?)"
+_LARGEST_EXPONENT = 999
 _UNIT = r"(?:(?<=\s)1\s*/|[^\d\s.+\-]).*"
 _VALUE = re.compile(rf"\s*(?:{_POWER}|(?P<number>{_NUMBER}))\s*(?P<unit>{_UNIT})?", re.ASCII)
 _EXPONENT = r"(?:\^|\*\*)?(?:(?P<exponent>[+-]?\d(?:\.5)?)|\((?P<ratio>[+-]?\d/[1-9])\))"
@@ -234,8 +235,19 @@ def _split(written: object, rule: str) -> tuple[Fraction, str]:
         raise QuantityError(rule)
     unit = (match["unit"] or "").strip()
     if match["base"]:
-        return Fraction(int(match["base"]) ** int(match["exponent"])), unit
+        return _written_power(int(match["base"]), match["exponent"]), unit
     return Fraction(match["number"]), unit
+
+
+def _written_power(base: int, exponent: str) -> Fraction:
+    """Exact power, such as ``2^17`` or ``10^-3``; its exponent is a whole number of few digits."""
+    if "." in exponent:
+        raise QuantityError("has an exponent that is no whole number")
+    if abs(int(exponent)) > _LARGEST_EXPONENT:
+        raise QuantityError(f"has an exponent beyond {_LARGEST_EXPONENT} to either side")
+    if base == 0 and int(exponent) < 0:
+        raise QuantityError("divides by zero")
+    return Fraction(base) ** int(exponent)
 
 
 def _ungrouped(text: str, number: str) -> tuple[str, str]:

@@ -168,6 +168,30 @@ def test_pure_numbers_are_read_exactly(written, value):
     assert unit.factor * number == (Fraction(1, 10) if value == 0.1 else value)
 
 
+@pytest.mark.parametrize(
+    ("written", "value"), [("2^-1", Fraction(1, 2)), ("10^-3", Fraction(1, 1000)), ("10^+2", 100)]
+)
+def test_powers_of_negative_exponents_are_read_exactly(written, value):
+    assert read_number(written)[0] == value
+    assert si(f"{written} m", "m") == float(value)
+
+
+@pytest.mark.parametrize(
+    ("written", "words"),
+    [
+        ("2^100000000", "has an exponent beyond 999"),
+        ("2**-100000000", "has an exponent beyond 999"),
+        ("2^1.5", "has an exponent that is no whole number"),
+        ("0^-1", "divides by zero"),
+    ],
+)
+def test_powers_that_are_none_say_why(written, words):
+    with pytest.raises(QuantityError, match=words):
+        read_number(written)
+    with pytest.raises(QuantityError, match=words):
+        si(f"{written} m", "m")
+
+
 @given(st.text(max_size=120))
 def test_any_text_is_a_quantity_or_a_quantity_error(text):
     for si_unit in ("m", "W/Hz^0.5", "dB", "K", "1/Hz", "m^(-2/3)"):

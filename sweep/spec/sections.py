@@ -94,8 +94,8 @@ class Telescope(Part):
 
     aperture: float = of.length("Diameter of the aperture", "25 mm", "1 um", "1 km")
     optical_efficiency: float = of.number(
-        "Fraction of the collected light that reaches the detector", "0.8", "0", "1", default=1.0,
-        is_power_ratio=True,
+        "Fraction of the collected light that reaches the detector", "0.8", "1e-12", "1",
+        default=1.0, is_power_ratio=True,
     )  # fmt: skip
     coupling: str = of.choice(
         "Light that mixes with the local oscillator: that of a single mode, or all in "

@@ -35,6 +35,11 @@ FIELDS = [
     ("instrument.telescope.aperture", "25 mn", "did you mean 'mm'?"),
     ("instrument.telescope.optical_efficiency", 1.01, "must be at most 1"),
     ("instrument.telescope.optical_efficiency", "3 dB", "must be at most 1 (you wrote '3 dB')"),
+    ("instrument.telescope.optical_efficiency", "-1e9 dB", "must be at least 1e-12"),
+    ("instrument.telescope.optical_efficiency", 0, "must be at least 1e-12"),
+    ("instrument.receiver.mixing_efficiency", "-1e9 dB", "must be at least 1e-9"),
+    ("instrument.processing.fft_size", "2^-1", "must be a whole number (you wrote '2^-1')"),
+    ("instrument.processing.fft_size", "2^100000000", "has an exponent beyond 999"),
     ("instrument.telescope.optical_efficiency", "0.5 mW",
      "takes no unit: fraction of the collected light that reaches the detector (you wrote "
      "'0.5 mW'); write 0.5"),

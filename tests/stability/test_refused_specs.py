@@ -17,9 +17,10 @@ MEANINGLESS = {
         "instrument.processing.sample_rate", "target.range", "target.grazing_angle",
         "atmosphere.depth", "footprint.beamlets",
     )),
+    "1e-13": ("at least 1e-12", ("instrument.telescope.optical_efficiency",)),
     "-1": ("at least 0", (
         "instrument.laser.line_width", "instrument.laser.relative_intensity_noise",
-        "instrument.telescope.optical_efficiency", "instrument.receiver.noise_equivalent_power",
+        "instrument.receiver.noise_equivalent_power",
         "instrument.receiver.amplifier_noise_current", "instrument.receiver.noise_figure",
         "instrument.processing.acquisition_delay", "instrument.processing.bits",
         "instrument.processing.full_scale", "target.reflectance", "target.solar_irradiance",
