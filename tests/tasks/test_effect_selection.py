@@ -185,6 +185,41 @@ def test_a_plan_is_made_once_for_a_tile(monkeypatch):
     assert sorted(planned) == list(range(selection.tiles.n_blocks))
 
 
+def test_some_points_of_a_block_have_the_effects_that_they_have_among_all(monkeypatch):
+    """And only their tiles are planned: all those of a block of 10^6 points took a minute."""
+    spec = small(axes=WIDE, storage={})
+    whole, selection, planned = (
+        EffectSelection(spec, Grid(spec)),
+        EffectSelection(spec, Grid(spec)),
+        [],
+    )
+    plans = selection.plans
+    monkeypatch.setattr(selection, "plans", lambda tiles: planned.extend(tiles) or plans(tiles))
+    points = np.array([7, 0, 2000, 7, 4199])
+    found, among = selection.of_block(0, points), whole.of_block(0).some(points)
+    np.testing.assert_array_equal(found.flags, among.flags)
+    np.testing.assert_array_equal(found.error, among.error)
+    assert 0 < len(planned) <= 4 < selection.tiles.n_blocks
+
+
+def test_a_plan_plans_the_effects_of_few_points_of_a_large_block(monkeypatch):
+    axes = {
+        "target.range": {"linear": ["1 km", "3 km"], "number": 1000},
+        "target.grazing_angle": {"linear": ["10 deg", "80 deg"], "number": 1000},
+    }
+    study, looked = study_of(small(axes=axes, storage={"block_points": 10**6}), Path("no.zarr")), []
+    of_block = study.selection.of_block
+
+    def noted(block, points=None):
+        looked.append(study.grid.block_size(block) if points is None else len(points))
+        return of_block(block, points)
+
+    monkeypatch.setattr(study.selection, "of_block", noted)
+    monkeypatch.setattr(planned, "MEASURING", 0.01)
+    assert study.n_blocks == 1 and planned.measured(study) > 0
+    assert max(looked) < 1000
+
+
 def test_a_smooth_target_has_no_speckle_whatever_targets_are_beside_it():
     """Its beamlets add as powers; rough ones' at random."""
     axes = {"target.roughness": ["0 um", "10 um"], "target.range": ["1 km", "6 km"]}

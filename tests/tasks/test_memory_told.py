@@ -154,6 +154,18 @@ def test_a_grid_of_too_many_blocks_is_refused():
         study_of(small(axes=axes, storage={"block_points": 1}), Path("nowhere.zarr"))
 
 
+def test_a_grid_of_too_many_blocks_is_refused_before_any_point_is_looked_at(monkeypatch):
+    monkeypatch.setattr("sweep.tasks.plan.measured", lambda study: pytest.fail("it was measured"))
+    many = {"linear": ["1 W", "3 W"], "number": 10**4}
+    axes = {
+        "instrument.laser.power": many,
+        "target.range": {"linear": ["1 km", "3 km"], "number": 10**4},
+        "target.grazing_angle": {"linear": ["1 deg", "80 deg"], "number": 10**4},
+    }
+    with pytest.raises(SpecError, match=r"axes: makes 1e\+12 points in 1e\+08 blocks"):
+        plan(small(axes=axes, storage={"block_points": 10**4}))
+
+
 def test_the_memory_of_a_plan_counts_a_point():
     spec = small()
     assert plan(spec).worker_memory > memory.point_bytes(spec) > 1e6
