@@ -1,8 +1,8 @@
-"""Plain files, opened without waiting for anybody: no pipe, no device, nothing beyond a size.
+"""Open regular files of untrusted directories without blocking, and within a size limit.
 
-A file that a study or a store names may be anything: a named pipe, whose opening waits for a
-writer, a device that never ends, a link that leads elsewhere. The functions here open such a file
-without waiting, and refuse it unless it is a plain one.
+A path that a study or a store names may be a named pipe, whose opening waits for a writer, a device
+that never ends, or a link out of the store. These functions open without waiting, and refuse
+anything that is not a regular file.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ PIECE_BYTES = 1 << 20
 
 
 class UnfitFileError(OSError):
-    """A place that holds something else than a plain file of a size that can be right."""
+    """A path is not a regular file of a permitted size, or leads out of its directory."""
 
     def __str__(self) -> str:
         return f"{self.filename} {self.strerror}"
 
 
 def kind_of(mode: int) -> str:
-    """Name the kind of a file by its mode.
+    """Return the name of a file type, from the mode of its stat result.
 
     >>> kind_of(stat.S_IFIFO)
     'a named pipe'
@@ -40,18 +40,23 @@ def kind_of(mode: int) -> str:
 
 
 def open_plain(path: str | Path, *, follow: bool = True) -> int:
-    """Open a plain file for reading and return its descriptor, at once whatever is there.
+    """Open a regular file for reading without blocking, and return its descriptor.
 
-    UnfitFileError where it is a pipe, a device, a socket, or a link that is not to be followed;
-    other errors as of `os.open`.
+    Raises
+    ------
+    UnfitFileError
+        The path is a pipe, a device, a socket, or (unless ``follow``) a symbolic link.
+    OSError
+        As of `os.open`.
     """
     return _open(str(path), str(path), 0 if follow else os.O_NOFOLLOW, None)
 
 
 def open_below(root: str | Path, name: str) -> int:
-    """Open a plain file below a folder, as :func:`open_plain`, through no link below the folder.
+    """Open the regular file ``name`` below the directory ``root``; return its descriptor.
 
-    The folder itself may be reached through links: the user has named it.
+    ``name`` has components separated by '/'. No component below ``root`` may be a symbolic link,
+    '.' or '..'. ``root`` itself may be reached through links, because the user has named it.
     """
     *folders, last = name.split("/")
     whole = f"{root}/{name}"
@@ -73,7 +78,7 @@ def open_below(root: str | Path, name: str) -> int:
 
 
 def _open(name: str, whole: str, flags: int, folder: int | None) -> int:
-    """Open a plain file, or a directory where the flags ask for one."""
+    """Open a regular file, or a directory for O_DIRECTORY; errors name it ``whole``."""
     opened = -1
     try:
         opened = os.open(name, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | flags, dir_fd=folder)
@@ -99,12 +104,12 @@ def _open(name: str, whole: str, flags: int, folder: int | None) -> int:
 
 
 def read_plain(path: str | Path, bytes_max: int) -> bytes:
-    """Read a plain file of no more than so many bytes; links to it are followed."""
+    """Read a regular file of at most ``bytes_max`` bytes; symbolic links are followed."""
     return _read(open_plain(path), bytes_max, str(path))
 
 
 def read_below(root: str | Path, name: str, bytes_max: int, part: slice = slice(None)) -> bytes:
-    """Read a plain file below a folder, or a part of it, as :func:`open_below` opens it."""
+    """Read a regular file, or the bytes ``part`` of it, as :func:`open_below` opens it."""
     return _read(open_below(root, name), bytes_max, f"{root}/{name}", part)
 
 
@@ -124,7 +129,7 @@ def _read(opened: int, bytes_max: int, whole: str, part: slice = slice(None)) ->
 def pieces_below(
     root: str | Path, name: str, bytes_max: int
 ) -> Iterator[tuple[int, Iterator[bytes]]]:
-    """Size of a plain file below a folder, and its bytes, few of them in memory at a time."""
+    """Context manager: size of a regular file below a directory, and an iterator over its bytes."""
     opened = open_below(root, name)
     with open(opened, "rb", buffering=0) as file:
         size = size_within(opened, bytes_max, f"{root}/{name}")
@@ -132,14 +137,14 @@ def pieces_below(
 
 
 def size_within(opened: int, bytes_max: int, whole: str) -> int:
-    """Size of an open file; UnfitFileError where it is larger than it can be."""
+    """Return the size of an open file; raise UnfitFileError if it exceeds ``bytes_max``."""
     size = os.fstat(opened).st_size
     refuse_larger(size, bytes_max, whole)
     return size
 
 
 def refuse_larger(size: int, bytes_max: int, whole: str) -> None:
-    """Refuse a file, or an object, that is larger than it can be."""
+    """Raise UnfitFileError if the size of a file or object exceeds ``bytes_max``."""
     if size > bytes_max:
         what = f"has {size:,} bytes, and can have no more than {bytes_max:,}"
         raise UnfitFileError(errno.EFBIG, what, whole)

@@ -1,4 +1,4 @@
-"""Detection in one segment's spectrum: threshold, groups, what may raise a false alarm."""
+"""Detection in one segment's spectrum: threshold, echoes, and bins exempt from false alarms."""
 
 import math
 from typing import NamedTuple
@@ -24,13 +24,25 @@ def threshold(*, tnr: np.ndarray, bin_deviation: np.ndarray) -> np.ndarray:
 
 
 def quiet_below(*, chance: np.ndarray, level: np.ndarray, bins: int) -> np.ndarray:
-    """Signal [sigma] below which bins may count as noise alone, (n,).
+    """Return the signal amplitude [sigma] below which bins may count as noise alone, (n,).
 
-    With x = a^2/2 and y = b^2/2 a bin of a sigma leaks with no more than
+    Parameters
+    ----------
+    chance
+        (n,): probability of leakage that all these bins together may add.
+    level
+        (n,): threshold b [sigma].
+    bins
+        Number of bins.
+
+    Notes
+    -----
+    With x = a^2/2 and y = b^2/2 a bin of amplitude a [sigma] adds at most
 
         x y e^-y / (1 - e^-y) e^(a^2 b^2 / 8)
 
-    (:mod:`sweep.model.leakage`), here with a b <= 1; all of them together with ``chance`` (n,).
+    to the leakage (:mod:`sweep.model.leakage`). The last factor is taken at a b = 1, the largest
+    product that is returned.
     """
     y = 0.5 * np.square(level)
     with np.errstate(divide="ignore", over="ignore", under="ignore", invalid="ignore"):
@@ -39,24 +51,26 @@ def quiet_below(*, chance: np.ndarray, level: np.ndarray, bins: int) -> np.ndarr
 
 
 class DetectionRule(NamedTuple):
-    """Rule by which the bins of an echo detect it, one for all points."""
+    """Rule by which the bins of an echo detect it; common to all points."""
 
     ends: int
-    """N where the noise of bins 0 and N/2 is real, else 0."""
+    """FFT size N if the noise in bins 0 and N/2 is real, else 0."""
     beside: int
-    """Half of a main lobe [bins] where any bin of an echo detects; 0 where its largest alone."""
+    """Half-width of the main lobe [bins] if any bin of an echo may detect it; 0 if only its
+    largest."""
     pairs: np.ndarray
-    """Rule for pairs of bins, :func:`sweep.model.alarms.pair_nodes`."""
+    """(3, k): quadrature for the joint crossing of two bins,
+    :func:`sweep.model.alarms.pair_nodes`."""
     fades: float
-    """Correlation of neighbours' noise where echoes are developed speckle, else -1."""
+    """Correlation of neighbouring bins' noise if echoes are in developed speckle, else -1."""
     half: int
-    """N/2 of a real record whose echoes fade, else 0."""
+    """Nyquist bin N/2 of a real record whose echoes are in developed speckle, else 0."""
     noise_quadratures: np.ndarray
-    """(bins,): pseudo-variance of the noise over its power, by bins from DC or Nyquist."""
+    """(bins,): pseudo-variance ratio of the noise, by bins from the nearer of DC and Nyquist."""
     modes: ModeTable
-    """Modes of echoes that any bin detects."""
+    """Speckle modes of echoes that any bin may detect."""
     correlation: float = 0.0
-    """Correlation of the noise of neighbours."""
+    """Correlation of the noise of neighbouring bins."""
 
 
 class PedestalShape(NamedTuple):
@@ -83,35 +97,36 @@ NO_PEDESTAL = PedestalShape(0.0, 0.0, 0.0)
 
 
 class BinLevels(NamedTuple):
-    """Threshold and noise of the bins of an echo [V, summed over the record]."""
+    """Threshold on |X|, and noise per quadrature, in an echo's bins [V, summed over the record]."""
 
     line: float
-    """Noise per quadrature in bins that lines fill, with what of their pedestal |X| sees."""
+    """Noise in bins that the lines fill, with that part of the phase-noise pedestal that changes
+    |X|."""
     threshold: float
     quiet: float
-    """Noise per quadrature without the pedestal."""
+    """Noise without the pedestal."""
     beside: float
-    """Noise per quadrature in bins beside the lines, with all of the pedestal."""
+    """Noise in bins beside the lines, with the whole pedestal."""
     pedestal: PedestalShape = NO_PEDESTAL
     """Shape of the pedestal about the lines."""
 
 
 class BinSpeckle(NamedTuple):
-    """Speckle in the bins of a point's segment."""
+    """Speckle parameters of the bins of one point's segment."""
 
     spread: float
     """Deviation of the footprint's lines [bins of fs/N]."""
     quadratures: np.ndarray
-    """(bins,): pseudo-variance of the signal over its power, by bins from DC or Nyquist; nothing
-    of an echo that lies elsewhere."""
+    """(bins,): pseudo-variance ratio of the signal, by bins from the nearer of DC and Nyquist;
+    empty if the echo lies far from both."""
 
 
 STEADY = BinSpeckle(0.0, np.empty(0))
-"""Of echoes that do not fade, or whose quadratures are alike."""
+"""For echoes that do not fade, or have circular amplitudes in all bins."""
 
 
 class SpeckleTable(NamedTuple):
-    """Speckle in the bins of all points' segments."""
+    """Speckle parameters of the bins of all points, by segment."""
 
     spread: np.ndarray
     """(segments, n): :attr:`BinSpeckle.spread`."""
@@ -123,21 +138,21 @@ class SpeckleTable(NamedTuple):
     """(rows, angles): :attr:`sweep.model.quadratures.SignalQuadratures.factors`."""
 
     def at(self, segment: int, points: np.ndarray) -> "SpeckleTable":
-        """Speckle of one segment of some points."""
+        """Select one segment of some points."""
         spread, row = (values[[segment]][:, points] for values in (self.spread, self.row))
         return SpeckleTable(spread, row, self.quadratures, self.factors)
 
 
 @njit(cache=True, error_model="numpy")
 def levels_of(table, i):
-    """:class:`BinLevels` of a point, from a table (7, n) of them."""
+    """Return the :class:`BinLevels` of point i from an array (7, n)."""
     shape = PedestalShape(table[4, i], table[5, i], table[6, i])
     return BinLevels(table[0, i], table[1, i], table[2, i], table[3, i], shape)
 
 
 @njit(cache=True, error_model="numpy")
 def pedestal_density(shape, bins):
-    """Power of a pedestal so many bins from its line over that under the line."""
+    """Return the pedestal's power ``bins`` bins from its line, over that under the line."""
     gamma, delay = 2.0 * math.pi * shape.width, shape.delay
     lost, omega = math.exp(-gamma * delay), 2.0 * math.pi * bins
     if not bins > 0.0 or not gamma * delay > 1e-5:
@@ -203,21 +218,21 @@ def speckle_of(table, segment, i):
 
 
 class Fading(NamedTuple):
-    """Correlations of a point's segments in developed speckle, (n,) each."""
+    """Complex correlations of an echo's amplitudes between segments in speckle, (n,) each."""
 
     next: np.ndarray
-    """complex: of amplitudes in up and Doppler segment, within the unit circle."""
+    """Between up and Doppler segment, |.| <= 1."""
     over: np.ndarray
-    """complex: of those in up and down segment."""
+    """Between up and down segment."""
     last: np.ndarray
-    """complex: of those in Doppler and down segment."""
+    """Between Doppler and down segment."""
 
     def mixing(self) -> np.ndarray:
-        """Numbers by which three standard normal amplitudes mix, (6, n).
+        """Return the Cholesky factors of the segments' correlation matrix, (6, n).
 
-        Segment by segment z_0, m z_0 + sqrt(1 - m^2) z_1 and o z_0 + c z_1 + d z_2, with phases
-        turned away where they do not matter. Result: m, its complement, o, the two parts of c, and
-        d.
+        The amplitudes are A_up = z_0, A_doppler = m z_0 + sqrt(1 - m^2) z_1 and A_down = o z_0 + c
+        z_1 + d z_2, with independent circular z of unit power. Phases that do not change joint
+        magnitudes are removed. Rows: m, sqrt(1 - m^2), o, Re c, Im c, d.
         """
         near, far, last = (np.minimum(np.abs(one), 1.0) for one in self)
         turned = last * np.exp(1j * np.angle(self.next * self.last * np.conj(self.over)))
@@ -235,18 +250,30 @@ def fading_together(
     alike: np.ndarray,
     number: np.ndarray | float = 1.0,
 ) -> np.ndarray:
-    """Probability that two segments in developed speckle are both detected; nan where one lacks.
+    """Return the probability that two segments in developed speckle are both detected.
 
     Parameters
     ----------
     one, other
-        Probabilities that either is detected.
+        Probabilities that each segment is detected, (..., n); nan where it does not exist.
     level
-        Threshold over the noise per quadrature.
+        Threshold over the noise per quadrature, (n,).
     alike
-        Correlation of the signals' amplitudes in matching bins of the two segments.
+        Magnitude of the correlation of the echoes' amplitudes, (n,).
     number
-        Independent bins as which either echo counts, :func:`independent_bins`.
+        Number of independent bins as which each echo counts, :func:`independent_bins`.
+
+    Returns
+    -------
+    numpy.ndarray
+        (..., n); nan where either is nan.
+
+    Notes
+    -----
+    Joint exceedance of two correlated Rayleigh magnitudes [Schwartz, Bennett and Stein,
+    Communication Systems and Techniques, 1966, appendix A]. A, B are Th^2 over the mean powers, so
+    that the segments are detected with e^-A and e^-B. r is the squared correlation of signal and
+    noise: ``alike``^2 times the product of SNR / (1 + SNR). Then
 
     Notes
     -----
@@ -307,9 +334,10 @@ def independent_bins(pd: np.ndarray, strongest: np.ndarray, level: np.ndarray) -
 
 
 def any_two(chances: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Probability that at least two of three independent events happen.
+    """Return the probability that at least two of three independent events happen.
 
-    Of the probabilities of each, and of its contrary, (3, ...).
+    ``chances`` and ``others`` (3, ...) are the events' probabilities and their complements, which
+    are passed separately to keep precision in both tails.
 
     >>> round(float(any_two(np.array([0.9, 0.8, 0.5]), np.array([0.1, 0.2, 0.5]))), 6)
     0.85
@@ -320,13 +348,29 @@ def any_two(chances: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 @njit(cache=True, error_model="numpy")
 def mark(magnitude, count, level, exempt, beside):
-    """Find the detection in a run of bins, and mark those that can't raise a false alarm.
+    """Find the strongest bin of a run, and mark the bins that cannot raise a false alarm.
 
-    Adjacent bins at or above the threshold form a group; its largest bin is the detection. The bins
-    of a group and the two next to it can't raise a false alarm, nor can the strongest bin and its
-    neighbours, group or not. If any bin of the echo detects, bins within a main lobe (half of it
-    ``beside``, else 0) of one that has half of the largest magnitude can't either. Returns the
-    index of the largest bin, and the number of exempt bins.
+    Adjacent bins at or above the threshold form a group, and its largest bin is the detection.
+    Exempt are the bins of each group and the two next to it, and the strongest bin and its
+    neighbours, group or not. If any bin of the echo may detect it (``beside`` > 0, half-width of
+    the main lobe), bins within a main lobe of a bin of at least half the largest magnitude are
+    exempt as well.
+
+    Parameters
+    ----------
+    magnitude
+        |X|, at least ``count`` bins.
+    level
+        Threshold on |X|.
+    exempt
+        Result, bool: bins that cannot raise a false alarm.
+    beside
+        Half-width of the main lobe [bins], or 0.
+
+    Returns
+    -------
+    peak, exempted
+        Index of the largest bin; number of exempt bins.
     """
     largest, above = _survey(magnitude[:count], level)
     peak = 0
@@ -355,16 +399,19 @@ def mark(magnitude, count, level, exempt, beside):
 
 @njit(cache=True, error_model="numpy")
 def is_end(bin_, ends):
-    """Return true for DC and Nyquist, where noise is real; ``ends`` is N, or 0 where none is."""
+    """Return whether a bin is DC or Nyquist of a real record, where noise is real.
+
+    ``ends`` is the FFT size N, or 0 if noise is circular in all bins.
+    """
     return ends > 0 and (bin_ == 0 or 2 * bin_ == ends)
 
 
 @njit(cache=True, error_model="numpy")
 def crossing_pair(a, b, real):
-    """Probabilities that a bin of signal a [sigma] reaches a threshold b, and that it does not.
+    """Return P(|X| >= b) and P(|X| < b) of a bin with a steady signal a, both over sigma.
 
-    Q_1(a, b) and its complement. If the noise is real it has the power of both quadratures in
-    one, a variance of 2 sigma^2: |a + n| >= b.
+    Q_1(a, b) and its complement. If the noise is ``real``, it has the power of both quadratures in
+    one, a variance of 2 sigma^2: P(|a + n| >= b).
     """
     if not real:
         return marcum_q1_pair(a, b)
@@ -376,12 +423,22 @@ def crossing_pair(a, b, real):
 
 @njit(cache=True, error_model="numpy")
 def found_pair(magnitude, echo, peak, low, rule, levels, speckle):
-    """Probabilities that an echo is detected, and that it is missed.
+    """Return the probabilities that an echo is detected, and that it is missed.
 
-    By any of its bins (:func:`any_pair`), or by the peak of a run alone where half of a main lobe
-    is 0. ``rule`` is a :class:`DetectionRule`, ``levels`` are :class:`BinLevels`, and ``speckle``
-    is the :class:`BinSpeckle` of the segment. A pedestal of phase noise is light of the echo and
-    fades with it.
+    The echo is detected by any of its bins (``rule.beside`` > 0, :func:`any_pair`) or by the
+    largest bin of the run alone. The pedestal of phase noise is light of the echo and fades with
+    it.
+
+    Parameters
+    ----------
+    magnitude
+        (bins,): |X| of the run without noise [V].
+    echo
+        (bins,) bool: bins of the echo.
+    peak, low
+        Index of the largest bin, and number of the run's first bin.
+    rule, levels, speckle
+        :class:`DetectionRule`, :class:`BinLevels` and :class:`BinSpeckle`.
     """
     deviation, level = levels.line, levels.threshold
     if rule.fades >= 0.0:
@@ -410,17 +467,18 @@ def found_pair(magnitude, echo, peak, low, rule, levels, speckle):
 
 @njit(cache=True, error_model="numpy")
 def any_pair(magnitude, echo, low, ends, levels, pairs):
-    """Probabilities that any bin of an echo reaches the threshold, and that none does.
+    """Return the probabilities that any bin of an echo reaches the threshold, and that none does.
 
-    Each bin by itself crosses with :func:`crossing_pair`. Neighbours' noise is correlated, and in
-    phase with a signal that is in step from bin to bin, as in a line's main lobe. Of each pair the
-    joint probability is that of normal numbers with the bins' own probabilities, which add
+    Each bin by itself crosses with :func:`crossing_pair`. The noise of neighbours is correlated, in
+    phase with a signal that is in step from bin to bin, as in a main lobe. The joint probability of
+    two neighbours is that of correlated normal numbers with the same probabilities: their product
+    plus
 
         1 / (2 pi) int_0^{asin rho} exp(-(s^2 + t^2 - 2 s t sin u) / (2 cos^2 u)) du
 
-    to the product [Owen, Ann. Math. Statist. 27, 1956], by the rule ``pairs`` of
-    :func:`sweep.model.alarms.pair_nodes`; bins are a Markov chain of first order. ``levels`` are
-    :class:`BinLevels`.
+    [Owen, Ann. Math. Statist. 27, 1956], with the normal deviates s and t, by the quadrature
+    ``pairs`` (:func:`sweep.model.alarms.pair_nodes`). Bins are treated as a first-order Markov
+    chain.
     """
     found, missed, before, t_before, largest = 0.0, 1.0, -1.0, 0.0, 0.0
     level = levels.threshold
@@ -477,9 +535,9 @@ def _after_neighbour(chances, before, t_before, pairs):
 
 @njit(cache=True, error_model="numpy")
 def any_neighbour(chances, count, pairs):
-    """Probability that any of ``count`` adjacent bins crosses, by their own probabilities.
+    """Return the probability that any of ``count`` adjacent bins crosses, given each bin's own.
 
-    Bins are a Markov chain as in :func:`any_pair`; those that hardly ever cross count as
+    Neighbours are correlated as in :func:`any_pair`; bins that cross with less than 1e-4 count as
     independent.
     """
     found, missed, before, t_before = 0.0, 1.0, -1.0, 0.0
@@ -500,10 +558,11 @@ def any_neighbour(chances, count, pairs):
 
 @njit(cache=True, error_model="numpy")
 def free_images(magnitude, exempt, low, size, gain):
-    """Let bins raise a false alarm in which images of unequal I and Q stand; return the exempt.
+    """Clear the exemption of bins dominated by an I/Q image; return the number still exempt.
 
-    An image of ``gain`` times the line's |X| stands in the bin of the opposite frequency. Bins are
-    its own where it makes half of |X| and more. ``low`` is the number of the first bin, ``size`` N.
+    The image of ``gain`` times the line's |X| stands at the opposite frequency. It dominates a bin
+    where it makes at least half of |X|. ``low`` is the number of the first bin, ``size`` the FFT
+    size N.
     """
     exempted = 0
     for k in range(magnitude.size):
@@ -518,15 +577,14 @@ def free_images(magnitude, exempt, low, size, gain):
 
 @njit(cache=True, error_model="numpy")
 def any_faded(magnitude, echo, low, rule, levels, speckle):
-    """Probabilities that any, and that no, bin of an echo in developed speckle crosses.
+    """Return the probabilities that any, and that no, bin of an echo in developed speckle crosses.
 
-    Signal and noise of a bin are complex Gaussian. The strongest mode of the echo's lines
-    (:mod:`sweep.model.speckle_modes`) is one number z for all bins, of exponential |z|^2: the
-    probability is the mean over it of that given z. There bins have a steady signal u_k z, and the
-    echo's other modes are noise to them, with a variance and a correlation of their own. Of a line
-    all power is in the mode, and the sidelobes of one that cross too fade with it. Near DC and
-    Nyquist the mode's power goes with the phase of z as (1 + q_k cos t), q_k the pseudo-variance of
-    bin k over its power, t uniform (:mod:`sweep.model.quadratures`).
+    The strongest speckle mode (:mod:`sweep.model.speckle_modes`) is one complex Gaussian number z
+    for all bins. Given z, bin k has the steady signal u_k z, and the other modes add to its noise,
+    with their own variance and correlation. The result is the mean over |z|^2, which is
+    exponential. A single line has all its power in this mode, and its sidelobes fade with it. Near
+    DC and Nyquist the mode's power depends on the phase of z as 1 + q_k cos t, with the
+    pseudo-variance ratio q_k of bin k and t uniform (:mod:`sweep.model.quadratures`).
 
     Stretches of bins of half the largest magnitude are echoes by themselves; weaker stretches
     belong to the one below. Errors: docs/physics.md.
@@ -561,7 +619,10 @@ _PAIR_NODE, _PAIR_WEIGHT = np.polynomial.legendre.leggauss(4)
 
 @njit(cache=True, error_model="numpy")
 def _stretch_faded(magnitude, echo, bounds, low, rule, levels, speckle):
-    """:func:`any_faded` of the bins from ``bounds[0]`` to before ``bounds[1]``, one echo."""
+    """Return pd and 1 - pd of one echo in developed speckle, bins bounds[0] .. bounds[1] - 1.
+
+    As of :func:`any_faded`.
+    """
     begin, end = bounds
     nearest = begin
     for i in range(begin, end):
@@ -610,9 +671,9 @@ def _stretch_faded(magnitude, echo, bounds, low, rule, levels, speckle):
 
 @njit(cache=True, error_model="numpy")
 def _mean_over_phases(steady, echo, low, rule, speckle):
-    """:func:`_mean_over_mode`, and over the phases of the mode where quadratures differ.
+    """Average :func:`_mean_over_mode` over the phase of the mode, where bins are noncircular.
 
-    A fifth row of ``steady``, where there is one, is the share of the noise that is echo as well.
+    An optional fifth row of ``steady`` is the fraction of the noise that is echo as well.
     """
     if speckle.quadratures.size == 0:
         return _mean_over_mode(steady, echo, low, rule.ends)
@@ -635,11 +696,12 @@ def _mean_over_phases(steady, echo, low, rule, speckle):
 
 @njit(cache=True, error_model="numpy")
 def _mean_over_mode(steady, echo, low, ends):
-    """Probabilities that any, and that no, bin crosses, over a signal that fades in all alike.
+    """Return the probabilities that any, and that no, bin crosses, averaged over the mode's power.
 
-    ``steady`` (4, bins): the signal's root mean square over the noise; the threshold over the
-    noise; the correlation of the noise with that of the bin below; the mean power of noise that
-    fades with the signal, over the other's.
+    ``steady`` (>= 4, bins): root mean square signal of the mode over the noise; threshold over the
+    noise; noise correlation with the bin below; mean power of the noise that fades with the mode,
+    over that of the rest. Given z the signal is z times row 0. The average is over |z| with the
+    density 2 z e^(-z^2).
     """
     first, last, middle = _Z_MAX, _Z_MAX, _Z_MAX
     for k in range(echo.size):
@@ -674,14 +736,14 @@ def _mean_over_mode(steady, echo, low, ends):
 
 @njit(cache=True, error_model="numpy")
 def _any_steady(steady, z, echo, low, ends):
-    """Probabilities that any, and that no, bin crosses, at a factor z on the signal.
+    """Return the probabilities that any, and that no, bin crosses, given the mode's magnitude z.
 
-    As :func:`any_pair`, with noise of its own in each pair of bins. Of the correlation r of two
-    bins' noise their powers have
+    As :func:`any_pair`, with a noise correlation r of each pair of neighbours. Their powers then
+    have the correlation
 
         (r^2 + r a b) / sqrt((1 + a^2) (1 + b^2)),
 
-    a and b their signals over the noise: r^2 of noise alone, r of strong signals.
+    with their signals a and b over the noise: r^2 for noise alone, r for strong signals.
     """
     found, missed, before, t_before, a_before = 0.0, 1.0, -1.0, 0.0, 0.0
     for k in range(echo.size):
@@ -717,7 +779,7 @@ def _any_steady(steady, z, echo, low, ends):
 
 @njit(cache=True, error_model="numpy")
 def _deviate(chance):
-    """Compute the normal deviate exceeded with a probability of at most 1/2; to about 1e-4."""
+    """Return the normal deviate exceeded with probability ``chance`` <= 1/2, to about 1e-4."""
     if chance < 1e-300:
         return 37.0
     s = math.sqrt(-2.0 * math.log(chance))
@@ -729,10 +791,10 @@ def _deviate(chance):
 
 @njit(cache=True, error_model="numpy")
 def echo_of(magnitude, first, last, level, beside):
-    """First and last bin of the echo about a group of bins first .. last of a run.
+    """Return the first and last bin of the echo around a group of bins first .. last.
 
-    Those of half the group's largest magnitude that join on to it, and a main lobe on either side,
-    up to the next group; the group itself where ``beside`` is 0.
+    The echo has the adjacent bins of at least half the group's largest magnitude, and a main lobe's
+    half-width ``beside`` on either side, up to the next group. With ``beside`` 0 it is the group.
     """
     if beside == 0:
         return first, last
@@ -749,7 +811,7 @@ def echo_of(magnitude, first, last, level, beside):
 
 @njit(cache=True, error_model="numpy")
 def _survey(magnitude, level):
-    """Largest magnitude, and how many reach a level."""
+    """Return the largest magnitude, and the number of bins at or above a level."""
     largest, above = magnitude[0], 0
     for i in range(magnitude.size):
         largest = magnitude[i] if magnitude[i] > largest else largest
@@ -759,7 +821,7 @@ def _survey(magnitude, level):
 
 @njit(cache=True, error_model="numpy")
 def _exempt(first, last, count, exempt):
-    """Mark the bins of a group and the two beside it; return their number."""
+    """Mark the bins first .. last and their two neighbours as exempt; return their number."""
     first, last = max(first - 1, 0), min(last + 1, count - 1)
     exempt[first : last + 1] = True
     return last - first + 1
@@ -767,7 +829,7 @@ def _exempt(first, last, count, exempt):
 
 @njit(cache=True, error_model="numpy")
 def detect_rows(magnitude, first, bins, rule, levels, speckle, out):
-    """Detect in runs of spectra without noise, (m, count), into ``out`` (6, m).
+    """Detect in runs of noiseless spectra, one per point.
 
     Its rows are those of :data:`sweep.model.segments.SEGMENT_FIELDS`; no leakage. ``bins`` are the
     last bin of the spectrum and the bin width [Hz]; bins outside 0..N/2 are passed over.

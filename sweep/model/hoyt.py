@@ -1,13 +1,15 @@
-"""Magnitude of a complex Gaussian number whose quadratures differ.
+"""Tail probabilities of a noncircular complex Gaussian's magnitude (Hoyt distribution).
 
-Of a mean power P and a real pseudo-variance E[X^2] = q P the quadratures are independent, of the
-variances (1 +- q) P / 2. |X|^2 is a Hoyt variable [Hoyt, Bell Syst. Tech. J. 26, 318, 1947]: with a
-phase t uniform in 0 .. pi it is exponential, of the mean P (1 + q cos t). It exceeds r^2 with
-[Paris, Electron. Lett. 45, 210, 2009]
+Let X be a zero-mean complex Gaussian number of mean power P = E|X|^2 and real pseudo-variance
+E[X^2] = q P, -1 <= q <= 1. Its real and imaginary parts are independent, with the variances
+v_1^2, v_2^2 = (1 +- q) P / 2, and |X| has a Hoyt (Nakagami-q) distribution [Hoyt, Bell Syst. Tech.
+J. 26, 318, 1947]. Equivalently, |X|^2 is exponential with the mean P (1 + q cos t), averaged over a
+phase t uniform in 0 .. pi. It exceeds r^2 with the probability [Paris, Electron. Lett. 45, 210,
+2009]
 
-    1 - Q_1(a r, b r) + Q_1(b r, a r),    a, b = (v_1 +- v_2) / (2 v_1 v_2),
+    P(|X| > r) = 1 - Q_1(a r, b r) + Q_1(b r, a r),    a, b = (v_1 +- v_2) / (2 v_1 v_2).
 
-v_1 and v_2 the deviations of the quadratures; a real number with erfc(r / sqrt(2 P)).
+For q = +-1 only one part of X is left, and the probability is erfc(r / sqrt(2 P)).
 """
 
 import math
@@ -18,23 +20,27 @@ from sweep.kernels import njit
 from sweep.model.marcum import marcum_q1_pair
 
 ANGLES = 8
-"""Phases of an amplitude that stand for all where quadratures differ."""
+"""Number of nodes t_j = pi (j + 1/2) / ANGLES of the midpoint rule over the phase t."""
 
 COSINES = np.cos(np.pi * (np.arange(ANGLES) + 0.5) / ANGLES)
 
 
 @njit(cache=True, error_model="numpy")
 def bin_share(bin_, half, shares):
-    """Pseudo-variance over power of a bin 0 .. N/2; ``shares`` (k,) are counted from DC."""
+    """Return the pseudo-variance ratio q = E[X^2] / E[|X|^2] of a bin; 0 far from DC and Nyquist.
+
+    ``bin_`` is 0 .. N/2 and ``half`` is N/2. ``shares`` (k,): q of the bins 0 .. k - 1, counted
+    from the nearer of DC and Nyquist.
+    """
     k = min(bin_, half - bin_)
     return shares[k] if 0 <= k < shares.size else 0.0
 
 
 @njit(cache=True, error_model="numpy")
 def hoyt_pair(power, share, level):
-    """Probabilities that a Gaussian number's magnitude reaches a level, and that it does not.
+    """Return P(|X| >= level) and P(|X| < level) of a noncircular complex Gaussian number X.
 
-    ``power`` is its mean square, ``share`` its pseudo-variance over that, -1 .. 1.
+    ``power`` is E[|X|^2], ``share`` the pseudo-variance ratio q = E[X^2] / E[|X|^2], -1 .. 1.
     """
     q = abs(share)
     if q == 0.0:

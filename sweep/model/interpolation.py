@@ -41,49 +41,52 @@ from sweep.kernels import njit
 from sweep.model.window import Window, samples
 
 _STEPS = 2048
-"""Intervals of the tables: their linear interpolation is good to some 1e-7 bins."""
+"""Number of intervals in the tables; linear interpolation errs by some 1e-7 bins."""
 
 _WIDENED, _NARROW = 129, 0.05
-"""Places at which a spread [bins] of lines is tried."""
+"""Number of places, and standard deviation [bins], at which ``widening`` is evaluated."""
 
 _DEGREE = 32
-"""Of the polynomial that a lone tone's bins within 2 are."""
+"""Degree of the polynomial that represents a tone's complex bin within +-2 bins."""
 
 _VANISHING = 0.25
-"""Height of the neighbours of a tone on a bin under which the larger of them is used alone."""
+"""Relative height of a centred tone's neighbours below which TWO_BINS is used."""
 
 THREE_BINS, TWO_BINS = 0, 1
 
 
 class Interpolator(NamedTuple):
-    """Tables of one window and FFT, as the compiled code takes them; m places from 0 to 1 bin."""
+    """Tables of one window and FFT size that convert bin magnitudes to a position between bins.
+
+    m is the number of places 0 .. 1 bin at which they are given.
+    """
 
     measure: int
     """THREE_BINS or TWO_BINS."""
     low: float
-    """The measure of a tone on the centre bin."""
+    """Measure of a tone exactly on the centre bin."""
     step: float
-    """Spacing of the measures in `position`."""
+    """Spacing of the measures at which ``position`` is tabulated."""
     position: np.ndarray
-    """(m,): |delta| [bins] of measures low, low + step ..; 0..1."""
+    """(m,): |delta| [bins], 0 .. 1, for the measures low, low + step, .."""
     weight: np.ndarray
-    """(3, m): weights of the step of least squares by |delta|, for the bin on the tone's side
-    last; of magnitudes in units of the centre's. Zero for TWO_BINS."""
+    """(3, m): least-squares weights by |delta|, on the bin away from the tone, the centre and the
+    bin on the tone's side, for magnitudes over the centre's. Zero for TWO_BINS."""
     error: np.ndarray
-    """(m,): standard error [bins] by |delta| where the centre bin's magnitude is sigma."""
+    """(m,): standard error [bins] by |delta| if the centre bin's magnitude equals sigma."""
     mixing: tuple[float, float, float, float]
-    """What makes the noise of three adjacent bins, in one quadrature, of independent numbers z for
-    the middle one, the one above and the one below: above m0 z0 + m1 z1, below m0 z0 + m2 z1 +
-    m3 z2."""
+    """Factors m0 .. m3 that make the correlated noise of three adjacent bins, in one quadrature, of
+    independent normal numbers z0 (centre), z1, z2: above m0 z0 + m1 z1, below m0 z0 + m2 z1 + m3
+    z2."""
     sidelobe_correlation: float
     """Correlation of the noise of neighbouring bins in phase with a tone's sidelobes there, which
     change sign from one to the next: once in L of N bins, for records of L samples."""
     widening: np.ndarray
-    """(m,): shift [bins] by |delta| over the variance [bins^2] of lines that add as powers."""
+    """(m,): position error by |delta| over the variance of lines that add as powers [1/bins]."""
 
 
 def noise_correlation(window: Window, fft_size: int) -> tuple[float, float]:
-    """Correlation of the noise of bins one and two apart, in phase with a tone's signal."""
+    """Return the noise correlation of bins one and two apart, in phase with a tone's signal."""
     squared = samples(window.name, window.length) ** 2
     turns = (np.arange(window.length) - window.length / 2) / fft_size
     near, far = (float((squared * np.cos(2 * np.pi * d * turns)).sum()) for d in (1, 2))
@@ -92,10 +95,10 @@ def noise_correlation(window: Window, fft_size: int) -> tuple[float, float]:
 
 @lru_cache(maxsize=32)
 def interpolator(window: Window, fft_size: int) -> Interpolator:
-    """Tables that place a tone between bins, made once for a window and FFT size.
+    """Prepare the tables for a window and FFT size (cached).
 
-    A top so flat that nothing grows with delta (flat-top windows in a padded FFT) has no place
-    between bins: delta is then 0 and its error half a bin.
+    If the window's top is so flat that no measure grows with delta (flat-top windows in a padded
+    FFT), positions are not resolved: delta is 0 and its error half a bin.
     """
     delta = np.arange(_STEPS + 1) / _STEPS
     tone = _tone(window, fft_size, delta)
@@ -123,7 +126,7 @@ def interpolator(window: Window, fft_size: int) -> Interpolator:
 
 
 def phasors(cycles: float, number: int) -> np.ndarray:
-    """exp(-2 pi i cycles n) of n = 0 .. number - 1: products of as few exponentials as will do."""
+    """Return exp(-2 pi i cycles n), n = 0 .. number - 1, from some 2 sqrt(number) exponentials."""
     step = math.isqrt(number) + 1
     angle = -2j * np.pi * cycles * np.arange(step)
     return np.multiply.outer(np.exp(step * angle), np.exp(angle)).ravel()[:number]
@@ -131,10 +134,10 @@ def phasors(cycles: float, number: int) -> np.ndarray:
 
 @lru_cache(maxsize=32)
 def lone_tone(window: Window, fft_size: int) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the complex bin as a function of its distance from a lone tone, -2..2 bins.
+    """Return a function that gives the complex bin at distances -2 .. 2 [bins] from a lone tone.
 
-    The phase of half a record is taken off, so it is real for a symmetric window. It turns by one
-    cycle at the most, so a polynomial gives it to 1e-14 of the largest bin.
+    The phase of half a record is removed, so that it is real for a symmetric window. It turns by at
+    most one cycle, so that a polynomial represents it to 1e-14 of the largest bin.
     """
     w, middle = samples(window.name, window.length), window.length / 2
 
@@ -153,11 +156,11 @@ def _tone(window: Window, fft_size: int, delta: np.ndarray) -> np.ndarray:
 def _least_squares(
     tone: np.ndarray, delta: np.ndarray, near: float, far: float, *, two_bins: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Weights (3, m) on the bins that give a small change of delta, and their error (m,).
+    """Return minimum-variance weights (3, m) on three bins for a small change of delta.
 
-    Of all weights that a change of amplitude leaves at zero and a change of delta moves as much,
-    those of least variance, for a centre bin of 1: u = C^-1 G (G' C^-1 G)^-1 (0, 1)', G = (tone,
-    its slope).
+    The weights annihilate a change of amplitude and respond with 1 to a change of delta, for a
+    centre bin of 1: u = C^-1 G (G' C^-1 G)^-1 (0, 1)', G = (tone, its slope), with the noise
+    covariance C. The standard error is (m,) [bins], at a centre bin of one sigma.
     """
     slope = np.gradient(tone, delta, axis=1)
     used = slice(1 if two_bins else 0, 3)
@@ -172,9 +175,10 @@ def _least_squares(
 
 
 def _widening(window: Window, fft_size: int, tables: Interpolator) -> np.ndarray:
-    """Shift of the estimate over the variance of a narrow Gaussian spread, by |delta| (m,).
+    """Return the position error over the variance of a narrow Gaussian spread, by |delta| (m,).
 
-    Three lines with weights of 1/6, 2/3, 1/6 have its moments up to the fifth.
+    The spread is represented by three lines of weights 1/6, 2/3, 1/6, which has its moments up to
+    the fifth.
     """
     place = np.linspace(0.0, 1.0, _WIDENED)
     power = np.zeros((3, _WIDENED))
@@ -188,7 +192,7 @@ def _widening(window: Window, fft_size: int, tables: Interpolator) -> np.ndarray
 
 
 def _mixing(near: float, far: float) -> tuple[float, float, float, float]:
-    """Factors of the covariance's root: bin 0, then +1, then -1."""
+    """Return the Cholesky factors m0 .. m3 of the noise covariance of bins 0, +1, -1."""
     rest = math.sqrt(max(1 - near**2, 0.0))
     across = (far - near**2) / rest if rest > 0 else 0.0
     return near, rest, across, math.sqrt(max(1 - near**2 - across**2, 0.0))
@@ -196,7 +200,7 @@ def _mixing(near: float, far: float) -> tuple[float, float, float, float]:
 
 @njit(cache=True, error_model="numpy")
 def sub_bin(below, centre, above, tables):
-    """Tone's distance [bins, -1..1] past the centre bin, from the magnitudes of three bins."""
+    """Estimate a tone's offset from the centre bin [bins, -1 .. 1] from three magnitudes."""
     position, weight = tables.position, tables.weight
     larger, lesser = max(below, above), min(below, above)
     if not larger > 0.0:
@@ -223,16 +227,20 @@ def _at(values, place):
 
 @njit(cache=True, error_model="numpy")
 def sub_bin_error(delta, ratio, tables):
-    """Compute the standard error [bins] of :func:`sub_bin`, <= 1/2, by the centre over sigma."""
+    """Return the standard error of :func:`sub_bin` [bins], at most 1/2.
+
+    ``delta``: estimated position [bins]; ``ratio``: magnitude of the centre bin over sigma.
+    """
     if not ratio > 0.0:
         return 0.5
     return min(_at(tables.error, abs(delta) * (tables.error.size - 1)) / ratio, 0.5)
 
 
 def drift_error(delta: np.ndarray, drift: np.ndarray, window: Window, fft_size: int) -> np.ndarray:
-    """Error [bins] of :func:`sub_bin` for a tone that moves on by some bins within the record.
+    """Return the error of :func:`sub_bin` [bins] for a tone that drifts within the record.
 
-    The tone lies ``delta`` bins past the centre bin at the record's middle, and moves evenly.
+    The tone lies ``delta`` bins from the centre bin at the record's middle, and moves at a constant
+    rate by ``drift`` bins in all.
     """
     shift = RegularGridInterpolator(
         (_DRIFTS, _DRIFTING_PLACES), _drift_shifts(window, fft_size), bounds_error=False
@@ -244,12 +252,13 @@ def drift_error(delta: np.ndarray, drift: np.ndarray, window: Window, fft_size: 
 
 _DRIFTS = np.array([0.5, 1.0, 2.0, 4.0])
 _DRIFTING_PLACES = np.linspace(0.0, 1.0, 17)
-"""Bins by which a tone is made to move within the record, and its places past a bin."""
+"""Drifts of a tone within the record, and its places at the record's middle, in the tables
+[bins]."""
 
 
 @lru_cache(maxsize=32)
 def _drift_shifts(window: Window, fft_size: int) -> np.ndarray:
-    """Shift of the estimate over the square of a tone's drift [1/bins], by drift and place."""
+    """Tabulate the position error over the square of a tone's drift [1/bins], (drifts, places)."""
     w, tables = samples(window.name, window.length), interpolator(window, fft_size)
     middle = np.arange(w.size) / w.size - 0.5
     found = np.empty((_DRIFTS.size, _DRIFTING_PLACES.size))
@@ -265,31 +274,31 @@ def _drift_shifts(window: Window, fft_size: int) -> np.ndarray:
 
 
 _LATE_PLACES = 65
-"""Places past a bin at which echoes of part of a record are tried."""
+"""Number of places 0 .. 1 bin in the tables of late echoes."""
 _LATE_SHARES = np.concatenate([np.arange(0.0, 0.8, 0.02), np.arange(0.8, 0.985, 0.01)])
-"""Shares of a record's samples that such echoes lack."""
+"""Fractions of the record without an echo in the tables of late echoes."""
 _LEAST_SLOPE = 0.05
 _STEP = 1e-4
 
 
 class LateEcho(NamedTuple):
-    """Correction of places between bins of echoes that lack a record's first samples."""
+    """Correction of positions between bins for echoes that arrive after the record has begun."""
 
     shift: np.ndarray
-    """To be added to the place past the centre bin [bins], of its sign."""
+    """Shift to add to the estimated position [bins]."""
     wider: np.ndarray
-    """Factor on the standard error, by noise, of :func:`sub_bin_error`."""
+    """Factor on the standard error of :func:`sub_bin_error`."""
 
 
 def late_echo(delta: np.ndarray, lacking: np.ndarray, window: Window, fft_size: int) -> LateEcho:
-    """Correct :func:`sub_bin` for an echo that has no sample before a given one of the record.
+    """Return the correction of :func:`sub_bin` for an echo that misses the record's first samples.
 
     Parameters
     ----------
     delta
-        Place past the centre bin that :func:`sub_bin` gives [bins].
+        Position that :func:`sub_bin` gives, relative to the centre bin [bins].
     lacking
-        Samples at the record's start without an echo.
+        Number of samples at the record's start without an echo.
     """
     shift, wider = _late_tables(window, fft_size)
     delta, share = np.broadcast_arrays(delta, np.asarray(lacking) / window.length)
@@ -304,7 +313,7 @@ def late_echo(delta: np.ndarray, lacking: np.ndarray, window: Window, fft_size: 
 
 @lru_cache(maxsize=32)
 def _late_tables(window: Window, fft_size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Shift and factor on the error by share and place that is read, (shares, places) each."""
+    """Tabulate shift [bins] and error factor, (shares, places), for :func:`late_echo`."""
     w, tables = samples(window.name, window.length), interpolator(window, fft_size)
     first = np.minimum(np.rint(_LATE_SHARES * w.size).astype(int), w.size - 2)
     place = np.linspace(0.0, 1.0, _LATE_PLACES)
@@ -348,9 +357,17 @@ def _late_tables(window: Window, fft_size: int) -> tuple[np.ndarray, np.ndarray]
 
 @njit(cache=True, error_model="numpy")
 def spread_error(delta, spread, power, tables):
-    """Error [bins] of :func:`sub_bin` for lines of that standard deviation [bins] about its place.
+    """Return the error of :func:`sub_bin` [bins] for lines that spread about their mean.
 
-    If they do not add as powers, they may cancel so that the place is anywhere among them.
+    Parameters
+    ----------
+    delta
+        Position relative to the centre bin [bins].
+    spread
+        Standard deviation of the lines [bins].
+    power
+        True if the lines add as powers. If they add as amplitudes they may cancel, and the error is
+        the whole spread.
     """
     if not power:
         return spread

@@ -1,24 +1,24 @@
-"""A segment's detection and leakage, every bin accounted for without looking at each.
+"""Detection and leakage of a segment, with all bins accounted for but few evaluated.
 
-Bins within a run around the lines are evaluated one by one: all that may cross the threshold, and
-as many as it takes for what leaks to become smooth. Beyond it, down to DC and up to Nyquist, the
-probabilities that leaked signal adds are summed as an integral, to better than 1e-6 of the leakage.
-They are left out where the shape's envelope says that they come to no more than the accuracy asked
-for. The rest may serve for the bins within the run too.
+Bins in a run around the lines are evaluated one by one: all that may cross the threshold, and as
+many more as it takes for the leaked signal to become smooth. Beyond the run, down to DC and up to
+Nyquist, the probabilities that leaked signal adds are summed as an integral, with an error below
+1e-6 of the leakage. The integral is left out where the envelope of the line shape bounds it below
+the accuracy asked for.
 
-Without padding e^{i pi k} is a sign. So |X| far from the lines is a smooth function of k, and a sum
-over bins is an integral and corrections at its near end (Euler's and Maclaurin's, in central
-differences). As |X|^2 is even about DC and about Nyquist, there is none at the far end but half the
-value there. In v = cot(pi q / N), q the distance from the lines, the integrand is nearly a
-polynomial: some thirty Gauss points stand for sixty thousand bins.
+Without padding the factor e^{i pi k} is a sign, so |X| far from the lines is a smooth function of
+k. Its sum over bins is then an integral plus corrections at its near end (Euler-Maclaurin, in
+central differences). |X|^2 is even about DC and Nyquist, so the far end needs no correction but
+half the value there. In v = cot(pi q / N), with the distance q from the lines, the integrand is
+nearly a polynomial: some thirty Gauss points represent sixty thousand bins.
 
-If the echo is in developed speckle, what leaks fades with it. Given the power u of the speckle, of
-mean 1, bins of u |X|^2 leak with a probability 1 - exp(-R(u)), and the mean is
+In developed speckle the leaked signal fades with its echo. If the speckle's power is u, of mean 1,
+bins of power u |X|^2 leak with the probability 1 - exp(-R(u)), and the mean is
 
     P = int_0^inf e^{-u} (1 - exp(-R(u))) du.
 
-ln R is computed at powers a factor of 2 apart, with a monotone cubic between
-(:func:`fading_mean`). Bins that the mean echo leaves exempt stay so at any power.
+ln R is computed at powers a factor of 2 apart and interpolated by a monotone cubic
+(:func:`fading_mean`). Bins that are exempt at the mean power are exempt at any power.
 """
 
 import math
@@ -64,23 +64,24 @@ from sweep.model.spectrum import (
 )
 
 APRON = 3
-"""Bins on either side of an integral's near end that its corrections look at."""
+"""Bins on either side of the integral's near end that its end corrections use."""
 
 SMOOTHNESS = 1e-7
-"""Largest last correction at the near end of an integral, relative to all that leaks."""
+"""Largest last term of the end corrections, relative to the whole leakage."""
 
 MOST_POINTS = 200
-"""Gauss points on one side of the lines, at the most."""
+"""Maximum number of Gauss points on one side of the lines."""
 
 WHOLE, HALF = np.bool_(False), np.bool_(True)
-"""As arguments, of NumPy because Python's would compile what takes them once more."""
+"""Arguments of :func:`_cotangent`: at a bin, or half a bin beyond. NumPy booleans, because numba
+would compile the function anew for Python's."""
 
 LOUDEST = 16.0
-"""Power of speckle, of mean 1, up to which leakage is averaged: e^-16 of draws are brighter."""
+"""Largest speckle power (mean 1) in averages of leakage; a fraction e^-16 of draws exceeds it."""
 SPECKLE_POWERS = LOUDEST * 2.0 ** -np.arange(10.0)
 _SPECKLE_STEPS = 160
 FAINTEST_RATE = 1e-30
-"""R below which nothing leaks."""
+"""Rate R below which leakage is taken to be 0."""
 
 _LARGEST_ORDER = 12
 _GAUSS = np.zeros((2, _LARGEST_ORDER + 1, _LARGEST_ORDER))
@@ -90,13 +91,23 @@ for _n in range(1, _LARGEST_ORDER + 1):
 
 @njit(cache=True, error_model="numpy")
 def inspect(origin, lines, noise, table, form, sizes, tangent, room, exempt, series):
-    """Run of bins, detection and leakage of a segment's lines; all bins are accounted for.
+    """Evaluate a segment: a run of bins around its lines, detection, and leakage of all bins.
 
-    Arguments and results as of :func:`sweep.model.spectrum.detect`, and the leakage last.
-    ``noise``: sigma per quadrature; threshold; probability of leakage that may be left out; and
-    LOUDEST where the echo fades, else 1.
-    ``series``:
-    :func:`sweep.model.crossings.crossing_series` of the threshold.
+    Parameters and results are those of :func:`sweep.model.spectrum.detect`, with these differences.
+
+    Parameters
+    ----------
+    noise
+        Noise per quadrature sigma; threshold on |X|; probability of leakage that may be neglected;
+        and LOUDEST if the echo is in developed speckle, else 1.
+    series
+        :func:`sweep.model.crossings.crossing_series` of the threshold over sigma.
+
+    Returns
+    -------
+    low, count, peak, exempted, leakage
+        First bin and length of the run; index of the largest bin; number of exempt bins;
+        probability that leaked signal raises at least one false alarm.
     """
     n, lowest, highest, total, faint = lines
     sigma, level, tolerance, loudest = noise
@@ -154,7 +165,10 @@ def inspect(origin, lines, noise, table, form, sizes, tangent, room, exempt, ser
 
 @njit(cache=True, error_model="numpy")
 def of_bins(count, noise, floor, room, exempt, series):
-    """Leakage of the bins of a run that stand above ``floor`` sigma, one by one."""
+    """Return the leakage of those bins of a run that exceed ``floor`` [sigma], bin by bin.
+
+    Bins below the floor become exempt. ``noise`` begins with sigma and the threshold.
+    """
     for i in range(count):
         if room[OUT, i] < floor * noise[0]:
             exempt[i] = True
@@ -164,7 +178,7 @@ def of_bins(count, noise, floor, room, exempt, series):
 
 @njit(cache=True, error_model="numpy")
 def of_fading_bins(count, noise, floor, room, exempt, series):
-    """Compute :func:`of_bins` for an echo in developed speckle."""
+    """Return the mean of :func:`of_bins` over developed speckle."""
     for i in range(count):
         if room[OUT, i] < floor * noise[0]:
             exempt[i] = True
@@ -173,7 +187,7 @@ def of_fading_bins(count, noise, floor, room, exempt, series):
 
 @njit(cache=True, error_model="numpy")
 def _faded_bins(count, noise, room, exempt, series):
-    """Mean leakage of a run's bins over developed speckle."""
+    """Return the mean leakage of a run's bins over developed speckle."""
     log_rates = np.empty(SPECKLE_POWERS.size)
     for k in range(SPECKLE_POWERS.size):
         root = math.sqrt(SPECKLE_POWERS[k])
@@ -187,21 +201,21 @@ def _faded_bins(count, noise, room, exempt, series):
 
 @njit(cache=True, error_model="numpy")
 def _log_rate(chance):
-    """Logarithm of -ln(1 - chance)."""
+    """Return ln R of a leakage probability, R = -ln(1 - chance), at least ln FAINTEST_RATE."""
     return math.log(max(silence(min(chance, 1.0 - 1e-15)), FAINTEST_RATE))
 
 
 @njit(cache=True, error_model="numpy")
 def _common_slope(one, other):
-    """Harmonic mean of two slopes of one sign, or 0."""
+    """Return the harmonic mean of two slopes, or 0 if their signs differ."""
     return 2.0 * one * other / (one + other) if one * other > 0.0 else 0.0
 
 
 @njit(cache=True, error_model="numpy")
 def fading_mean(log_rates):
-    """Mean of 1 - exp(-R) over an exponential power, of ln R at SPECKLE_POWERS.
+    """Return int_0^inf e^-u (1 - exp(-R(u))) du, ln R given at SPECKLE_POWERS.
 
-    Below the last of them R is proportional to the power.
+    Below the smallest of these powers R is proportional to u; above LOUDEST nothing is added.
     """
     last = log_rates.size - 1
     mean, before, chance_before = 0.0, 0.0, 0.0
@@ -230,14 +244,16 @@ def fading_mean(log_rates):
 
 @njit(cache=True, error_model="numpy")
 def _all_beyond(weight, first, mirror, noise, form):
-    """Bound on the probability that any bin ``first`` or more bins from the lines adds to leakage.
+    """Bound the leakage of all bins that are ``first`` or more bins away from the lines.
 
-    With x = a^2/2, y = b^2/2 and z = a b a bin's own is at most
+    With x = a^2/2, y = b^2/2 and z = a b a single bin adds at most
 
-        x dQ_1/dx = x y e^{-y} g,    g = I_1(z) / (z/2) <= e^{z^2/8}, 2 e^z / sqrt(2 pi z^3)
+        x dQ_1/dx = x y e^{-y} g,    g = I_1(z) / (z/2) <= e^{z^2/8}, 2 e^z / sqrt(2 pi z^3),
 
-    so that all of them together have at most y e^{-y} g(nearest) times the sum of x. Images are no
-    nearer to a bin than the lines, nor than ``mirror``; infinite where there are none.
+    so that all of them together add at most y e^{-y} g(nearest) times the sum of x. Images are no
+    nearer to a bin than the lines, nor than ``mirror`` bins; inf if there are no images.
+    ``weight``: summed magnitude of the lines; ``noise``: sigma, threshold, tolerance. Returns inf
+    where the bound does not hold (z > 2 y).
     """
     sigma, level, _ = noise
     weight /= sigma
@@ -260,18 +276,19 @@ def _all_beyond(weight, first, mirror, noise, form):
 
 @njit(cache=True, error_model="numpy")
 def _envelope_beyond(first, form):
-    """Envelope ``first`` bins away; half the sum of its squares in all bins from there on."""
+    """Return the envelope of |G| at ``first`` bins, and half its squares' sum from there on."""
     place = envelope_from(first - 1.5, form)
     return form[1, place], form[1, place] * form[1, place] + form[2, place]
 
 
 @njit(cache=True, error_model="numpy")
 def _at_most(count, noise, exempt, room):
-    """Bound on the probability that any bin of a run adds to leakage; infinite where it is large.
+    """Bound the leakage of a run's bins from their magnitudes; inf where a bin is too strong.
 
-    With x and y as of :func:`_all_beyond`, Q_1 is convex in x up to y - 2, as I_2(z) / I_1(z) is at
-    least z / (2 + sqrt(z^2 + 4)); there each bin adds no more than in proportion to the largest of
-    them, and that at most e^{-(b - a)^2 / 2}, of the e^-2 and more below 1 that noise alone leaves.
+    With x and y as in :func:`_all_beyond`, Q_1 is convex in x up to y - 2, because I_2(z) / I_1(z)
+    >= z / (2 + sqrt(z^2 + 4)). Each bin then adds at most in proportion to the strongest one, and
+    this at most e^{-(b - a)^2 / 2}; the factor 1.2 covers that noise alone stays below the
+    threshold with a probability of at least 1 - e^-2.
     """
     sigma, level, _ = noise
     most, squares = 0.0, 0.0
@@ -289,7 +306,7 @@ def _at_most(count, noise, exempt, room):
 
 @njit(cache=True, error_model="numpy")
 def _chances(count, noise, room, exempt, series):
-    """Compute the added crossing probabilities of a run of bins, into row CHANCE."""
+    """Store in row CHANCE the crossing probability that signal adds in each bin of a run."""
     sigma, level = noise[0], noise[1]
     scale = 0.5 / (sigma * sigma)
     for i in range(count):
@@ -299,7 +316,11 @@ def _chances(count, noise, room, exempt, series):
 
 @njit(cache=True, error_model="numpy")
 def _least_reach(weight, spread, noise, crossing, form, sizes):
-    """Bins beyond the near ones that the run has to take in: see the module."""
+    """Return how many bins beyond the near ones the run has to include before the integral begins.
+
+    Heuristic: far enough for the threshold, for a smooth rate, and for 3/4 of the lines' spread;
+    rounded up to a multiple of 8. :func:`inspect` doubles it until :func:`_leakage` is accurate.
+    """
     sigma, level, _ = noise
     clearance = sizes[6]
     beside = form[1, clearance] * weight / sigma
@@ -310,9 +331,9 @@ def _least_reach(weight, spread, noise, crossing, form, sizes):
 
 @njit(cache=True, error_model="numpy")
 def _leakage(run, lines, place, noise, form, sizes, tangent, room, exempt, series, loudest):
-    """Leakage of the run and of all beyond it; False where the run is too short to tell.
+    """Return the leakage of the run and of all bins beyond it, and whether the run is long enough.
 
-    If the echo fades (``loudest`` above 1) the mean over its speckle.
+    If ``loudest`` is above 1 the echo fades, and the leakage is the mean over its speckle.
     """
     low, count, peak, origin = run
     sigma, level, _ = noise
@@ -363,7 +384,7 @@ def _leakage(run, lines, place, noise, form, sizes, tangent, room, exempt, serie
 
 @njit(cache=True, error_model="numpy")
 def _faded(run, points, noise, below, above, sizes, room, exempt, series):
-    """Mean over developed speckle of the leakage of a run and of the points beyond it."""
+    """Return the mean leakage, over developed speckle, of a run and of the integral beyond it."""
     count = run[1]
     sigma, level, _ = noise
     log_rates = np.empty(SPECKLE_POWERS.size)
@@ -389,9 +410,10 @@ def _faded(run, points, noise, below, above, sizes, room, exempt, series):
 
 @njit(cache=True, error_model="numpy")
 def _far_values(points, centre, origin, lines, digits, form, sizes, tangent, room):
-    """|X|^2 at points whose tangents from ``centre`` are in row POINT, into row HALF_SQUARE.
+    """Store |X|^2 at far points in row HALF_SQUARE, with a relative error of e^-digits.
 
-    To e^-digits, but for lines so few that each stands for itself.
+    The points are given by tan(pi q / N), with their distance q from ``centre``, in row POINT.
+    Lines that are too few for equivalent sources are summed exactly.
     """
     n, lowest, highest = lines
     power, way = sizes[4] != 0, -1 if is_turned(origin, lowest, highest, sizes[7]) else 1
@@ -421,7 +443,11 @@ def _far_values(points, centre, origin, lines, digits, form, sizes, tangent, roo
 
 @njit(cache=True, error_model="numpy")
 def _near_end(side, count, chance, exempt):
-    """Correction of an integral at its near end, its last term's size, -d ln f / dq; if there."""
+    """Compute the Euler-Maclaurin correction at the near end of one side's integral.
+
+    Returns the correction, the size of its last term, the steepness -d ln f / dq [1/bin], and False
+    if an exempt bin is too near for it.
+    """
     step = 1 if side > 0 else -1
     i = count - APRON - 1 if side > 0 else APRON  # the last bin before the integral
     for k in range(-2, 4):
@@ -441,11 +467,12 @@ def _near_end(side, count, chance, exempt):
 
 @njit(cache=True, error_model="numpy")
 def _points_beyond(side, last, centre, steepness, sizes, tangent, room, points):
-    """Add cotangents and weights of one side's integral to rows POINT and WEIGHT.
+    """Append the Gauss points of one side's integral to rows POINT and WEIGHT; return their number.
 
-    The integral begins half a bin beyond ``last``, counted from ``centre``. With images the
-    spectrum is even about DC and Nyquist; without, it goes on, and the integral out to half a bin
-    beyond is corrected by the first difference there.
+    Rows hold cotangents of pi q / N and weights. The integral begins half a bin beyond ``last``, q
+    counted from ``centre``. With images the spectrum is even about DC and Nyquist. Without them it
+    goes on, and the integral, out to half a bin beyond the last bin, is corrected by the first
+    difference.
     """
     fft_size, half_size = sizes[0], sizes[0] // 2
     far_bin = 0 if side < 0 else half_size
@@ -484,7 +511,7 @@ def _points_beyond(side, last, centre, steepness, sizes, tangent, room, points):
 
 @njit(cache=True, error_model="numpy")
 def _cotangent(whole, half, fft_size, tangent):
-    """cot(pi q / N) for q = whole, or half a bin more, 0 < q <= N/2."""
+    """Return cot(pi q / N) at q = ``whole`` bins, or half a bin farther, 0 < q <= N/2."""
     t = tangent[whole]
     if not half:
         return 1.0 / t
@@ -495,7 +522,7 @@ def _cotangent(whole, half, fft_size, tangent):
 
 @njit(cache=True, error_model="numpy")
 def _order(steepness, share):
-    """Gauss points of a stretch that begins at a share of the near end's v."""
+    """Return the number of Gauss points of a panel that begins at ``share`` times the near v."""
     order = 4 + int(0.6 * steepness * share)
     if share > 0.9:
         order += 5

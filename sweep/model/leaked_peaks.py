@@ -41,73 +41,73 @@ from sweep.model.marcum import excess_crossing, marcum_q1_pair
 from sweep.model.preparation import Shots
 
 RATES = 1024
-"""Amplitudes at which the rates of a point are known."""
+"""Number of amplitudes at which a point's rates are tabulated."""
 
 SURE = 12.0
-"""Amplitude above the threshold [sigma] from where on a bin surely crosses it."""
+"""Amplitude above the threshold [sigma] from which a bin is certain to cross."""
 
 FAINTEST = 1e-2
-"""Amplitude [sigma] at which tables begin: below, rates go by its square."""
+"""Lowest tabulated amplitude [sigma]; below it rates go as the amplitude squared."""
 
 SELDOM = 1e-9
-"""Probability of leakage in a segment below which none is drawn."""
+"""Probability of leakage in a segment below which no leaked peaks are drawn."""
 
 LINE = 1 << 24
-"""Numbers of the random numbers of the line, from which they count apart from the echoes'."""
+"""First random number of the leaked light's line; lower ones belong to the echoes."""
 
 EDGES = 1 << 25
 """Numbers of the random numbers of bins of an echo next to leaked signal, likewise."""
 
 POINTS_WITH_LINE = 4
-"""Points whose bins of a line of leaked light are held at a time: a hundred million numbers."""
+"""Points processed at a time if leaked light has a line, which bounds memory to 1e8 numbers."""
 
 HALVINGS = 40
-"""Steps by which the magnitude of a raised peak is found, to 1e-11 of it."""
+"""Bisection steps for the magnitude of a raised peak; relative error 1e-11."""
 
 _PANELS = np.array([0.0, 0.125, 0.25, 0.5, 1.0, 2.0, 3.0, 4.5, 6.5, 9.0, 12.0, 16.0, 21.0, 28.0])
 _NODE, _WEIGHT = np.polynomial.legendre.leggauss(8)
 SPECKLE_POWER = (_PANELS[:-1, None] + np.diff(_PANELS)[:, None] * 0.5 * (_NODE + 1)).ravel()
-"""Powers of speckle, of mean 1, over which probabilities are averaged."""
+"""Nodes in speckle power (mean 1) of the average over speckle; weights are SPECKLE_WEIGHT."""
 SPECKLE_WEIGHT = (np.diff(_PANELS)[:, None] * 0.5 * _WEIGHT).ravel() * np.exp(-SPECKLE_POWER)
 
 CLASS_WIDTH = 0.02
-"""Width of the classes of amplitudes, in logarithms, that are averaged over speckle together."""
+"""Width in ln(amplitude) of the histogram bins whose members are averaged over speckle together."""
 
 
 class LeakedPeaks(NamedTuple):
-    """Bins of some points in which signal may raise false peaks, by point and segment (m, 3)."""
+    """Bins in which leaked signal may raise false peaks, by point and segment (m, 3)."""
 
     stretch: np.ndarray
-    """(m, 3, 2) int64: first of a segment's bins of leaked echo in the next three, and the end."""
+    """(m, 3, 2) int64: begin and end of each segment in ``bin``, ``amplitude`` and ``echo``."""
     bin: np.ndarray
-    """int64, numbered as :attr:`sweep.model.groups.Groups.bin`."""
+    """int64: bins with leaked echo, numbered as :attr:`sweep.model.groups.Groups.bin`."""
     amplitude: np.ndarray
-    """ln(|X| / sigma)"""
+    """ln(|X| / sigma) in these bins."""
     echo: np.ndarray
-    """int64: the group with which the bin fades."""
+    """int64: index of the group (echo) with which each bin fades."""
     edge: np.ndarray
     """|X| / sigma of the bin next to it that is exempt from false alarms, 0 for none."""
     total: np.ndarray
-    """(m, 3): sum of the rates of these bins without fading."""
+    """(m, 3): sum of the rates of these bins at mean speckle power."""
     line_stretch: np.ndarray
-    """(m, 3, 2) int64: likewise of the bins of a line of leaked light."""
+    """(m, 3, 2) int64: begin and end of each segment in ``line_bin`` and ``line_amplitude``."""
     line_bin: np.ndarray
     line_amplitude: np.ndarray
-    """(PHASES, bins)"""
+    """(PHASES, bins): ln(|X| / sigma) in these bins at each phase of the leaked light's line."""
     line_total: np.ndarray
-    """(m, 3): largest sum of the rates of these bins, at any of the phases."""
+    """(m, 3): largest over the phases of the sum of the rates of these bins."""
     barred_stretch: np.ndarray
-    """(m, 3, 2) int64: likewise of the bins in which noise alone raises no peak."""
+    """(m, 3, 2) int64: begin and end of each segment in ``barred_bin``."""
     barred_bin: np.ndarray
-    """int64"""
+    """int64: bins in which noise alone raises no peak."""
     rates: np.ndarray
-    """(m, RATES): logarithms of the rates, at equal steps of the amplitude's logarithm."""
+    """(m, RATES): ln(rate) at evenly spaced ln(amplitude)."""
     scale: np.ndarray
-    """(m, 2): logarithm of the first of these amplitudes, and the step."""
+    """(m, 2): first of these ln(amplitude), and their step."""
 
     @classmethod
     def nothing(cls, points: int) -> "LeakedPeaks":
-        """No leaked signal."""
+        """Return no bins at all, for ``points`` points."""
         none, bins, sums = np.zeros((points, 3, 2), np.int64), np.empty(0, np.int64), (points, 3)
         return cls(
             none, bins, np.empty(0), bins, np.empty(0), np.zeros(sums), none, bins,
@@ -122,25 +122,22 @@ class LeakedPeaks(NamedTuple):
         return self._replace(**{name: getattr(self, name)[points] for name in by_point})
 
     def mean_leakage(self) -> np.ndarray:
-        """Probability of leakage, the mean over developed speckle and over the line's phase.
-
-        Returns
-        -------
-        numpy.ndarray
-            (m, 3), by point and segment.
-        """
+        """Return the mean probability of leakage over speckle and the line's phase, (m, 3)."""
         found = np.empty(self.total.shape)
         _average(self, SPECKLE_POWER, SPECKLE_WEIGHT, found)
         return found
 
 
 def leaking_points(shots: Shots, found: Groups) -> np.ndarray:
-    """Points whose groups leak so much that false peaks of leaked signal are drawn, int64."""
+    """Return the indices of points whose probability of leakage exceeds SELDOM in any segment."""
     return np.flatnonzero((found.leakage > SELDOM).any(axis=1))
 
 
 def echo_of_bins(shots: Shots, found: Groups, part: np.ndarray, seen: Seen) -> np.ndarray:
-    """Group with which each bin of leaked signal fades: the one of the nearest strongest bin."""
+    """Return the group with which each leaking bin fades, that of the nearest strongest bin.
+
+    ``part`` are the points of ``seen``; distances of a complex record are around the circle.
+    """
     bins, point, segment = _leaked_bins(seen)
     groups = found.bin[part[point], segment]
     apart = np.abs(bins[:, None] - groups)
@@ -150,7 +147,10 @@ def echo_of_bins(shots: Shots, found: Groups, part: np.ndarray, seen: Seen) -> n
 
 
 def peaks_in_noise(shots: Shots, found: Groups, part: np.ndarray, seen: Seen) -> LeakedPeaks:
-    """Bins whose noise is drawn together with their signal: noise alone raises no peak there."""
+    """List bins whose noise is drawn with their signal; noise alone raises no peak there.
+
+    No bin of the result raises leaked peaks; ``echo`` holds the group of each listed bin.
+    """
     return LeakedPeaks.nothing(part.size)._replace(
         echo=echo_of_bins(shots, found, part, seen),
         barred_stretch=seen.stretch,
@@ -161,7 +161,7 @@ def peaks_in_noise(shots: Shots, found: Groups, part: np.ndarray, seen: Seen) ->
 def leaked_peaks(
     shots: Shots, found: Groups, points: np.ndarray
 ) -> Iterator[tuple[np.ndarray, LeakedPeaks]]:
-    """Yield some points at a time of ``points``, and the bins of their leaked signal."""
+    """Yield batches of ``points``: their indices, and the bins of their leaked signal."""
     echoes_alone = replace(shots, leak_amplitude=None)
     step = max(points.size, 1) if shots.leak_amplitude is None else POINTS_WITH_LINE
     for first in range(0, points.size, step):
@@ -185,7 +185,7 @@ def leaked_peaks(
 
 
 def _leaked_bins(seen: Seen) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the number of each bin of leaked signal, its point, and its segment."""
+    """Return bin number, point (index into the batch) and segment of each bin of leaked signal."""
     number = np.diff(seen.stretch.reshape(-1, 2)).ravel()
     run = np.repeat(np.arange(number.size), number)
     return seen.low.ravel()[run] + seen.aside, run // 3, run % 3
@@ -194,9 +194,10 @@ def _leaked_bins(seen: Seen) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _with_line(
     shots: Shots, part: np.ndarray, seen: Seen, echo: np.ndarray
 ) -> tuple[Seen, np.ndarray, LeakedPeaks]:
-    """Return spectra without the bins that a line of leaked light masks, and the line's peaks.
+    """Remove bins that a line of leaked light masks, and return the bins that this line raises.
 
-    ``echo`` is :func:`echo_of_bins`, and is returned for the bins that are left.
+    Returns the reduced spectra, ``echo`` (as of :func:`echo_of_bins`) of the bins that are left,
+    and :class:`LeakedPeaks` with the fields ``line_*`` and ``barred_*`` alone filled in.
     """
     kept = np.ones(seen.aside.size, bool)
     stretches = np.zeros((3, part.size, 3, 2), np.int64)  # of leaked, raised and masked bins
@@ -264,7 +265,10 @@ def _rates_by_law(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill_rates(level, floor, rates, scale):
-    """Fill in the rates of one record at the amplitudes of each point."""
+    """Tabulate ln(rate) for single looks, into ``rates`` (m, RATES) and ``scale`` (m, 2).
+
+    ``level`` and ``floor`` (m,): threshold and lowest amplitude [sigma].
+    """
     for j in range(level.size):
         b = level[j]
         scale[j, 0] = math.log(min(floor[j], b + 1.0))
@@ -281,7 +285,10 @@ def _fill_rates(level, floor, rates, scale):
 
 @njit(cache=True, error_model="numpy")
 def _rate(amplitude, rates, scale):
-    """Rate of a bin by the logarithm of its amplitude [sigma]."""
+    """Return the rate -ln(1 - c) of a bin.
+
+    ``amplitude`` is ln(|X| / sigma); ``rates`` are logarithms, at the amplitudes of ``scale``.
+    """
     place = (amplitude - scale[0]) / scale[1]
     if place <= 0.0:
         return math.exp(rates[0] + 2.0 * (amplitude - scale[0]))
@@ -293,7 +300,10 @@ def _rate(amplitude, rates, scale):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _sum_rates(amplitude, leaks):
-    """Take the logarithms of amplitudes [sigma], and sum up rates, into the fields of leaks."""
+    """Store ln(``amplitude``) and the sums of rates in the fields of ``leaks``, in place.
+
+    ``amplitude`` [sigma] is that of all bins of leaked echo, in the order of ``leaks.bin``.
+    """
     for k in range(amplitude.size):
         leaks.amplitude[k] = math.log(amplitude[k])
     for p in range(leaks.line_amplitude.shape[0]):
@@ -314,7 +324,10 @@ def _sum_rates(amplitude, leaks):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _average(leaks, powers, weights, out):
-    """Average leakage over speckle, of each echo its own, and over phases of the line."""
+    """Average the probability of leakage over speckle and the line's phase, into ``out`` (m, 3).
+
+    Each echo fades independently. Bins are binned by ln(amplitude), CLASS_WIDTH wide.
+    """
     classes = int(40.0 / CLASS_WIDTH)
     number, mean = np.zeros(classes), np.zeros(classes)
     listed = np.empty(classes, np.int64)
@@ -355,9 +368,9 @@ def _average(leaks, powers, weights, out):
 
 @njit(cache=True, error_model="numpy")
 def list_peak(peak, bins, ratios, number):
-    """Put a peak (bin, |X| / sigma) into a list of the strongest; return how many it holds.
+    """Insert a peak (bin, |X| / sigma) into a list sorted by strength; return its new length.
 
-    A bin of -1 is none. The list has room for as many peaks as ``bins``.
+    A bin of -1 is ignored. If the list is full, its weakest peak is dropped.
     """
     bin_, ratio = peak
     if bin_ < 0:
@@ -376,12 +389,30 @@ def list_peak(peak, bins, ratios, number):
 
 @njit(cache=True, error_model="numpy")
 def draw_leaked(address, at, leaks, fading, level, looks, tables, bins, ratios):
-    """List the strongest peaks that leaked signal raises in a segment; return their number.
+    """Draw the leaked peaks of a segment, and insert them into the list of the strongest peaks.
 
-    ``address``: key of the point, number of the draw; ``at``: point and segment; ``fading`` (most,
-    3): factors on the echoes' magnitudes, by segment; ``level``: threshold [sigma]; ``looks``:
-    records whose powers are averaged. Results are bins, and |X| / sigma; of averaged powers those
-    of one record as sure as these.
+    Parameters
+    ----------
+    address
+        Key of the point (two uint64) and number of the draw.
+    at
+        Point and segment.
+    leaks
+        :class:`LeakedPeaks` of the batch.
+    fading
+        (groups, 3): factors on the echoes' magnitudes by speckle.
+    level
+        Threshold [sigma].
+    looks
+        Number of looks whose powers are averaged.
+    bins, ratios
+        Results: bin and |X| / sigma of the peaks, strongest first. For averaged looks |X| is that
+        of a single look of the same significance.
+
+    Returns
+    -------
+    int
+        Number of peaks in the list.
     """
     (a, b, draw), (i, s) = address, at
     number = _list_raised(
@@ -406,11 +437,14 @@ def _list_raised(
     address, s, first, stretch, bins, amplitude, echo, edge, fading, total, rates, scale, law,
     listed, ratios, number,
 ):  # fmt: skip
-    """Go from one bin that is raised to the next; adjacent ones make one peak, the largest.
+    """Draw which bins of a range are raised, and insert their peaks; adjacent bins make one peak.
 
-    They are of the echo if they join on to a bin of it that crosses. Random numbers are those from
-    ``first`` on of the segment's stream; ``total`` is the sum of the rates of all bins without
-    fading; ``law`` the threshold, the number of looks, and the correlation of neighbours' noise.
+    Peaks that join on to a bin of the echo that crosses are the echo's.
+
+    Bins are skipped by exponential numbers, as the module says. ``first``: first random number of
+    the segment's stream; ``total``: sum of the rates of all bins at mean speckle power; ``law``:
+    threshold [sigma], number of looks and correlation of neighbours' noise; ``listed``, ``ratios``,
+    ``number``: the list, as of :func:`list_peak`. Returns its new length.
     """
     (a, b, draw), stream, (level, looks, near) = address, philox.STREAM_LEAKAGE[s], law
     rest = math.sqrt(1.0 - near * near)
@@ -448,13 +482,13 @@ def _list_raised(
 
 @njit(cache=True, error_model="numpy")
 def _added(signal, level):
-    """Probability that a bin's signal raises it above a level where noise alone does not."""
+    """Return c(z), the probability that signal lifts a bin to a level that noise alone misses."""
     return excess_crossing(signal, level) / -math.expm1(-0.5 * level * level)
 
 
 @njit(cache=True, error_model="numpy")
 def _exceeded(signal, level, chance):
-    """Magnitude [sigma], from a level on, that a bin exceeds by its signal with a probability."""
+    """Return the magnitude z >= ``level`` [sigma] at which c(z) is ``chance``, by bisection."""
     low, high = level, max(signal, level) + SURE
     for _ in range(HALVINGS):
         middle = 0.5 * (low + high)

@@ -43,42 +43,45 @@ from sweep.kernels import njit
 from sweep.model.marcum import marcum_q1_pair
 
 MATRIX_LOOKS_MAX = 64
-"""Looks whose correlation matrix is taken as it is."""
+"""Number of looks up to which the full correlation matrix is used."""
 
 GAMMA_SHAPE_MIN = 32.0
-"""Effective number of looks from which the mean power of more than MATRIX_LOOKS_MAX is a gamma
-variable."""
+"""Effective number of looks from which, with more than MATRIX_LOOKS_MAX looks, the mean power is
+treated as a gamma variable."""
 
 NODES = 2048
-"""Speckles of all looks over which votes are averaged."""
+"""Number of lattice points (joint speckles of all looks) over which votes are averaged."""
 
 _CONTOUR_NODES = 40
 _CONTOUR_END = 4.6
 _HALVINGS = 60
 _Q_STEPS = 512
 _SPECKLE_MAX = 5.0
-"""Largest magnitude of speckle over its root mean square."""
+"""Largest tabulated speckle magnitude, in units of its root mean square."""
 
 
 class LookSpeckle(NamedTuple):
-    """Correlation of the speckle of N looks, by segment and point."""
+    """Correlation of the speckle between the N looks of a shot, by segment and point."""
 
     strength: np.ndarray
-    """(3, n, k): eigenvalues c_j of the matrix of the looks' speckle."""
+    """(3, n, k): eigenvalues c_j of the looks' correlation matrix."""
     multiplicity: np.ndarray
-    """(3, n, k): m_j, 0 where there is no such eigenvalue; the sum of c_j m_j is N."""
+    """(3, n, k): multiplicities m_j, 0 for unused entries; sum_j c_j m_j = N."""
     shape: np.ndarray
-    """(3, n): M, the effective number of looks whose speckle is independent."""
+    """(3, n): effective number M of looks of independent speckle, 1 .. N."""
     between: np.ndarray
-    """(3, n): root of r, of up and Doppler, up and down, Doppler and down segment."""
+    """(3, n): sqrt(r) for the pairs (up, Doppler), (up, down), (Doppler, down)."""
     by_lag: np.ndarray
-    """(3, n, N) complex: mu of looks that are 0, 1 .. N - 1 looks apart."""
+    """(3, n, N) complex: correlation mu of two looks by their distance 0 .. N - 1."""
     power: np.ndarray
-    """(3, n, N): power of the looks in the strongest bin, of mean 1."""
+    """(3, n, N): relative power of each look in the strongest bin; mean 1."""
 
     @classmethod
     def of(cls, by_lag: np.ndarray, power: np.ndarray, between: np.ndarray) -> "LookSpeckle":
-        """Take the eigenvalues of the looks' matrices."""
+        """Compute eigenvalues and effective number of looks from correlations and powers.
+
+        ``by_lag``, ``power`` and ``between`` are as of the fields.
+        """
         number = by_lag.shape[2]
         strength = np.maximum(np.linalg.eigvalsh(look_matrices(by_lag, power)), 0.0)
         strength *= number / strength.sum(axis=-1, keepdims=True)
@@ -96,11 +99,15 @@ class LookSpeckle(NamedTuple):
         return cls(strength, multiplicity, np.clip(shape, 1.0, number), between, by_lag, power)
 
     def at(self, points: np.ndarray | slice) -> "LookSpeckle":
-        """Take some points, by their numbers."""
+        """Select points by their indices."""
         return LookSpeckle(*(column[:, points] for column in self))
 
     def root(self, segment: int, point: int) -> np.ndarray:
-        """Matrix (N, N) that makes the looks' speckles of as many independent ones."""
+        """Return a matrix A (N, N) with A A^H = the covariance of the looks' speckle.
+
+        A z are the speckles of the N looks, each times the root of its power, if the z are
+        independent, of mean power 1.
+        """
         by_lag = self.by_lag[segment, point]
         matrix = look_matrices(by_lag, self.power[segment, point], by_lag.size)
         value, vector = np.linalg.eigh(matrix)
@@ -110,10 +117,10 @@ class LookSpeckle(NamedTuple):
 def look_matrices(
     by_lag: np.ndarray, power: np.ndarray, most: int = MATRIX_LOOKS_MAX
 ) -> np.ndarray:
-    """Correlation matrices of the looks' speckle times the roots of their powers, (..., k, k).
+    """Return the covariance matrices sqrt(x_k x_l) mu(l - k) of the looks' speckle, (..., k, k).
 
-    Of more than ``most`` looks those of as many that are farther apart, of the same mean square
-    distance.
+    More than ``most`` looks are represented by ``most`` looks farther apart, with the same mean
+    square time from the middle.
     """
     number = by_lag.shape[-1]
     few = min(number, most)
@@ -135,10 +142,18 @@ def look_matrices(
 def mean_power_tails(
     speckle: LookSpeckle, number: int, snr: np.ndarray, threshold: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Probabilities (..., 3, n) that the sum of the looks' powers exceeds a threshold, and not.
+    """Return P(sum of the looks' powers > threshold), equation (1), and its complement.
 
-    By equation (1). ``snr`` is the mean of a look, ``threshold`` is over the noise's mean power in
-    one look.
+    Parameters
+    ----------
+    speckle
+        Correlation of the looks' speckle.
+    number
+        Number of looks N.
+    snr
+        (..., 3, n): mean SNR of one look.
+    threshold
+        (..., 3, n): threshold on the sum, over the mean noise power of one look.
     """
     snr, threshold = np.broadcast_arrays(snr, threshold)
     noise_alone = number - speckle.multiplicity.sum(axis=-1, keepdims=True)
@@ -184,9 +199,9 @@ def _saddle_point(
 
 @lru_cache(maxsize=8)
 def independent_speckles(number: int) -> np.ndarray:
-    """Speckles (NODES, number) complex of looks that are independent: a fixed lattice.
+    """Return a fixed lattice of independent speckles, (NODES, number) complex.
 
-    Their mean is 0 and their covariance the unit matrix.
+    Kronecker lattice of the roots of primes, standardised: mean 0, covariance the unit matrix.
     """
     primes = [2]
     while len(primes) < 2 * number:
@@ -204,7 +219,10 @@ def independent_speckles(number: int) -> np.ndarray:
 
 @njit(cache=True, error_model="numpy")
 def correlated_magnitudes(speckle, root):
-    """Magnitudes (m, N) of the looks' speckle, of independent ones (m, k) by a matrix (N, k)."""
+    """Return magnitudes |A z| of correlated speckles, (m, N).
+
+    ``speckle`` (m, k): independent speckles z; ``root`` (N, k): A, as of :meth:`LookSpeckle.root`.
+    """
     magnitude = np.empty((speckle.shape[0], root.shape[0]))
     for i in range(speckle.shape[0]):
         for k in range(root.shape[0]):
@@ -219,9 +237,21 @@ def correlated_magnitudes(speckle, root):
 
 @njit(cache=True, error_model="numpy")
 def votes_given_speckle(signal, level, votes, magnitude):
-    """Probability (m,) that enough looks cross, given the magnitudes (m, N) of their speckle.
+    """Return the probability that at least ``votes`` looks cross, given their speckle, (m,).
 
-    ``signal`` and ``level``: root mean square signal and threshold over the noise per quadrature.
+    Parameters
+    ----------
+    signal, level
+        Root mean square signal and threshold of one look, over the noise per quadrature.
+    votes
+        Number of looks that have to cross.
+    magnitude
+        (m, N): magnitudes of the looks' speckle, of mean square 1.
+
+    Notes
+    -----
+    Looks cross independently, with Q_1(signal |s_k|, level); the number of crossings has a Poisson
+    binomial distribution, summed up look by look.
     """
     crossing = np.empty(_Q_STEPS + 1)
     step = _SPECKLE_MAX / _Q_STEPS

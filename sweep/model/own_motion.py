@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from sweep.model.eyepoints import Eyepoints
 
 LEAST_DESCENT = 0.05
-"""Sine of the angle below the horizon from which on a beam is taken to meet level ground."""
+"""Smallest sine of the depression angle at which a beam is taken to meet level ground."""
 
 
 class MotionPriors(NamedTuple):
@@ -63,38 +63,43 @@ class MotionPriors(NamedTuple):
 
 
 class OwnMotion(NamedTuple):
-    """Motion along n shots' beams as the instrument knows it; arrays (n,) unless said otherwise."""
+    """Motion along n beams as the instrument knows it; arrays are (n,) unless noted."""
 
     closing: np.ndarray
     """Closing speed of ground at rest [m/s]."""
     acceleration: np.ndarray
-    """Rate at which that grows [m/s^2]."""
+    """Rate of change of the closing speed [m/s^2]."""
     slip: np.ndarray
-    """Closing speed less the speed at which the range of level ground falls, at range 0 [m/s]."""
+    """Slip at range 0: closing speed less the speed at which the range to level ground falls
+    [m/s]."""
     slip_by_range: np.ndarray
-    """Growth of that difference with the range [1/s]."""
+    """Derivative of the slip with respect to the range [1/s]."""
     slip_by_slope: np.ndarray
-    """(n, 3): growth of that difference with the gradient of the surface, at range 0 [m/s]."""
+    """(n, 3): derivative of the slip with respect to the surface's gradient, at range 0 [m/s]."""
     slip_by_slope_and_range: np.ndarray
-    """(n, 3): growth of that with the range [1/s]."""
+    """(n, 3): derivative of ``slip_by_slope`` with respect to the range [1/s]."""
     slip_by_target: np.ndarray
-    """Standard deviation of that difference over that of the target's velocity."""
+    """Standard deviation of the slip per standard deviation of a component of the target's
+    velocity."""
     turn_rate: np.ndarray
     """Rate at which the beam turns [rad/s]."""
     priors: MotionPriors
     """Standard deviations of what is not known."""
 
     def slip_at(self, distance: np.ndarray) -> np.ndarray:
-        """Return the closing speed less the speed at which ranges (n, ...) [m] fall [m/s]."""
+        """Return the slip at ranges (n, ...) [m]: closing speed less range decrease [m/s]."""
         slip, by_range = (_per_shot(v, distance) for v in (self.slip, self.slip_by_range))
         return np.asarray(slip + by_range * distance)
 
     def approach_at(self, distance: np.ndarray) -> np.ndarray:
-        """Return the speed at which ranges (n, ...) [m] fall, as far as is known [m/s]."""
+        """Return the known rate of decrease of ranges (n, ...) [m], closing less slip [m/s]."""
         return np.asarray(_per_shot(self.closing, distance) - self.slip_at(distance))
 
     def slip_error(self, distance: np.ndarray) -> np.ndarray:
-        """Return the standard deviation of that difference at ranges (n, ...) [m/s]."""
+        """Return the standard deviation of the slip at ranges (n, ...) [m] by the priors [m/s].
+
+        sqrt(slope^2 |d slip / d gradient|^2 + speed^2 (slip_by_target^2 + slope^2)).
+        """
         slope, speed, _ = self.priors
         near, far = self.slip_by_slope, self.slip_by_slope_and_range
         constant, linear, square = (
@@ -111,7 +116,7 @@ class OwnMotion(NamedTuple):
 
 
 def own_motion(eyepoints: Eyepoints, priors: MotionPriors = MotionPriors()) -> OwnMotion:  # noqa: B008  # a tuple
-    """Motion along the commanded beams of n shots, over level ground."""
+    """Compute the known motion along the commanded beams of n shots over level ground."""
     return motion_of_beams(
         eyepoints.direction, eyepoints.velocity, eyepoints.turning,
         eyepoints.platform_acceleration, priors,
@@ -125,8 +130,21 @@ def motion_of_beams(
     acceleration: np.ndarray,
     priors: MotionPriors,
 ) -> OwnMotion:
-    """Motion along n beams (n, 3) that turn by `turning` [1/s], of a moving instrument.
+    """Compute the known motion along n beams of a moving instrument over level ground.
 
+    Parameters
+    ----------
+    direction
+        (n, 3): unit vectors d of the beams.
+    velocity, acceleration
+        (n, 3): of the instrument, V [m/s] and V' [m/s^2].
+    turning
+        (n, 3): rate of change d' of the directions [1/s].
+    priors
+        Standard deviations of what is not known.
+
+    Notes
+    -----
     With the vertical z, u - V.d = V.z / d.z - V.d + R d'.z / d.z.
     """
     grows = _dot(acceleration, direction) + _dot(velocity, turning)
@@ -154,7 +172,7 @@ def motion_of_beams(
 
 
 def _per_shot(values: np.ndarray, distance: np.ndarray) -> np.ndarray:
-    """Values (n,) in the shape of ranges (n, ...)."""
+    """Reshape values (n,) so that they broadcast with ranges (n, ...)."""
     return values.reshape(-1, *[1] * (np.ndim(distance) - 1))
 
 

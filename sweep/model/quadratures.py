@@ -36,23 +36,25 @@ from sweep.model.speckle_correlation import window_transform
 from sweep.model.window import Window, samples
 
 SHARE_MIN = 0.05
-"""Size of a line's q below which its bins are taken to be circular; pd is off by less than 2e-4."""
+"""Pseudo-variance ratio |q| below which bins are treated as circular; pd changes by less than
+2e-4."""
 
 
 class SignalQuadratures(NamedTuple):
-    """Pseudo-variance over mean power of the signal in bins near DC and Nyquist."""
+    """Pseudo-variance ratio q of echoes near DC and Nyquist, which overlap their images there."""
 
     row: np.ndarray
-    """(segments, n) int64: row of ``share`` of each point; 0 where the echo lies elsewhere."""
+    """(segments, n) int64: row of ``share`` and ``factors`` of each point; row 0, in which q is 0,
+    for echoes far from DC and Nyquist."""
     share: np.ndarray
-    """(rows, bins): by the bin, counted from DC or Nyquist, that which is nearer."""
+    """(rows, bins): q by bin, counted from the nearer of DC and Nyquist."""
     factors: np.ndarray
-    """(rows, ANGLES): power of the echo at phases of its amplitude, over its mean: of the strongest
-    bin, or of that which is the strongest at each phase where any bin detects."""
+    """(rows, ANGLES): echo power at each phase node, 1 + q cos t_j times its mean in the strongest
+    bin. With ``any_bin`` detection, of the bin that is strongest at that phase."""
 
 
 def signal_quadratures(shots: Any) -> SignalQuadratures:
-    """Return the pseudo-variances of the signals of shots with real records and their images."""
+    """Compute the pseudo-variance ratios of echoes near DC and Nyquist of real records."""
     size, ratio = shots.fft_size, shots.fft_size / shots.window.length
     bins = number_of_bins(shots.window, size)
     row = np.zeros((len(shots.waveform), shots.size), np.int64)
@@ -89,22 +91,28 @@ def mean_over_angles(
     chances: tuple[np.ndarray, ...],
     law: Callable[..., tuple[np.ndarray, ...]],
 ) -> tuple[np.ndarray, ...]:
-    """Mean of a law of several segments' probabilities over the phases of their amplitudes.
+    """Average a joint law of detection over the phases of the segments' noncircular echoes.
 
     Parameters
     ----------
     factors
-        (segments, n, ANGLES): of :class:`SignalQuadratures`.
+        (segments, n, ANGLES): relative echo power at the phase nodes, as of
+        :class:`SignalQuadratures`.
     chances
-        (..., n) by segment: probabilities that each is detected.
+        For each segment (..., n): probability that it is detected.
     law
-        Function of such probabilities for circular numbers, of results (..., n).
+        Function of the segments' probabilities for circular numbers; returns arrays (..., n).
+
+    Returns
+    -------
+    tuple of numpy.ndarray
+        Mean over the phases of each result of ``law``, (..., n).
 
     Notes
     -----
-    At a phase t, uniform in 0 .. pi, a bin is detected as a circular number of f = 1 + q cos t
-    times the power is, with exp(-A / f); A is that of which the mean is the probability that is
-    given. Phases of different segments are independent.
+    At the phase t a bin is detected like a circular number of f = 1 + q cos t times the power, with
+    exp(-A / f); A is solved for, so that the mean over t is the given probability. Phases of
+    different segments are independent.
     """
     turned = [_at_angles(*of_segment) for of_segment in zip(chances, factors, strict=True)]
     total: list[np.ndarray] = []
@@ -116,7 +124,10 @@ def mean_over_angles(
 
 
 def _at_angles(chance: np.ndarray, factors: np.ndarray) -> np.ndarray:
-    """Probabilities of a detection at all phases, (ANGLES, ..., n), their mean ``chance``."""
+    """Return detection probabilities exp(-A / f) at all phase nodes, (ANGLES, ..., n).
+
+    A is found by bisection so that their mean over the nodes is ``chance`` (..., n).
+    """
     factors = factors.T.reshape(ANGLES, *[1] * (chance.ndim - 1), -1)
     there = np.isfinite(chance)
     wanted = np.where(there, chance, 0.5)
@@ -129,7 +140,7 @@ def _at_angles(chance: np.ndarray, factors: np.ndarray) -> np.ndarray:
 
 
 def lines_near_end(shots: Any) -> np.ndarray:
-    """Return true where lines lie so near to DC or Nyquist that images matter, (segments, n)."""
+    """Mark points whose lines overlap their own images at DC or Nyquist, bool (segments, n)."""
     reach = _reach(shots.window) * shots.fft_size / shots.window.length
     place = centre_lines(shots)
     edge = np.minimum(place, shots.fft_size / 2 - place)
@@ -138,14 +149,14 @@ def lines_near_end(shots: Any) -> np.ndarray:
 
 @lru_cache(maxsize=64)
 def number_of_bins(window: Window, fft_size: int) -> int:
-    """Bins from DC on in which the pseudo-variance of a signal is looked at."""
+    """Return the number of bins, counted from DC, whose pseudo-variance is tabulated."""
     beyond = (_reach(window) + main_lobe(window) + 1) * fft_size / window.length
     return min(math.ceil(beyond) + 1, fft_size // 4 + 1)
 
 
 @lru_cache(maxsize=64)
 def noise_quadratures(window: Window, fft_size: int) -> np.ndarray:
-    """Pseudo-variance of white noise over its mean power, W2(2k) / W2(0), (bins,), by bin k."""
+    """Return the pseudo-variance ratio W2(2k) / W2(0) of white noise by bin k, (bins,)."""
     squares = samples(window.name, window.length) ** 2
     time = (np.arange(window.length) - window.length / 2) / fft_size
     bins = np.arange(number_of_bins(window, fft_size))
@@ -154,7 +165,7 @@ def noise_quadratures(window: Window, fft_size: int) -> np.ndarray:
 
 
 def _reach(window: Window) -> float:
-    """Distance of a line from DC [bins of fs/L] beyond which its image is as good as away."""
+    """Return the distance of a line from DC [bins of fs/L] beyond which its image is negligible."""
     far = window.reach[np.argmax(window.envelope < SHARE_MIN / 2)]
     return 0.5 * min(float(far), 12.0)
 
@@ -162,21 +173,22 @@ def _reach(window: Window) -> float:
 def faded_looks(
     looks: Looks, signal: np.ndarray, level: np.ndarray, shares: np.ndarray, noise: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Probabilities that several records detect a bin in developed speckle, and that they miss it.
+    """Return pd and 1 - pd of a bin near DC or Nyquist for several looks in developed speckle.
 
     Parameters
     ----------
     signal, level
-        (m,): |X| and threshold over the noise per quadrature of one record.
+        (m,): root mean square |X| and threshold over the noise per quadrature of one look.
     shares, noise
-        (m,): pseudo-variance over power of the signal, and of the noise.
+        (m,): pseudo-variance ratio q of the signal, and of the noise.
 
     Notes
     -----
-    Speckle that all records have in common is averaged over, by its size and its phase t, which
-    makes a factor 1 + q cos t on the signal's power; noise is circular but for real bins. Records
-    of independent speckle are Hoyt variables. The mean of N powers is taken as a gamma variable of
-    the same mean and variance, of the order N / (1 + q^2): exact for q = 0 and 1.
+    If all looks share one speckle, the probability is averaged over its magnitude and over its
+    phase t, which multiplies the signal's power by 1 + q cos t. Noise is taken to be circular
+    except in real bins (``noise`` = 1). If looks have independent speckle each |X|^2 is a Hoyt
+    variable. The mean of N of them is approximated by a gamma variable of the same mean and
+    variance, of the order N / (1 + q^2): exact for q = 0 and 1.
     """
     from scipy import special
 

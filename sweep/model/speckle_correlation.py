@@ -37,47 +37,50 @@ import numpy as np
 from sweep.model.window import Window, samples
 
 SEGMENT_PAIRS = ((0, 1), (0, 2), (1, 2))
-"""Up and Doppler, up and down, Doppler and down segment."""
+"""Pairs (up, Doppler), (up, down), (Doppler, down); the order of all arrays by pair of segments."""
 
 NARROW = 0.01
-"""Spread of a footprint's lines [bins of fs/L] below which its scatterers share one bin."""
+"""Line shift per standard deviation of the beam [bins of fs/L] below which one bin holds all
+lines."""
 
 REACH = 6.0
-"""Bins of fs/L on either side of a line within which its transform is integrated over."""
+"""Half-width of the window transform in the integrals (3) [bins of fs/L]."""
 
 OVERSAMPLING = 64
-"""Steps of a window's tabulated transform for a bin of fs/L."""
+"""Samples of the tabulated window transform per bin of fs/L."""
 _NODES = 48
 _DEVIATIONS_MAX = 5.0
-"""Standard deviations of the beam on either side that are integrated over, at the most."""
+"""Largest half-width of the integration interval [standard deviations of the beam]."""
 _RESOLVED_PHASE_MAX = 40.0
-"""Phase [rad] at the end of the integral up to which the nodes resolve its turning."""
+"""Largest phase [rad] at the ends of the interval that the quadrature nodes resolve."""
 
 
 class SpeckleLines(NamedTuple):
-    """Footprints of n points by their standard deviations along the beam's two coordinates."""
+    """Gradients of line position and phase across the beams of n points, along two coordinates."""
 
     spread: np.ndarray
-    """(n, 3, 2): shift of a segment's line for a standard deviation [bins], signed as its beat."""
+    """(n, 3, 2): line shift per standard deviation of the beam [bins of fs/N], signed as the
+    beat."""
     turn: np.ndarray
-    """(n, 3, 2): phase that it gains against the up segment's [rad]."""
+    """(n, 3, 2): phase per standard deviation of the beam, relative to the up segment [rad]."""
 
     def of(self, part: np.ndarray) -> "SpeckleLines":
-        """Footprints of some points."""
+        """Select points by their indices."""
         return SpeckleLines(self.spread[part], self.turn[part])
 
 
 class LineSpread(NamedTuple):
-    """Spread of footprints' lines over two segments' bins, (n,) each."""
+    """Gradients across the beam of the lines of two segments, arrays (n,)."""
 
     distance: tuple[np.ndarray, np.ndarray]
-    """Of the strongest bin from the line on the beam's axis [bins of fs/L]."""
+    """Distance k - nu of each segment's strongest bin from the line of the axis [bins of fs/L]."""
     spread: tuple[np.ndarray, np.ndarray]
-    """Shift of a line for a standard deviation of the beam along y [bins of fs/L], signed."""
+    """Line shift of each segment per standard deviation of the beam along y [bins of fs/L],
+    signed."""
     turn: np.ndarray
-    """Phase difference between the segments for a standard deviation along y [rad]."""
+    """Phase difference t between the segments per standard deviation of the beam along y [rad]."""
     lean: np.ndarray
-    """Relative change of echo power for a standard deviation along y."""
+    """Relative change of the echo's power per standard deviation of the beam along y."""
 
     @property
     def widest(self) -> np.ndarray:
@@ -85,7 +88,7 @@ class LineSpread(NamedTuple):
         return np.maximum(np.abs(self.spread[0]), np.abs(self.spread[1]))
 
     def at(self, points: np.ndarray) -> "LineSpread":
-        """Spreads of some points by their numbers."""
+        """Select points by their indices."""
         (d, e), (a, b) = self.distance, self.spread
         return LineSpread(
             (d[points], e[points]), (a[points], b[points]), self.turn[points], self.lean[points]
@@ -93,10 +96,10 @@ class LineSpread(NamedTuple):
 
 
 def bin_correlation(window: Window, lines: LineSpread) -> np.ndarray:
-    """Correlation mu of the strongest bins of two segments by equation (3), (n,) complex.
+    """Return the correlation mu, equation (3), of the strongest bins of two segments, (n,) complex.
 
-    A phase that turns too fast for the integral gives the mu of a window whose transform is a
-    Gaussian of the same half width; it is all but 0 then.
+    Where the phase turns too fast for the quadrature, |mu| for a Gaussian window transform of the
+    same half-width is returned instead; it is close to 0 there.
     """
     end = np.minimum(_DEVIATIONS_MAX, REACH / np.maximum(lines.widest, 1e-300))
     node, weight = np.polynomial.legendre.leggauss(_NODES)
@@ -114,9 +117,10 @@ def bin_correlation(window: Window, lines: LineSpread) -> np.ndarray:
 
 
 def _gaussian_correlation(window: Window, lines: LineSpread) -> np.ndarray:
-    """Size of mu for the transform G(x) = exp(-x^2 / (4 v)), (n,); it is 1/2 where the window's is.
+    """Return |mu| for the Gaussian transform G(x) = exp(-x^2 / (4 v)), (n,).
 
-    All factors of the integrals (3) are Gaussian then.
+    v is such that G falls to 1/2 at the same distance as the window's transform. All factors of the
+    integrals (3) are then Gaussian.
     """
     v = _half_width(window) ** 2 / (4 * np.log(2))
     (a, b), (d, e) = lines.spread, lines.distance
@@ -130,9 +134,9 @@ def _gaussian_correlation(window: Window, lines: LineSpread) -> np.ndarray:
 
 
 def window_transform(window: Window, distance: np.ndarray) -> np.ndarray:
-    """Transform G of a window about its middle over its sum, at distances [bins of fs/L]; real.
+    """Return the normalised window transform G, G(0) = 1, about the record's middle; it is real.
 
-    It is taken as 0 beyond twice REACH.
+    ``distance`` is in bins of fs/L. G is set to 0 beyond 2 REACH.
 
     >>> from sweep.model.window import window
     >>> float(np.round(window_transform(window("hann", 1024), np.array([1.0]))[0], 3))
@@ -155,7 +159,7 @@ def middle_moved(window: Window) -> np.ndarray:
 
 
 def _half_width(window: Window) -> float:
-    """Distance at which a window's transform has fallen to 1/2, 2 REACH at most [bins of fs/L]."""
+    """Return the distance [bins of fs/L] at which G falls to 1/2; at most 2 REACH."""
     place, value = transform_table(window)
     fallen = value < 0.5  # nowhere if all samples but one are 0, as of hann's two
     last = int(np.argmax(fallen)) if fallen.any() else value.size - 1
@@ -164,7 +168,7 @@ def _half_width(window: Window) -> float:
 
 @lru_cache(maxsize=16)
 def transform_table(window: Window) -> tuple[np.ndarray, np.ndarray]:
-    """Distances [bins of fs/L] and the window's transform there."""
+    """Tabulate the window transform: distances 0 .. 2 REACH [bins of fs/L], and G there."""
     place = np.arange(int(2 * REACH * OVERSAMPLING) + 1) / OVERSAMPLING
     w = samples(window.name, window.length)
     time = (np.arange(window.length) - window.length / 2) / window.length

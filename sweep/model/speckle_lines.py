@@ -53,50 +53,52 @@ if TYPE_CHECKING:
     from sweep.model.preparation import Shots
 
 NODES = np.array([1, 3, 7, 15, 31, 63, 127, 255, 511])
-"""Lines along one coordinate."""
+"""Numbers of nodes of the Gaussian rules: lines along one coordinate of the beam."""
 
 _RESOLVED = np.array([0.02, 0.6, 1.9, 3.8, 9.4, 23.0, 52.0, 109.0, np.inf])
-"""Phase [rad for a standard deviation] up to which so many nodes integrate it to 1e-3."""
+"""Largest phase per standard deviation of the beam [rad] that each rule of NODES integrates to
+1e-3."""
 
 _LEAST_WEIGHT = 1e-6
-"""Share of the power below which a line is left out."""
+"""Power fraction below which a line is left out."""
 
 FIRST_LINE = 1 << 24
-"""Number of the amplitude of a group's first line, over one more than the number of the group."""
+"""Random numbers reserved for a group: those of group g begin at (1 + g) FIRST_LINE."""
 
 NEXT_LOOK = np.int64(1 << 48)
-"""Draws from one look's random numbers to the next one's."""
+"""Offset in the draw number between successive looks, which makes their random numbers distinct."""
 
 
 class LineFan(NamedTuple):
-    """Lines of n points as compiled code takes them."""
+    """Grid of speckle lines of n points, as compiled code takes it."""
 
     spread: np.ndarray
-    """(n, 3, 2): as of :class:`SpeckleLines`, in the direction in which bins are numbered."""
+    """(n, 3, 2): line shift per standard deviation of the beam [bins], positive towards higher
+    bins."""
     turn: np.ndarray
-    """(n, 3, 2)"""
+    """(n, 3, 2): phase per standard deviation of the beam, relative to the up segment [rad]."""
     rule: np.ndarray
     """(n, 2) int64: index into :data:`NODES` for each coordinate."""
     reach: np.ndarray
-    """(n,) int64: bins on either side of the strongest among which a peak may lie."""
+    """(n,) int64: bins on either side of the strongest one in which the peak is searched."""
     node: np.ndarray
-    """(rules, nodes): of the Gaussian rules."""
+    """(rules, nodes): nodes of the Gaussian rules [standard deviations], padded with 0."""
     weight: np.ndarray
-    """(rules, nodes): shares of power."""
+    """(rules, nodes): weights of the Gaussian rules; those of a rule sum to 1."""
     number: np.ndarray
-    """(rules,) int64: nodes of each."""
+    """(rules,) int64: number of nodes of each rule."""
     transform: np.ndarray
-    """Window's transform at even steps from 0 on."""
+    """(m,): window transform G at 0, 1/steps, 2/steps .. bins."""
     steps: float
-    """Of these for a bin."""
+    """Samples of ``transform`` per bin of fs/N."""
     size: float
-    """Bins on either side of a line that see it."""
+    """Distance from a line up to which bins receive light of it [bins of fs/N]."""
     half: int
     """N/2 of a real record whose bins near DC and Nyquist see the conjugate images of lines,
     else 0."""
 
     def of(self, part: np.ndarray) -> "LineFan":
-        """Lines of some points by their numbers."""
+        """Select points by their indices."""
         if not self.spread.shape[0]:
             return self
         return self._replace(
@@ -115,7 +117,7 @@ def _rules() -> tuple[np.ndarray, np.ndarray]:
 
 
 def line_fan(shots: "Shots") -> LineFan:
-    """Lines of shots in developed speckle; none of shots without it."""
+    """Prepare the speckle lines of shots; of no points if the shots have no developed speckle."""
     lines = shots.speckle_lines
     value = transform_table(shots.window)[1]
     node, weight = _rules()
@@ -159,7 +161,7 @@ def _turned_to_steepest(
 
 
 def directions(shots: "Shots") -> np.ndarray:
-    """Return (n, 3) by segment: -1 where the beat of the axis's line is folded to fall, else 1."""
+    """Return the sign of d(bin) / d(beat) after folding, by segment: -1 or 1, (n, 3)."""
     found = np.ones((shots.size, 3))
     if shots.complex_record:
         return found
@@ -173,7 +175,7 @@ def directions(shots: "Shots") -> np.ndarray:
 
 @njit(cache=True, error_model="numpy")
 def transform_at(distance, fan):
-    """Window's transform at a distance [bins]."""
+    """Interpolate the window transform G at a distance from the line [bins of fs/N]."""
     place = abs(distance) * fan.steps
     k = int(place)
     if k >= fan.transform.size - 1:
@@ -229,12 +231,27 @@ def line_powers(fan, i, middle, first, power, pseudo):
 
 @njit(cache=True, error_model="numpy")
 def draw_lines(address, group, fan, i, middle, first, power, out):
-    """Draw complex amplitudes (3, bins) of bins, of mean power 1, into ``out``.
+    """Draw complex speckle amplitudes of bins, of mean power 1, into ``out`` (3, bins).
 
-    They are those of the transform about the record's middle.
+    Amplitudes are those of the transform about the record's middle.
 
-    ``address``: key of the point and number of the draw; ``group``: number of the echo; ``power``:
-    :func:`line_powers` of the same bins.
+    Parameters
+    ----------
+    address
+        Key of the point (two uint64) and number of the draw.
+    group
+        Number of the echo, which has random numbers of its own.
+    fan, i
+        Speckle lines (:class:`LineFan`), and the point.
+    middle, first
+        As of :func:`line_powers`.
+    power
+        (3, bins): result of :func:`line_powers` for the same bins.
+
+    Notes
+    -----
+    Equation (1) of the module, over the root of ``power``. All segments see the same amplitudes z.
+    Bins that no line reaches stay 0.
     """
     out[:] = 0.0
     along, across = fan.rule[i]
@@ -382,19 +399,25 @@ def drawn_speckle(
     draws: np.ndarray,
     group: int = 0,
 ) -> np.ndarray:
-    """Complex amplitudes of adjacent bins of point i in some draws, of a mean power of 1.
+    """Draw speckle amplitudes of mean power 1 in adjacent bins of one segment of point i.
 
     Parameters
     ----------
     middle
-        (3,): middle of the echo in the segment that is asked for [bins], nan in the others.
+        (3,): centre of the echo in the segment that is drawn [bins], nan in the other two.
     bins
-        First bin, and their number.
+        First bin, and number of bins.
+    key
+        (2,) uint64: random key of the point.
+    draws
+        (m,) int64: numbers of the draws.
+    group
+        Number of the echo.
 
     Returns
     -------
     numpy.ndarray
-        (m, bins)
+        (m, bins) complex.
     """
     (segment,) = np.flatnonzero(np.isfinite(middle))
     first = np.full(3, bins[0])
@@ -461,26 +484,26 @@ def wander_covariance(
 
 
 class Peaks(NamedTuple):
-    """Peaks of m echoes in developed speckle by segment, (m, 3) each; nan where there is none."""
+    """Detected peaks of m echoes in developed speckle, (m, 3) by segment; nan for none."""
 
     delta: np.ndarray
-    """Place past the bin about which it was estimated [bins]."""
+    """Interpolated position, relative to the bin about which it was estimated [bins]."""
     direction: np.ndarray
-    """-1 where the beat is folded to fall, else 1."""
+    """-1 where the segment's bin falls as its beat rises (:func:`directions`), else 1."""
     power: np.ndarray
-    """Power q^2 in units of its mean, noise included."""
+    """Power q^2 of the peak bin over its mean, echo and noise."""
     share: np.ndarray
-    """Share of the echo in that mean."""
+    """Fraction v of that mean that is echo, 0 .. 1."""
 
 
 FARTHEST = 1.5
-"""Distance [bins] from the strongest bin that bounds the places of peaks where it alone detects."""
+"""Bound on the wander of a peak [bins] where only the strongest bin is tested (``peak_bin``)."""
 
 
 ALL_PAIRS = (0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)
-"""Pairs of segments, of one and the same too."""
+"""All pairs of segments (0 up, 1 Doppler, 2 down), each segment with itself included."""
 CHIRPS = (0, 0), (0, 2), (2, 2)
-"""Those of the up and the down segment."""
+"""Pairs among the up and the down segment alone."""
 
 
 def place_errors(
@@ -489,25 +512,31 @@ def place_errors(
     shots: "Shots",
     pairs: tuple[tuple[int, int], ...] = ALL_PAIRS,
 ) -> np.ndarray:
-    """Mean products [bins^2] of the errors of places by speckle, signed as the beats.
+    """Return second moments E[e_i e_j] [bins^2] of the errors that speckle makes in peak positions.
 
     Parameters
     ----------
     lines
-        Footprints of the m echoes.
+        Gradients of the lines of the m echoes (:class:`SpeckleLines`).
+    peaks
+        Their peaks, (m, 3).
+    shots
+        Window, FFT size, rule of detection and looks.
     pairs
-        Pairs of segments whose products are asked for.
+        Pairs of segments (i, j) that are computed.
 
     Returns
     -------
     numpy.ndarray
-        (m, 3, 3) by segment; 0 where a segment has no peak, or is not asked for.
+        (m, 3, 3) by segment, signed as the beats; 0 for pairs without both peaks, or not asked for.
 
     Notes
     -----
-    The wander by equation (3) and :func:`wander_covariance`; and errors by the shape of the peak
-    (:class:`ShapeErrors`). Re V has the mean b^2 and, with q^2 / v the power of the echo's share,
-    the variance b^4 (v / q^2 + v^2 / q^4).
+    The sum of the wander, equation (3) and :func:`wander_covariance`, and of the errors by the
+    shape of the peak (:class:`ShapeErrors`). Re V has the mean b^2 and the variance b^4 (v / q^2 +
+    v^2 / q^4), with the peak's power q^2 and its echo fraction v. Where only the strongest bin is
+    tested the wander's deviation is divided by sqrt(1 + variance / FARTHEST^2). The mean over L
+    looks of independent speckle has 1 / L of the variance.
     """
     spread = (lines.spread**2).sum(axis=-1)
     there = np.isfinite(peaks.power) & np.isfinite(peaks.delta)
@@ -540,28 +569,29 @@ def place_errors(
 
 
 _STEP = 0.05
-"""Imaginary shift, and root of a variance, [bins] at which the estimate of a place is tried."""
+"""Test displacement [bins]: imaginary shift, and root of the variance, of the numerical
+derivatives."""
 
 
 class ShapeErrors(NamedTuple):
-    """Errors of a peak's place because speckle changes the shape of the peak."""
+    """Position errors of peaks that speckle has deformed, to second order in the lines' spread."""
 
     twist: np.ndarray
-    """[bins] by the imaginary part of the complex shift of a tone."""
+    """Error [bins] by the imaginary part of the tone's complex shift, for its given variance."""
     widening: np.ndarray
-    """[bins] by a complex variance V of the lines of 1 bin^2."""
+    """Error [bins] per bin^2 of Re V, V the complex variance of the lines."""
 
     @classmethod
     def at(cls, delta: np.ndarray, variance: np.ndarray, shots: "Shots") -> "ShapeErrors":
-        """Errors at places ``delta`` past the strongest bin.
+        """Return the errors of tones ``delta`` [bins] from the strongest bin.
 
-        To second order in the spread b a bin is A (G - x G' + (V + x^2) G'' / 2), with the complex
-        shift x, of whose real and imaginary part this is the ``variance``, and
+        To second order in the spread b the bin at x is A (G - s G' + (V + s^2) G'' / 2), with the
+        complex shift s, whose real and imaginary parts each have the ``variance`` [bins^2], and
 
-            V = sum a z b^2 y^2 / A - x^2.
+            V = sum a z b^2 y^2 / A - s^2.
 
-        The real part of x is the wander. The imaginary part, and V, make the magnitudes of three
-        bins those of no tone: the estimate errs by a multiple of (Im x)^2, and of Re V.
+        The real part of s is the wander. Its imaginary part, and V, make the magnitudes of three
+        bins differ from those of any tone: the estimate errs in proportion to (Im s)^2 and to Re V.
         """
         place, twist, widening = _shape_table(shots.window, shots.fft_size)
         side, past = np.sign(delta), np.abs(delta)
@@ -572,7 +602,7 @@ class ShapeErrors(NamedTuple):
 
 @lru_cache(maxsize=16)
 def _shape_table(window: Window, fft_size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Places past a bin; errors there over the square of an imaginary shift, and over Re V."""
+    """Tabulate place 0 .. 1 [bins], error / (Im shift)^2 [1/bins] and error / Re V [1/bins]."""
     tables, tone = interpolator(window, fft_size), lone_tone(window, fft_size)
     place = np.linspace(0.0, 1.0, 65)
     bins = np.array([[-1.0], [0.0], [1.0]]) - place

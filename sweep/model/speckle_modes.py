@@ -1,15 +1,18 @@
-"""Share of an echo's bins that fades as one complex amplitude, where speckle is developed.
+"""Strongest speckle mode of an echo: the part that fades in all of its bins as one amplitude.
 
-Lines of a footprint that spread over the bins with the density p(nu) give bins k, l the covariance
+If the lines of a footprint spread over the bins with the density p(nu), the amplitudes of bins k
+and l in developed speckle have the covariance
 
-    C(k, l) = int p G(k - nu) G(l - nu) dnu,
+    C(k, l) = int p(nu) G(k - nu) G(l - nu) dnu,
 
-G the window's transform. It is a sum over modes, which fade independently [Goodman, Speckle
-Phenomena in Optics, 2007, 3.3]. Of a lone line there is one mode: all bins fade together. The
-strongest mode u, of the eigenvalue m, has the share m u(k)^2 / C(k, k) of the power of bin k. The
-others are taken as further noise, with the correlation of neighbours that C leaves them.
+with the window's transform G. C is a sum of independently fading modes (its eigenvectors: a
+Karhunen-Loeve expansion [Goodman, Speckle Phenomena in Optics, 2007, 3.3]). A single line has one
+mode: all bins fade together. The strongest mode u, of the eigenvalue m, has the fraction
+m u(k)^2 / C(k, k) of the power of bin k. The other modes are treated as additional noise, whose
+correlation between neighbouring bins is what C leaves for them.
 
-p is taken to be Gaussian. Tables are over its deviation and the place of its middle between bins.
+p is taken to be Gaussian. The tables are over its standard deviation and the position of its centre
+between bins.
 """
 
 import math
@@ -24,10 +27,11 @@ from sweep.model.speckle_correlation import window_transform
 from sweep.model.window import COSINE_SUMS, Window, window
 
 SPREADS = np.array([0, 0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0, 1.4, 2.0, 3.0, 4.5, 7.0, 11.0])
-"""Deviations of p that tables have [bins of fs/L, or half main lobes over two if that is more]."""
+"""Standard deviations of p in the tables, in units of a bin of fs/L, or of a quarter of the main
+lobe's width where that is more."""
 
 OFFSETS = 9
-"""Places of the middle that tables have, from -1/2 to 1/2 bin of fs/N."""
+"""Number of positions of p's centre in the tables, evenly spaced over -1/2 .. 1/2 bin of fs/N."""
 
 _STAND_IN_LENGTH = 1024
 _ITERATIONS = 80
@@ -40,16 +44,18 @@ _SPREAD_OF_BINS = 3.0
 
 
 class ModeTable(NamedTuple):
-    """Shares of the strongest mode, and what correlation the others have."""
+    """Power fraction of the strongest mode, and the correlation of neighbouring bins."""
 
     spread: np.ndarray
-    """(s,): deviations of the lines [bins of fs/N]; none where no law needs them."""
+    """(s,): standard deviations of the lines' density [bins of fs/N]; empty in NO_MODES."""
     share: np.ndarray
-    """(s, OFFSETS, k): share of the strongest mode in the power of bins, about the nearest one."""
+    """(s, OFFSETS, k): power fraction of the strongest mode in a bin, k bins about the nearest
+    one."""
     coherence: np.ndarray
-    """(s, OFFSETS, k): correlation of the signal of a bin and the one below."""
+    """(s, OFFSETS, k): correlation of the echo's amplitudes in a bin and in the one below it,
+    signed."""
     lean: np.ndarray
-    """(s, OFFSETS): :func:`lean_of` the bins about the nearest one; rises with the offset."""
+    """(s, OFFSETS): :func:`lean_of` the three bins about the nearest one; rises with the offset."""
 
 
 NO_MODES = ModeTable(np.empty(0), np.empty((0, 0, 0)), np.empty((0, 0, 0)), np.empty((0, 0)))
@@ -57,7 +63,7 @@ NO_MODES = ModeTable(np.empty(0), np.empty((0, 0, 0)), np.empty((0, 0, 0)), np.e
 
 @lru_cache(maxsize=32)
 def mode_table(shape: Window, fft_size: int) -> ModeTable:
-    """Return the table of a window and an FFT size."""
+    """Tabulate the strongest mode for a window and an FFT size (cached)."""
     ratio, lobe = fft_size / shape.length, main_lobe(shape)
     if shape.name in COSINE_SUMS:
         shape = window(shape.name, min(shape.length, _STAND_IN_LENGTH))
@@ -97,7 +103,7 @@ def _gaussian_nodes(spread: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _strongest_mode(covariance: np.ndarray) -> np.ndarray:
-    """Eigenvector of the largest eigenvalue, times its root, by iteration."""
+    """Return the leading eigenvector scaled by the root of its eigenvalue, by power iteration."""
     mode = np.sqrt(np.diag(covariance))
     value = 1.0
     for _ in range(_ITERATIONS):
@@ -109,7 +115,10 @@ def _strongest_mode(covariance: np.ndarray) -> np.ndarray:
 
 @njit(cache=True, error_model="numpy")
 def lean_of(below, middle, above):
-    """Difference of the powers above and below the largest bin over their sum, from magnitudes."""
+    """Return (P_above - P_below) / (P_above + P_below) of the largest bin's neighbours; 0 if faint.
+
+    Arguments are magnitudes |X|. The ratio tells on which side of the bin the echo's centre lies.
+    """
     whole = below * below + above * above
     if not whole > 1e-6 * middle * middle:
         return 0.0
@@ -118,7 +127,10 @@ def lean_of(below, middle, above):
 
 @njit(cache=True, error_model="numpy")
 def modes_of(table, spread, lean):
-    """Return where to interpolate in a table: row and weight of the next, of either index."""
+    """Return the cell (s, d) of a table around a spread and an asymmetry, and the weights in it.
+
+    Result: s, weight of s + 1, d, weight of d + 1; weights 0 .. 1 (bilinear interpolation).
+    """
     s = 0
     while s < table.spread.size - 2 and table.spread[s + 1] <= spread:
         s += 1
@@ -134,7 +146,10 @@ def modes_of(table, spread, lean):
 
 @njit(cache=True, error_model="numpy")
 def interpolated(values, at, k):
-    """Value of a table at the place of :func:`modes_of`, k bins from the nearest to the middle."""
+    """Interpolate a table (s, OFFSETS, bins) k bins from the bin nearest to the echo's centre.
+
+    The cell ``at`` is a result of :func:`modes_of`.
+    """
     s, over, d, aside = at
     half = values.shape[2] // 2
     k = min(max(k, -half), half) + half

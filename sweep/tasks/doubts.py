@@ -1,6 +1,6 @@
-"""Warnings of a study before it runs: what can be computed, but is hardly meant.
+"""Warnings before a study runs: valid settings that are probably mistakes.
 
-The command prints them. In Python they are warnings of the category `StudyWarning`.
+The command prints them; in Python they are warnings of the category `StudyWarning`.
 """
 
 from __future__ import annotations
@@ -28,13 +28,16 @@ _PACKAGE = os.path.dirname(os.path.dirname(os.path.abspath(__file__))) + os.sep
 
 
 class StudyWarning(UserWarning):
-    """A study that can be computed, but is hardly meant as it is written."""
+    """Warning about a study that can be computed, but is probably not what was meant."""
 
 
 def doubts_of_spec(spec: Spec | SceneSpec) -> Iterator[str]:
     """Yield what is doubtful of a study's beam, scene, path and threshold.
 
-    SceneError for a flight that sees nothing.
+    Raises
+    ------
+    SceneError
+        The flight sees nothing.
     """
     if narrow := too_narrow(spec.parameters_off_axes(), spec.axes):
         yield narrow
@@ -48,7 +51,7 @@ def doubts_of_spec(spec: Spec | SceneSpec) -> Iterator[str]:
 
 
 def doubts_of_results(study: GridStudy | FlightStudy) -> Iterator[str]:
-    """Yield which echoes arrive too late or are misread, and which effects off matter."""
+    """Yield warnings about late or ambiguous echoes, and about disabled effects that matter."""
     yield from warnings_of(study)
     if "off" in study.spec.modes().values():
         from sweep.tasks.plan import effects_table

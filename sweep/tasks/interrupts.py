@@ -1,9 +1,9 @@
-"""Ctrl-C and SIGTERM to a run: finish what runs, or stop at once, in compiled code too.
+"""Handling of Ctrl-C and SIGTERM in a run: finish running blocks, or stop at once.
 
-Python hands a signal to its handler only between two of its own instructions. A call of compiled
-code may take minutes, and a batch system kills 30 s after SIGTERM. A thread therefore sees each
-signal as it arrives. It says what happens; and if the main thread does not take a signal that is
-to stop it at once, the thread ends the process. A store survives that, as it survives any kill.
+Python calls a signal handler only between two of its own instructions, but a call of compiled code
+may take minutes, and batch systems kill 30 s after SIGTERM. A watcher thread therefore receives
+each signal as it arrives and prints what happens. If the main thread does not handle a signal that
+should stop it at once, the watcher ends the process, which stores survive as they survive any kill.
 """
 
 from __future__ import annotations
@@ -48,17 +48,17 @@ _WAKE = b"\0"
 
 
 class Interrupts:
-    """Ctrl-C once: finish what runs and stop; twice: stop at once; in the main thread only.
+    """Context manager for signals: the first lets running blocks finish, the second stops at once.
 
-    A closed terminal counts as one Ctrl-C, however often it is told; not where the process was
-    started to ignore it, as by nohup. SIGTERM counts as Ctrl-C, and the process is about to be
-    killed: what runs `TERMINATION_SECONDS_MAX` later is stopped at once, and if SIGTERM comes in
-    compiled code that runs for `REACTION_SECONDS_MAX` more, the process ends.
+    It acts in the main thread only. A closed terminal (SIGHUP) counts as one Ctrl-C however often
+    it is signalled, and not at all if the process ignores SIGHUP, as under nohup. SIGTERM counts as
+    Ctrl-C with a deadline: blocks that run `TERMINATION_SECONDS_MAX` later are stopped, and if
+    compiled code does not return within `REACTION_SECONDS_MAX` of SIGTERM, the process ends.
 
     Parameters
     ----------
     listener
-        Progress that is told what happens, from a thread.
+        Progress listener for messages; called from the watcher thread.
     """
 
     def __init__(self, listener: Progress | None = None) -> None:
@@ -96,7 +96,7 @@ class Interrupts:
             self._watcher = None
 
     def announce(self) -> None:
-        """Say once that the run is about to stop."""
+        """Print, once, that the run stops when running blocks are written."""
         with self._announcing:
             if not self._is_announced:
                 self._is_announced = True
@@ -121,7 +121,7 @@ class Interrupts:
     # The watcher
 
     def _watch_signals(self) -> None:
-        """Start the thread that sees signals as they arrive, unless another sees them already."""
+        """Start the watcher thread, unless an event loop of the caller already receives signals."""
         arrivals, entrance = socket.socketpair()
         arrivals.setblocking(False)
         entrance.setblocking(False)
@@ -167,7 +167,7 @@ class Interrupts:
         return None if deadline is None else max(deadline - time.monotonic(), 0.0)
 
     def _untaken(self, arrivals: socket.socket) -> list[int]:
-        """Return the signals that have arrived and are not taken; drop bytes of others."""
+        """Return arrived signals that the main thread has not handled; discard wake-up bytes."""
         try:
             arrived = arrivals.recv(_SIGNALS_MAX, socket.MSG_PEEK)
             numbers = [number for number in arrived if number in self._before]
@@ -178,7 +178,7 @@ class Interrupts:
         return numbers
 
     def _is_taken(self, arrivals: socket.socket, number: int) -> bool:
-        """Tell whether the main thread takes so many signals in time."""
+        """Wait up to `REACTION_SECONDS_MAX`; return whether a signal was handled meanwhile."""
         end = time.monotonic() + REACTION_SECONDS_MAX
         while time.monotonic() < end:
             if self._over.wait(POLL_SECONDS) or len(self._untaken(arrivals)) < number:
@@ -186,7 +186,7 @@ class Interrupts:
         return False
 
     def _answer(self, numbers: list[int], *, is_repeated: bool) -> None:
-        """Say what becomes of signals while compiled code runs, or end the process."""
+        """React to signals that compiled code holds up: print a message, or end the process."""
         if set(numbers) == {HANGUP}:
             return
         is_asked_again = self.stopping or is_repeated
@@ -200,7 +200,7 @@ class Interrupts:
             self.announce()
 
     def _leave(self, code: int) -> None:
-        """End the process in the middle of compiled code; never returns."""
+        """Print a last message and end the process from the watcher thread; never returns."""
 
         def speak() -> None:
             self._listener.end()

@@ -1,4 +1,4 @@
-"""Memory that a study takes and that its workers have, compared before anything is computed."""
+"""Check that a study's memory fits its workers, before anything is computed."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ FFT_SIZE = "instrument.processing.fft_size"
 
 BYTES_PER_BIN = 250
 BYTES_PER_DRAWN_BIN = 300
-"""Memory of a point at its peak over the points of its FFT, measured at 2^20 and 2^22: of the
-closed form, and of spectra that are drawn whole."""
+"""Peak memory of a point per point of its FFT [bytes], measured at 2^20 and 2^22: for closed-form
+results, and for draws of whole spectra."""
 
 
 def largest_fft(spec: Spec | SceneSpec) -> int:
@@ -35,31 +35,31 @@ def largest_fft(spec: Spec | SceneSpec) -> int:
 
 
 def point_bytes(spec: Spec | SceneSpec) -> int:
-    """Return the bytes that a point or a shot takes at its peak."""
+    """Return the peak memory of one point, or shot [bytes]."""
     drawn = getattr(spec.draws, "whole_spectra", False)
     return largest_fft(spec) * (BYTES_PER_DRAWN_BIN if drawn else BYTES_PER_BIN)
 
 
 def scene_bytes(spec: SceneSpec) -> int:
-    """Return the bytes of a scene's triangles and trees, which each process has a copy of."""
+    """Return the size of a scene's triangles and search trees, copied into each process [bytes]."""
     from sweep.tasks.eyepoint_study import world_of
 
     return world_of(spec).caster.nbytes
 
 
 class WorkerMemory(NamedTuple):
-    """Memory of the process that computes a study's points."""
+    """Memory available to a process that computes points."""
 
     limit: float
-    """Bytes that it may take; inf where that is not known."""
+    """Largest memory that the process may use [bytes]; inf if unknown."""
     owner: str
-    """The process, as the subject of a sentence: `this machine`."""
+    """Name of the process in messages, as the subject of a sentence: `this machine`."""
     workers: int = 1
-    """Workers that share the memory of this machine; 1 where they do not."""
+    """Number of workers that share this machine's memory; 1 if each has a limit of its own."""
 
 
 def this_machine() -> WorkerMemory:
-    """Return the memory of a plain loop in this process."""
+    """Return the memory available to serial computation in this process."""
     # Here, as a spec with mistakes is told without the second that this import takes.
     from distributed.system import MEMORY_LIMIT
 
@@ -97,7 +97,7 @@ def _smallest_worker(client: Client) -> float:
 
 
 def refuse_too_large(spec: Spec | SceneSpec, memory: WorkerMemory) -> None:
-    """Refuse a study of which one point takes more memory than a process has."""
+    """Raise a SpecError if one point needs more memory than a process has."""
     needed = point_bytes(spec)
     if needed > memory.limit:
         rule = f"makes a point take about {_gigabytes(needed)} of memory, {_shortage(memory)}"
@@ -115,7 +115,7 @@ def refuse_too_large_study(study: GridStudy | FlightStudy, memory: WorkerMemory)
 
 
 def refuse_too_large_scene(spec: SceneSpec, memory: WorkerMemory) -> None:
-    """Refuse a scene that takes more memory, in each process that computes, than it has."""
+    """Raise a SpecError if a scene and one point need more memory than a process has."""
     needed = point_bytes(spec) + scene_bytes(spec)
     if needed > memory.limit:
         rule = (
@@ -127,7 +127,7 @@ def refuse_too_large_scene(spec: SceneSpec, memory: WorkerMemory) -> None:
 
 
 def refuse_too_large_blocks(study: Study, memory: WorkerMemory) -> None:
-    """Refuse a study of which the results of one block take more memory than a process has."""
+    """Raise a SpecError if the results of one block need more memory than a process has."""
     needed = 2 * study.block_bytes  # its own, and those being encoded
     if needed > memory.limit:
         rule = f"makes a block take about {_gigabytes(needed)} of memory, {_shortage(memory)}"
@@ -139,7 +139,7 @@ def _shortage(memory: WorkerMemory) -> str:
 
 
 def _or_fewer_workers(memory: WorkerMemory, needed: float) -> str:
-    """Remedy for workers that share a machine, if fewer would have enough memory each."""
+    """Return a remedy such as ', or --workers 4' if fewer workers would suffice, else ''."""
     fewer = int(memory.limit * memory.workers / needed)
     return f", or {option('workers', fewer)}" if 1 <= fewer < memory.workers else ""
 

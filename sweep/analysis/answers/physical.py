@@ -1,4 +1,4 @@
-"""Values with units on a dataset's coordinates, and SI values of its parameters."""
+"""Look up a dataset's coordinates, study and parameters, with units converted."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from sweep.spec.sections import parameter_rules
 from sweep.units import QuantityError, read_number, read_quantity
 
 CLOSE = 1e-9
-"""Relative difference up to which a value is one on the grid."""
+"""Relative tolerance for matching a value to one of the grid."""
 
 STUDY_ID = "study_id"
-"""Coordinate with the id of the study that points are of; an attribute of the same name, too."""
+"""Name of the coordinate, and of the attribute, with the identity of the study."""
 
 HOW_TO_JOIN = (
     "join stores with sweep.open([STORE, STORE], dim='design'), whose answers are per design"
@@ -31,14 +31,15 @@ HOW_TO_JOIN = (
 _MARKER = re.compile("study_[0-9a-f]{16}")
 
 SPECS = "specs"
-"""Attribute of a join of studies: JSON with the spec and the variables of each by its id."""
+"""Attribute of a join of studies: JSON of spec and variable names by study identity."""
 
 
 def marker_of(identities: Iterable[str]) -> str:
-    """Return the name of the coordinate that marks points of a study, or of a join of several.
+    """Return the name of the marker coordinate of a study, or of a join of several.
 
-    Of coordinates of one name xarray may keep the first dataset's. A name that only one dataset
-    has it never drops. Two studies leave two markers.
+    xarray drops a conflicting coordinate or keeps the first dataset's, but keeps a coordinate that
+    only one dataset has. The identity is therefore in the name: a merge of two studies has two
+    markers.
     """
     identities = list(identities)
     if len(identities) == 1:
@@ -52,7 +53,7 @@ def markers(dataset: xr.Dataset | xr.DataTree) -> list[str]:
 
 
 def study_of(dataset: xr.Dataset | xr.DataTree) -> Spec | SceneSpec:
-    """Return the study that a dataset, or a flight's tree, comes from."""
+    """Return the spec of the study that a dataset, or a flight's tree, comes from."""
     text = dataset.attrs.get("spec")
     _check_marker(dataset)
     if STUDY_ID in dataset.coords:
@@ -76,7 +77,7 @@ def study_of(dataset: xr.Dataset | xr.DataTree) -> Spec | SceneSpec:
 
 
 def _check_marker(dataset: xr.Dataset | xr.DataTree) -> None:
-    """Refuse a dataset that was put together of those of several studies."""
+    """Raise a ValueError if a dataset combines several studies, or lacks its study's marker."""
     present = markers(dataset)
     if len(present) > 1:
         studies = ", ".join(name.removeprefix("study_")[:8] for name in present)
@@ -97,12 +98,12 @@ def _check_marker(dataset: xr.Dataset | xr.DataTree) -> None:
 
 @lru_cache(maxsize=8)
 def _from_stored(text: str) -> Spec | SceneSpec:
-    """Read the spec of a store; answers ask for that of one dataset again and again."""
+    """Parse a stored spec; cached, because answers parse that of one dataset repeatedly."""
     return from_stored(text)
 
 
 def spec_of(dataset: xr.Dataset) -> Spec:
-    """Return the study of a grid that a dataset comes from."""
+    """Return the spec of the grid study that a dataset comes from; ValueError for a flight's."""
     study = study_of(dataset)
     if not isinstance(study, Spec):
         raise ValueError("the dataset is a flight's: this answer is one of a grid of points")
@@ -119,7 +120,7 @@ def require_variables(dataset: xr.Dataset, *names: str) -> None:
 
 
 def quantity(written: object, *, si_unit: str, name: str) -> float:
-    """SI value of ``"20 Hz"``, or of a number, which is SI already; ValueError for others."""
+    """Parse a quantity such as ``"20 Hz"`` to SI; a bare number is in SI already."""
     if isinstance(written, int | float) and not isinstance(written, bool):
         return float(written)
     try:
@@ -152,7 +153,7 @@ def coordinate(dataset: xr.Dataset, name: str) -> xr.DataArray:
 
 
 def shown(array: xr.DataArray, written: object) -> float | str:
-    """Convert a written value to a coordinate's units; a number without a unit is in them."""
+    """Convert a value such as ``"2 km"`` to a coordinate's units; a bare number is in them."""
     rule = parameter_rules().get(array.attrs.get("path", ""))
     if isinstance(written, int | float | np.number) and not isinstance(written, bool):
         return float(written)
@@ -165,7 +166,7 @@ def shown(array: xr.DataArray, written: object) -> float | str:
 
 
 def si(array: xr.DataArray) -> xr.DataArray:
-    """SI values of a coordinate of numbers; of one of words, these."""
+    """Return a coordinate's values in SI, or as strings if they are words."""
     rule = parameter_rules().get(array.attrs.get("path", ""))
     units = array.attrs.get("units", "")
     if array.dtype.kind not in "fiu":
@@ -181,7 +182,7 @@ def si(array: xr.DataArray) -> xr.DataArray:
 
 
 def parameter(dataset: xr.Dataset, path: str, spec: Spec | SceneSpec | None = None) -> xr.DataArray:
-    """SI value of a parameter at each point: along its axis, or one value for all."""
+    """Return a parameter in SI: over its axis, or as a scalar if it is the same for all points."""
     array = parameter_coordinate(dataset, path)
     if array is not None:
         return si(array).drop_vars(list(array.coords), errors="ignore").assign_coords(
@@ -205,18 +206,18 @@ def parameter_coordinate(dataset: xr.Dataset, path: str) -> xr.DataArray | None:
 def select(
     dataset: xr.Dataset, wanted: Mapping[str, Any], *, method: str | None = None
 ) -> xr.Dataset:
-    """Points at which coordinates have some values.
+    """Select the points at which coordinates have given values.
 
     Parameters
     ----------
     wanted
         By a coordinate's name or path: a value (``"2 km"``, or a number in the coordinate's own
-        units), a list of values, or a slice from one value to another, both included. One value of
-        a coordinate with a dimension of its own removes that dimension. A coordinate along a zipped
-        axis keeps the points of the axis that have it.
+        units), a list of values, or a slice with both ends included. A single value of a dimension
+        coordinate removes its dimension. A coordinate along a zipped axis keeps the matching points
+        of that axis.
     method
-        ``nearest`` takes the nearest value, of one between the ends of the coordinate; by default
-        it must be there, to 1e-9 of it.
+        ``nearest`` takes the nearest value, for one within the coordinate's range; by default the
+        value must match to 1e-9.
 
     Raises
     ------
@@ -239,7 +240,7 @@ def select(
 
 
 def _places(array: xr.DataArray, written: Any, method: str | None) -> np.ndarray:
-    """Return indices of the values that are wanted, in the order of the coordinate for slices."""
+    """Return the indices of the wanted values; for slices in the coordinate's order."""
     values = np.atleast_1d(array.values)
     if isinstance(written, slice):
         low = -np.inf if written.start is None else float(shown(array, written.start))
@@ -254,7 +255,7 @@ def _places(array: xr.DataArray, written: Any, method: str | None) -> np.ndarray
 def _matching(
     array: xr.DataArray, values: np.ndarray, value: float | str, method: str | None
 ) -> np.ndarray:
-    """Return indices of one value."""
+    """Return the indices at which a coordinate has one value."""
     units = array.attrs.get("units", "")
     if values.dtype.kind not in "fiu":
         words = [str(word) for word in values]

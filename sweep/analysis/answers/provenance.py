@@ -1,11 +1,11 @@
-"""Proof that a dataset is one study's, and answers per design from a join of several studies.
+"""Proof that a dataset belongs to one study, and answers per design from a join of studies.
 
-A dataset of `sweep.open` has the scalar coordinate `study_id`. xarray keeps it through selections.
-From datasets of two studies xarray drops it, or spreads it along a dimension, or keeps the first
-one's (`compat="override"`). A second coordinate, the marker, has the study in its
-name: `study_1f2e3d4c5b6a7980`. xarray keeps a coordinate that only one of two datasets has. A
-dataset with two markers is therefore of two studies. Attributes prove nothing: of two datasets
-xarray keeps the first one's.
+A dataset of `sweep.open` has the scalar coordinate `study_id`, which selections keep. When two
+studies' datasets are combined, xarray drops it, spreads it along a dimension, or keeps the first
+one's (`compat="override"`). A second coordinate, the marker, therefore has the identity in its
+name: `study_1f2e3d4c5b6a7980`. xarray keeps a coordinate that only one dataset has, so that a
+dataset with two markers combines two studies. Attributes prove nothing: xarray keeps the first
+dataset's.
 """
 
 from __future__ import annotations
@@ -34,28 +34,28 @@ from sweep.spec.rules import Numeric
 from sweep.spec.sections import parameter_rules
 
 CLOSE = 1e-9
-"""Relative difference up to which a value is one of an axis."""
+"""Relative tolerance for matching a value to one of an axis."""
 
 
 def answer_per_study(
     dataset: xr.Dataset, answer: Callable[[xr.Dataset], Any], *, every_axis: bool
 ) -> Any:
-    """Answer from a dataset of one study, or design by design from a join of several.
+    """Compute an answer from a dataset of one study, or for each design of a join.
 
     Parameters
     ----------
     dataset
-        As `sweep.open` gives it, or a part.
+        A dataset of `sweep.open`, or a selection of it.
     answer
         Function of the dataset of a single study.
     every_axis
-        Whether the answer needs the study's parameters, and so a coordinate of each of its axes.
+        Whether the answer uses the study's parameters, so that each axis must have its coordinate.
 
     Returns
     -------
     Any
-        What `answer` returns; of a join along its dimension, where all results are datasets or
-        arrays. Contours are laid end to end along `vertex`.
+        Result of `answer`; for a join, the designs' results along its dimension, if they are
+        datasets or arrays. Contours are concatenated along `vertex`.
 
     Raises
     ------
@@ -86,10 +86,13 @@ def answer_per_study(
 
 
 def proven(dataset: xr.Dataset, *, every_axis: bool) -> xr.Dataset:
-    """Return a dataset proven to be of one study, the attributes of its coordinates restored.
+    """Check that a dataset is one study's; return it with coordinate attributes restored.
 
-    Raises a ValueError that says why it is not: no or several studies, coordinates changed, a
-    dimension that is no axis; with ``every_axis`` an axis without a coordinate.
+    Raises
+    ------
+    ValueError
+        It is of no or several studies, its coordinates were changed, a dimension is no axis, or
+        (with ``every_axis``) the coordinate of an axis is missing.
     """
     _join_dimension(dataset, refuse=True)
     spec = study_of(dataset)
@@ -109,7 +112,7 @@ def proven(dataset: xr.Dataset, *, every_axis: bool) -> xr.Dataset:
 
 
 def check_axes(dataset: xr.Dataset, spec: Spec | SceneSpec) -> None:
-    """Refuse a dataset that lacks the coordinate of an axis: nothing tells which value it has."""
+    """Raise a ValueError if the coordinate of an axis is missing, so that its value is unknown."""
     for member in _members(spec):
         if parameter_coordinate(dataset, member.path) is None:
             raise ValueError(
@@ -120,7 +123,10 @@ def check_axes(dataset: xr.Dataset, spec: Spec | SceneSpec) -> None:
 
 
 def _join_dimension(dataset: xr.Dataset, *, refuse: bool = False) -> str:
-    """Return the dimension along which a dataset joins studies; empty if it is of a single one."""
+    """Return the dimension along which a dataset joins studies, or '' for a single study.
+
+    Raises a ValueError if the dataset proves neither; with ``refuse`` also for a join.
+    """
     if STUDY_ID not in dataset.coords:
         raise ValueError(
             f"the dataset lacks the coordinate '{STUDY_ID}', which proves that it is one study's: "
@@ -148,7 +154,7 @@ def _members(spec: Spec | SceneSpec) -> list[Member]:
 
 
 def _with_attributes(dataset: xr.Dataset, spec: Spec | SceneSpec) -> xr.Dataset:
-    """Return a dataset whose coordinates have their path and unit, if an operation dropped both."""
+    """Restore path and units of coordinates where an operation dropped both."""
     restored = {}
     for member in _members(spec):
         array = dataset.coords.get(member.name)
@@ -158,7 +164,7 @@ def _with_attributes(dataset: xr.Dataset, spec: Spec | SceneSpec) -> xr.Dataset:
 
 
 def _is_of_study(array: xr.DataArray, spec: Spec | SceneSpec) -> np.ndarray:
-    """Mark the values of a parameter's coordinate that its study has: on its axis, or fixed."""
+    """Return whether the study has each value of a parameter's coordinate, bool array."""
     path = array.attrs["path"]
     on_axis = [np.asarray(member.values) for member in _members(spec) if member.path == path]
     allowed = on_axis[0] if on_axis else np.atleast_1d(spec.parameters()[path])
@@ -200,7 +206,7 @@ def _check_coordinates(dataset: xr.Dataset, spec: Spec | SceneSpec) -> None:
 
 
 def _check_dimensions(dataset: xr.Dataset, spec: Spec | SceneSpec) -> None:
-    """Refuse a dimension of the results that is no axis and has no coordinate of one."""
+    """Raise a ValueError if a dimension is neither an axis nor that of a parameter's coordinate."""
     known = {axis.name for axis in spec.axes} | {"shot", "draw", "return_number", "statistic"}
     known |= {str(dim) for array in _parameter_coordinates(dataset, spec) for dim in array.dims}
     foreign = [
@@ -217,7 +223,7 @@ def _check_dimensions(dataset: xr.Dataset, spec: Spec | SceneSpec) -> None:
 
 
 def _of_design(dataset: xr.Dataset, spec: Spec | SceneSpec) -> xr.Dataset:
-    """Return the points and variables of a single design in a join."""
+    """Reduce one design of a join to the points and variables of its study."""
     stored = json.loads(dataset.attrs[SPECS])[str(dataset[STUDY_ID].item())]
     dataset = dataset.drop_vars(set(dataset.data_vars) - set(stored["variables"]))
     for array in _parameter_coordinates(dataset, spec):
@@ -266,7 +272,7 @@ _SUMMED = ("points", "points_committed", "blocks", "blocks_committed")
 
 
 def _attributes_of_join(datasets: Mapping[str, xr.Dataset]) -> dict[str, Any]:
-    """Return the attributes that all have, sums of their points and blocks, and all specs."""
+    """Return the attributes of a join: common ones, summed counts, and all specs."""
     first, *others = (dataset.attrs for dataset in datasets.values())
     common = {
         key: value for key, value in first.items()
@@ -286,7 +292,7 @@ def _attributes_of_join(datasets: Mapping[str, xr.Dataset]) -> dict[str, Any]:
 
 
 def _check_names(datasets: Mapping[str, xr.Dataset], dim: str) -> None:
-    """Refuse the name of a dimension that is taken, and a study that comes twice."""
+    """Raise a ValueError if the dimension's name is taken, or a study occurs twice."""
     taken = {str(name) for d in datasets.values() for name in [*d.dims, *d.coords, *d.data_vars]}
     if not dim.isidentifier() or dim in taken:
         raise ValueError(f"'{dim}' can't name the dimension of designs: it is taken, or no word")
@@ -298,7 +304,7 @@ def _check_names(datasets: Mapping[str, xr.Dataset], dim: str) -> None:
 
 
 def _reference_coordinates(datasets: Mapping[str, xr.Dataset]) -> dict[str, xr.DataArray]:
-    """Return the coordinate of each parameter on an axis by path, of the first dataset with it."""
+    """Return for each parameter path the coordinate of the first dataset that has one."""
     found: dict[str, xr.DataArray] = {}
     for dataset in datasets.values():
         for array in dataset.coords.values():
@@ -310,7 +316,7 @@ def _reference_coordinates(datasets: Mapping[str, xr.Dataset]) -> dict[str, xr.D
 def _aligned(
     dataset: xr.Dataset, spec: Spec | SceneSpec, reference: Mapping[str, xr.DataArray]
 ) -> xr.Dataset:
-    """Return a dataset with the coordinates of all, in the names and units of the reference."""
+    """Give a dataset the coordinates of ``reference``, in their names and units."""
     for path, like in reference.items():
         array = parameter_coordinate(dataset, path)
         if like.name not in like.dims:
@@ -344,7 +350,7 @@ def _aligned(
 
 
 def _displayed(values: np.ndarray, path: str, units: str) -> np.ndarray:
-    """Return SI values in a unit; words as they are."""
+    """Convert SI values to display units; return words unchanged."""
     rule = parameter_rules()[path]
     if not isinstance(rule, Numeric) or not units:
         return values
@@ -352,7 +358,7 @@ def _displayed(values: np.ndarray, path: str, units: str) -> np.ndarray:
 
 
 def join_along(parts: Sequence[Any], dim: str, names: Sequence[str]) -> Any:
-    """Concatenate datasets or arrays along a new dimension; what one lacks has its fill value."""
+    """Concatenate datasets or arrays along a new dimension; missing points get a fill value."""
     fills: Any = np.nan
     if isinstance(parts[0], xr.Dataset):
         variables = {name: array for part in parts for name, array in part.data_vars.items()}
@@ -372,4 +378,4 @@ def join_along(parts: Sequence[Any], dim: str, names: Sequence[str]) -> Any:
 
 
 _FILLS = {"i": -1, "u": 0, "b": False}
-"""Values by the kind of an array's numbers where a design has no point."""
+"""Fill values of points that a design lacks, by NumPy kind; nan for other kinds."""

@@ -49,11 +49,11 @@ from sweep.model.effects.points import Points, largest_about
 from sweep.model.preparation import Shots
 
 _IMAGE = 0.9
-"""Least that an image far away leaves of a line whose amplitude it adds to."""
+"""Smallest fraction of a line's amplitude that a distant image leaves."""
 
 
 def size(points: Points) -> Size | None:
-    """Change of the largest bin by the samples that lack; None where none do."""
+    """Upper bound on the output change if missing samples are ignored; None if none are missing."""
     late = points.missing
     if late is None:
         return None
@@ -75,9 +75,9 @@ def size(points: Points) -> Size | None:
 
 
 def left(points: Points) -> np.ndarray:
-    """Bound the change of any bin by samples that beamlets and looks have in common.
+    """Bound the error of one first sample, the axis's at the middle look, for all beamlets.
 
-    These are the axis's, and the middle look's. Over the magnitude of all lines on a bin.
+    Relative to the magnitude that all lines make on a bin, by segment.
     """
     late = points.missing
     assert late is not None
@@ -98,7 +98,7 @@ def left(points: Points) -> np.ndarray:
 
 
 def act(shots: Shots, scene: Scene) -> Shots:
-    """Take the samples before the echo's arrival from each segment's lines."""
+    """Set ``first_sample``: the number of record samples before the echo, by segment."""
     first = np.zeros((len(shots.waveform), shots.size), np.int64)
     for s in np.flatnonzero(shots.segments):
         segment = shots.waveform[s]

@@ -56,15 +56,16 @@ from sweep.model.speckle_correlation import (
 _ROUGHNESS = "target.roughness"
 _LAW = "footprint.speckle"
 _FURTHEST = 5.0
-"""Root mean squares of a bin's diffuse part that the largest of some bins keeps to but in one of a
-million draws."""
+"""Bound on a bin's diffuse amplitude over its root mean square; exceeded in one of a million
+draws."""
 
 
 def coherent_share(*, roughness: ArrayLike, wavelength: ArrayLike) -> np.ndarray:
-    """Share kappa of the mean echo power that keeps its phase, 0..1.
+    """Return the fraction kappa of the mean echo power that keeps its phase, 0 .. 1.
 
-    The roughness [m] is the standard deviation of the surface's height along the line of sight: of
-    a plane, that across it times the sine of the grazing angle. Infinite: all speckle.
+    ``roughness`` [m] is the standard deviation of the surface's height along the line of sight: for
+    a plane, that normal to it times the sine of the grazing angle; infinite for developed speckle.
+    ``wavelength`` is in m.
     """
     phase = 4 * math.pi * np.asarray(roughness, float) / np.asarray(wavelength, float)
     return np.asarray(np.exp(-(phase**2)))
@@ -73,11 +74,23 @@ def coherent_share(*, roughness: ArrayLike, wavelength: ArrayLike) -> np.ndarray
 def factors(
     realisation: Realisation, *, beamlets: int, coherent_share: np.ndarray, random_phases: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Factors g_b on the beamlets' amplitudes: |g_b| and phase [cycles], (n, beamlets) each.
+    """Draw the factors g_b on beamlet amplitudes: |g_b| and phase [cycles], (n, beamlets) each.
 
-    A factor depends on key, number of the draw and number of the beamlet alone: pair b of
-    ``STREAM_SPECKLE`` is z_b, number b of ``STREAM_FOOTPRINT_PHASE`` the phase of u_b, uniform with
-    `random_phases`, else 0. `coherent_share` is kappa, (n,).
+    Parameters
+    ----------
+    realisation
+        Random keys and draw numbers of n points.
+    beamlets
+        Number of beamlets.
+    coherent_share
+        Fraction kappa, (n,) or scalar.
+    random_phases
+        True if u_b has a uniform phase; else it is 1.
+
+    Notes
+    -----
+    A factor depends on key, draw and beamlet alone: pair b of ``STREAM_SPECKLE`` makes z_b, number
+    b of ``STREAM_FOOTPRINT_PHASE`` the phase of u_b.
     """
     from sweep.model import philox
 
@@ -103,12 +116,12 @@ def factors(
 
 
 def size(points: Points) -> Size | None:
-    """Change by leaving speckle out in all draws but few.
+    """Upper bound on the output change if speckle is omitted, in all but 1e-6 of draws.
 
-    A bin of magnitude |X| becomes sqrt(kappa) X + D with D complex normal of power
-    (1 - kappa) |X|^2: between smooth and rough, 4 pi sigma_h << lambda, it lies within
-    1 +- 5 (4 pi sigma_h / lambda). Incoherent footprints have a coherent share of random phases.
-    A sum that may have cancelled does not measure the scattered light; the sum of powers does.
+    A bin of magnitude |X| becomes sqrt(kappa) X + D with D complex normal of power (1 - kappa)
+    |X|^2: between smooth and rough, 4 pi sigma_h << lambda, it lies within 1 +- 5 (4 pi sigma_h /
+    lambda). In incoherent footprints the coherent part has random phases. Where a sum of amplitudes
+    may cancel, the bound is relative to the sum of powers.
     """
     if not points.has(_ROUGHNESS):
         return None
@@ -127,15 +140,19 @@ def size(points: Points) -> Size | None:
 
 
 _SMOOTH = 1e-6
-"""Share kappa above which a coherent footprint is not turned between segments."""
+"""In coherent footprints, coherent fraction kappa below which segments' speckles are decorrelated
+here."""
 _SMALLEST = 1e-300
 
 
 def draw(shots: Shots, scene: Scene, realisation: Realisation) -> Shots:
-    """Draw a footprint of its own for each point, with speckled amplitudes of its beamlets.
+    """Give each point its own footprint with speckled beamlet amplitudes.
 
-    A ValueError for direct detection. It adds up the intensities of all speckles in the aperture,
-    in each of which beamlets interfere: that is no factor on each beamlet's own echo.
+    Raises
+    ------
+    ValueError
+        For direct detection, which sums the intensities of all speckles in the aperture: that is
+        not a factor on each beamlet's echo.
     """
     if shots.architecture == "direct":
         raise ValueError(
@@ -176,13 +193,13 @@ def draw(shots: Shots, scene: Scene, realisation: Realisation) -> Shots:
 
 
 def fading_size(points: Points) -> Size | None:
-    """Change by taking the mean power for the power: pd is another law."""
+    """Error in pd from using mean instead of fluctuating power (Swerling); None if inactive."""
     smooth = points.by_roots or points.architecture == "direct"
     return None if smooth or points.word(_LAW) == "none" else Size(magnitude=1.0)
 
 
 def fade(shots: Shots, scene: Scene) -> Shots:
-    """Set detection in developed speckle, where the spec wants it and no phases are in common."""
+    """Set up detection in developed speckle, if the spec asks for it and beamlets add as powers."""
     from sweep.model.detection import Fading
 
     law = str(scene.parameters[_LAW])
@@ -202,7 +219,7 @@ def fade(shots: Shots, scene: Scene) -> Shots:
 
 
 def _line_deviation(shots: Shots, moments: "BeamletMoments") -> np.ndarray:
-    """Return the deviation of the beamlets' lines [bins of fs/N], (segments, n)."""
+    """Return the standard deviation of the beamlets' lines [bins of fs/N], (segments, n)."""
     bins = shots.fft_size / shots.sample_rate
     delay = 2 * shots.range / SPEED_OF_LIGHT
     weights = np.array(
@@ -218,11 +235,14 @@ def _line_deviation(shots: Shots, moments: "BeamletMoments") -> np.ndarray:
 _NODES, _DEVIATIONS_MAX = 81, 4.0
 """Lines of a footprint, evenly spaced: few would be a comb where they spread over bins."""
 _ALIKE = 1e-9
-"""Loss of correlation from the first to the last look up to which all have one speckle."""
+"""Loss of correlation between looks below which all looks share one speckle."""
 
 
 def _fade_in_looks(shots: Shots, ground: "GroundSpread") -> Shots:
-    """Let the speckle change from look to look by the motion between them."""
+    """Set the correlation of the speckle between the looks of a shot, from the motion between them.
+
+    Looks that are added coherently get a smaller amplitude (``beat_scale``) instead.
+    """
     looks = shots.looks
     if not looks.moving:
         return shots
@@ -267,7 +287,10 @@ def _fade_in_looks(shots: Shots, ground: "GroundSpread") -> Shots:
 
 
 def _power_of_looks(shots: Shots, slopes: Slopes) -> np.ndarray:
-    """Power of each look in the strongest bin over its mean, (3, n, looks): lines move on."""
+    """Return each look's power in the strongest bin over the mean of looks, (3, n, looks).
+
+    It differs between looks because lines drift out of the bin.
+    """
     number = shots.looks.number
     power = np.ones((3, shots.size, number))
     if not np.any(shots.look_drift):
@@ -287,19 +310,19 @@ def _power_of_looks(shots: Shots, slopes: Slopes) -> np.ndarray:
 
 
 class GroundSpread(NamedTuple):
-    """Ranges and Doppler shifts over a beam on the ground."""
+    """Spread of ranges and Doppler ratios over the beam on the ground."""
 
     slopes: Slopes
     plane: Plane | None
-    """None of ground that rays have found."""
+    """The plane; None for ray-traced ground."""
     moments: "BeamletMoments"
 
     def correlation(
         self, shots: Shots, pair: tuple[int, int], phase: "PhaseDifference"
     ) -> np.ndarray:
-        """Correlation of the speckle in two records by the phase between them, (n,) complex.
+        """Return the correlation of the speckle in two records, (n,) complex.
 
-        ``pair`` are the segments that the records are of.
+        ``pair``: segments of the two records; ``phase``: phase difference between the records.
         """
         if self.plane is not None:
             found = self.plane.mean_phasor(*phase).astype(complex)
@@ -317,7 +340,7 @@ class GroundSpread(NamedTuple):
 
 
 def _ground_spread(shots: Shots, ground: Ground) -> GroundSpread:
-    """Spread over the beam, by a plane's slopes or by the beamlets that rays have found."""
+    """Return the spread over the beam, of a plane or of ray-traced beamlets."""
     moments = _beamlet_moments(shots, ground)
     if isinstance(ground, Plane):
         return GroundSpread(ground.slopes, ground, moments)
@@ -325,10 +348,10 @@ def _ground_spread(shots: Shots, ground: Ground) -> GroundSpread:
 
 
 def _speckle_lines(shots: Shots, ground: Plane | Cast) -> SpeckleLines:
-    """Return the spread of bins and phases over the beam, along the slope and across it.
+    """Return gradients of line position and phase across the beam, along the slope and across it.
 
-    Across it only Doppler ratios change. All of the ground counts, also where its effects are too
-    small to change probabilities: places wander with them.
+    Across the slope only Doppler ratios change. The gradients are set even where the effects of the
+    footprint are too small to change probabilities, because peak positions wander with them.
     """
     if isinstance(ground, Plane):
         slopes, across = ground.slopes, np.zeros(shots.size)
@@ -351,22 +374,22 @@ def _speckle_lines(shots: Shots, ground: Plane | Cast) -> SpeckleLines:
 
 
 class PhaseDifference(NamedTuple):
-    """Phase by which scatterers' echoes differ between two segments, (n,) each."""
+    """Coefficients of a scatterer's phase difference between two segments, (n,) each."""
 
     turn: np.ndarray
     """Cycles per unit of the Doppler ratio beta."""
     delay_cycles: np.ndarray
-    """Cycles per unit of relative range, with the opposite sign."""
+    """Cycles per unit of relative range, with the sign reversed."""
 
     def along(self, slopes: Slopes) -> np.ndarray:
-        """Phase for a standard deviation of the beam [rad], (n,)."""
+        """Return the phase difference per standard deviation of the beam [rad], (n,)."""
         return 2 * np.pi * (self.turn * slopes.beta - self.delay_cycles * slopes.range)
 
 
 def segment_phases(shots: Shots) -> list[PhaseDifference]:
-    """Phase differences of the second from the first segment of each of SEGMENT_PAIRS.
+    """Return the phase differences of the pairs in SEGMENT_PAIRS, second segment less first.
 
-    By equation (1) of :mod:`sweep.model.speckle_correlation`.
+    Equation (1) of :mod:`sweep.model.speckle_correlation`.
     """
     echo_frequency, middles = _echo_frequencies(shots)
     delay = 2 * shots.range / SPEED_OF_LIGHT
@@ -402,7 +425,7 @@ def _echo_frequencies(shots: Shots) -> tuple[list[np.ndarray], np.ndarray]:
 def _line_spread(
     shots: Shots, pair: tuple[int, int], phase: PhaseDifference, slopes: Slopes
 ) -> LineSpread:
-    """Spread of lines over the bins of two segments, and the distance of the nearest bins."""
+    """Return the gradients of two segments' lines, and the distance of their strongest bins."""
     bin_width = shots.sample_rate / shots.window.length
     padding = shots.fft_size / shots.window.length
     distances, spreads = [], []
@@ -422,19 +445,19 @@ def _line_spread(
 
 
 class BeamletMoments(NamedTuple):
-    """Moments of beamlets' Doppler ratios and relative ranges, in this order."""
+    """Power-weighted moments of the beamlets' (Doppler ratio, relative range)."""
 
     mean: np.ndarray
-    """(2, n)."""
+    """(2, n): means."""
     covariance: np.ndarray
-    """(2, 2, n)."""
+    """(2, 2, n): covariance matrix, about each surface's own mean."""
 
 
 def _beamlet_moments(shots: Shots, ground: Ground) -> BeamletMoments:
-    """Return the moments of beamlets, about the mean of their own surface.
+    """Return the beamlets' moments of Doppler ratio and relative range.
 
-    Surfaces at different ranges, as a roof and the ground below, are echoes of their own, each of
-    which fades as a whole.
+    The covariance is about the mean of each surface: surfaces at different ranges, as a roof and
+    the ground below, are echoes of their own, each of which fades as a whole.
     """
     values = np.array([shots.doppler, shots.offset])
     return _moments_by_surface(shots.amplitude**2, values, ground.beside, shots.row)
@@ -443,7 +466,10 @@ def _beamlet_moments(shots: Shots, ground: Ground) -> BeamletMoments:
 def _moments_by_surface(
     power: np.ndarray, values: np.ndarray, beside: np.ndarray | None, row: np.ndarray
 ) -> BeamletMoments:
-    """Return the moments of values (2, rows, beamlets) by power, for points of these rows."""
+    """Return power-weighted moments of values (2, rows, beamlets), for points with the given rows.
+
+    ``beside`` (rows, beamlets) bool marks beamlets on another surface than the axis's, or is None.
+    """
     share = power / np.maximum(power.sum(axis=1), _SMALLEST)[:, None]
     mean = (share * values).sum(axis=-1)
     centred = values - mean[:, :, None]
@@ -460,11 +486,11 @@ def _moments_by_surface(
 def _phase_moments(
     moments: BeamletMoments, phases: list[PhaseDifference]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and variance of the phase differences of beamlets that rays have found, (3, n) each.
+    """Return mean [rad] and variance [rad^2] of the phase differences over ray-traced beamlets.
 
-    Ranges and Doppler shifts change evenly across a beam, Gaussian as it is, so that these two are
-    enough. A sum of phasors over few rays would repeat itself where their phases are whole turns
-    apart.
+    (len(phases), n) each. Ranges and Doppler ratios change linearly across a Gaussian beam, so that
+    the phase is normal. A sum of phasors over few rays would recur where their phases are whole
+    cycles apart.
     """
     weights = 2 * np.pi * np.array([[phase.turn, -phase.delay_cycles] for phase in phases])
     variance = np.einsum("pin,ijn,pjn->pn", weights, moments.covariance, weights)
@@ -472,7 +498,7 @@ def _phase_moments(
 
 
 def _cast_slopes(moments: BeamletMoments) -> Slopes:
-    """Return the changes along the direction in which beamlets' ranges change most, (n,) each."""
+    """Return the gradients of ray-traced ground along its steepest range, (n,) each."""
     deviation = np.sqrt(moments.covariance[1, 1])
     along = moments.covariance[0, 1] / np.maximum(deviation, _SMALLEST)
     return Slopes(along, deviation, np.zeros(deviation.shape))
