@@ -12,10 +12,11 @@ import shared
 from shared import DOCS, EXPERIMENTS, ROOT
 
 import sweep
-from sweep.analysis import labels, noise_only
+from sweep.analysis import labels
 from sweep.analysis.figures import Study
 from sweep.analysis.shot_figure import chosen, simulated
 from sweep.analysis.tables import false_alarms
+from sweep.model import noise_only
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.spec import load
 

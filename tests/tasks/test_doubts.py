@@ -145,7 +145,9 @@ def failing(*args, **kwargs):
 
 
 @pytest.mark.parametrize(
-    "stream", [closed(), SimpleNamespace(write=failing), object(), None], ids=str
+    "stream",
+    [closed(), SimpleNamespace(write=failing), object(), None],
+    ids=["closed", "fails", "no stream", "none"],
 )
 def test_a_warning_that_nobody_can_read_ends_no_run(stream, tmp_path, monkeypatch):
     monkeypatch.setattr("sys.stderr", stream)
