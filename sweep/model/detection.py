@@ -270,17 +270,10 @@ def fading_together(
 
     Notes
     -----
-    Joint exceedance of two correlated Rayleigh magnitudes [Schwartz, Bennett and Stein,
+    Of one bin these are two correlated Rayleigh magnitudes [Schwartz, Bennett and Stein,
     Communication Systems and Techniques, 1966, appendix A]. A, B are Th^2 over the mean powers, so
     that the segments are detected with e^-A and e^-B. r is the squared correlation of signal and
-    noise: ``alike``^2 times the product of SNR / (1 + SNR). Then
-
-    Notes
-    -----
-    Of one bin these are two correlated Rayleigh magnitudes [Schwartz, Bennett and Stein,
-    Communication Systems and Techniques, 1966, appendix A]. With A, B = Th^2 over the mean powers,
-    e^-A and e^-B the probabilities that either is detected, and r the square of the correlation
-    that noise leaves of the signals',
+    noise: ``alike``^2 times the product of SNR / (1 + SNR). Then both are detected with
 
         J = e^-A (1 - Q_1(sqrt(2 B / (1-r)), sqrt(2 r A / (1-r))))
             + e^-B Q_1(sqrt(2 r B / (1-r)), sqrt(2 A / (1-r)))
@@ -302,8 +295,10 @@ def fading_together(
     both = np.exp(-a) * marcum_q1(np.sqrt(2 * b * rest), np.sqrt(2 * square * a * rest)).p
     both += np.exp(-b) * marcum_q1(np.sqrt(2 * square * b * rest), np.sqrt(2 * a * rest)).q
     missed = np.maximum((1 - bins[0]) * (1 - bins[1]), 1e-300)
-    more = np.expm1(number * np.log1p(np.maximum(both - bins[0] * bins[1], 0.0) / missed))
-    of_many = one * other + (1 - one) * (1 - other) * more
+    alone = (1 - one) * (1 - other)
+    with np.errstate(over="ignore", invalid="ignore"):
+        more = np.expm1(number * np.log1p(np.maximum(both - bins[0] * bins[1], 0.0) / missed))
+        of_many = one * other + np.where(alone > 0, alone * more, 0.0)
     both = np.where(number > 1, np.minimum(of_many, np.minimum(one, other)), both)
     return np.where(there, both, np.nan)
 

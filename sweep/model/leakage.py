@@ -8,7 +8,7 @@ the accuracy asked for.
 
 Without padding the factor e^{i pi k} is a sign, so |X| far from the lines is a smooth function of
 k. Its sum over bins is then an integral plus corrections at its near end (Euler-Maclaurin, in
-central differences). |X|^2 is even about DC and Nyquist, so the far end needs no correction but
+central differences). As |X|^2 is even about DC and Nyquist, the far end needs no correction but
 half the value there. In v = cot(pi q / N), with the distance q from the lines, the integrand is
 nearly a polynomial: some thirty Gauss points represent sixty thousand bins.
 

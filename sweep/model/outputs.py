@@ -74,10 +74,16 @@ OUTPUTS: dict[str, Output] = {
     "log10_pfa_both_chirps": Output("1", "log10 of pfa_both_chirps", NO_BIN),
     "log10_pfa_shot": Output("1", "log10 of pfa_shot", NO_BIN),
     "p_leakage_up": Output(
-        "1", "probability that leaked signal raises a further group, up-chirp", "over noise alone"
+        "1",
+        "probability that leaked signal raises a further group, up-chirp",
+        "over noise alone; with runs of bins that join on to the echo's, of which flights and "
+        "drawn spectra make no point",
     ),
     "p_leakage_down": Output(
-        "1", "probability that leaked signal raises a further group, down-chirp", "over noise alone"
+        "1",
+        "probability that leaked signal raises a further group, down-chirp",
+        "over noise alone; with runs of bins that join on to the echo's, of which flights and "
+        "drawn spectra make no point",
     ),
     **_by_segment(
         "snr_{}", "signal-to-noise ratio", shot=None,

@@ -98,8 +98,8 @@ class LineSpread(NamedTuple):
 def bin_correlation(window: Window, lines: LineSpread) -> np.ndarray:
     """Return the correlation mu, equation (3), of the strongest bins of two segments, (n,) complex.
 
-    Where the phase turns too fast for the quadrature, |mu| for a Gaussian window transform of the
-    same half-width is returned instead; it is close to 0 there.
+    If the phase turns too fast for the quadrature, the result is |mu| for a Gaussian window
+    transform of the same half-width, which is close to 0 there.
     """
     end = np.minimum(_DEVIATIONS_MAX, REACH / np.maximum(lines.widest, 1e-300))
     node, weight = np.polynomial.legendre.leggauss(_NODES)

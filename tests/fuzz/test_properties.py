@@ -30,6 +30,8 @@ SOME = settings(
 SIGNAL = ("snr_up", "snr_down", "snr_doppler", "pd_up", "pd_down", "pd_doppler", "pd_shot")
 ROUNDING = 1e-9
 """Relative error of closed-form sums over some ten lines, 1e-13 seen, and of probabilities."""
+SHOT_ROUNDING = 1e-6
+"""That of pd_shot of segments that share speckle; 7e-8 was seen where pd_shot is 2e-16."""
 
 RANDOM = tuple(p.path for effect in EFFECTS if effect.is_random for p in effect.parameters)
 CLIPPING = ("instrument.processing.full_scale", "instrument.processing.bits")
@@ -72,10 +74,10 @@ def results_of(written):
     return results
 
 
-def falls(values):
+def falls(values, rounding=ROUNDING):
     """Whether values fall anywhere by more than rounding."""
     low, high = values[:-1], values[1:]
-    return bool((high < low * (1 - ROUNDING) - 1e-300).any())
+    return bool((high < low * (1 - rounding) - 1e-300).any())
 
 
 @pytest.mark.parametrize(
@@ -105,7 +107,8 @@ def test_more_light_is_never_worse(path, factors, written):
     unit = {"power": " W", "aperture": " m"}.get(path.rsplit(".", 1)[-1], "")
     results = results_of(written | {"axes": {path: [f"{base * f!r}{unit}" for f in factors]}})
     for name in SIGNAL:
-        assert not falls(results[name]), (name, results[name])
+        rounding = SHOT_ROUNDING if name == "pd_shot" else ROUNDING
+        assert not falls(results[name], rounding), (name, results[name])
 
 
 @settings(SOME)

@@ -190,7 +190,7 @@ CASES = {
 def test_places_wander_as_those_of_scatterers(case, rule, table_4_1):
     angle, changes = CASES[case]
     p = slope(table_4_1, angle, ratio=10.0, **{PROCESSING + "detection": rule}, **changes)
-    draws = 2000
+    draws = 5000
     _, *truth = scatterers_reported(p, draws, seed=angle)
     for method in ("probabilities", "noise"):
         got = flown(p, method, draws)

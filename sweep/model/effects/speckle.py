@@ -120,7 +120,7 @@ def size(points: Points) -> Size | None:
 
     A bin of magnitude |X| becomes sqrt(kappa) X + D with D complex normal of power (1 - kappa)
     |X|^2: between smooth and rough, 4 pi sigma_h << lambda, it lies within 1 +- 5 (4 pi sigma_h /
-    lambda). In incoherent footprints the coherent part has random phases. Where a sum of amplitudes
+    lambda). In incoherent footprints the coherent part has random phases. If a sum of amplitudes
     may cancel, the bound is relative to the sum of powers.
     """
     if not points.has(_ROUGHNESS):
