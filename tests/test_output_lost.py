@@ -172,7 +172,7 @@ def test_a_run_whose_terminal_is_closed_stops_and_can_be_resumed(tmp_path, where
 
 @pytest.mark.parametrize("where", ["none", "workers"])
 def test_a_run_whose_terminal_is_stopped_goes_on_to_its_end(tmp_path, where):
-    """As by Ctrl-S, with a terminal that takes nothing from the start."""
+    """Run on a terminal that Ctrl-S has stopped from the start."""
     store, said, script = (tmp_path / name for name in ("store.zarr", "said", "script.py"))
     script.write_text(RUN)
     tests = str(Path(__file__).parent / "tasks")

@@ -261,7 +261,7 @@ class StatedErrors(NamedTuple):
     across_end: float = 0.06
     """``any_bin`` of lines that spread across DC or Nyquist."""
     chirps: float = 0.01
-    """What the law of several segments adds with ``any_bin``."""
+    """Further error of the law of several segments with ``any_bin``."""
     looks: float = 0.025
     """Shots of several looks whose speckle motion changes; segments have the half."""
     alike_looks: float = 0.015

@@ -122,7 +122,7 @@ class BinSpeckle(NamedTuple):
 
 
 STEADY = BinSpeckle(0.0, np.empty(0))
-"""For echoes that do not fade, or have circular amplitudes in all bins."""
+"""Parameters of echoes that do not fade, or have circular amplitudes in all bins."""
 
 
 class SpeckleTable(NamedTuple):
@@ -303,29 +303,35 @@ def fading_together(
     return np.where(there, both, np.nan)
 
 
-MOST_BINS = 1e3
-"""Independent bins as which an echo counts at the most."""
+INDEPENDENT_BINS_MAX = 1e3
+"""Largest number of independent bins as which an echo counts."""
 
 
 def independent_bins(pd: np.ndarray, strongest: np.ndarray, level: np.ndarray) -> np.ndarray:
-    """Count the independent bins, each as the strongest, that detect as often as an echo: M.
+    """Return the number M of independent bins like the strongest that detect as often as an echo.
 
     Parameters
     ----------
     pd
         Probability that any bin of the echo is detected.
     strongest, level
-        |X| of its strongest bin and threshold over the noise per quadrature.
+        |X| of its strongest bin, and threshold Th, both over the noise per quadrature sigma.
+
+    Returns
+    -------
+    numpy.ndarray
+        M, not a whole number, from 1 to :data:`INDEPENDENT_BINS_MAX`; 1 where pd is nan, or where
+        pd and q both round to 1.
 
     Notes
     -----
-    With q = exp(-Th^2 / (2 sigma^2 (1 + SNR))) of the strongest bin, 1 - pd = (1 - q)^M. It is 1
-    for a lone line: all its bins fade together.
+    The strongest bin alone is detected with q = exp(-Th^2 / (2 sigma^2 (1 + SNR))), SNR = |X|^2 /
+    (2 sigma^2), and 1 - pd = (1 - q)^M. A lone line has M = 1, as all its bins fade together.
     """
     single = np.exp(-0.5 * np.square(level) / (1 + 0.5 * np.square(strongest)))
     with np.errstate(divide="ignore", invalid="ignore"):
         number = np.log1p(-np.minimum(pd, 1 - 1e-15)) / np.log1p(-np.minimum(single, 1 - 1e-15))
-    return np.clip(np.nan_to_num(number, nan=1.0), 1.0, MOST_BINS)
+    return np.clip(np.nan_to_num(number, nan=1.0), 1.0, INDEPENDENT_BINS_MAX)
 
 
 def any_two(chances: np.ndarray, others: np.ndarray) -> np.ndarray:

@@ -189,9 +189,11 @@ def folded(number: int) -> Rule:
 
 
 def _density_change(offsets: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Return the beam's power about each beamlet less the lattice's weight, (number,); sums to 0.
+    """Return the beam's power in each beamlet's cell less its weight, (number,); sums to 0.
 
-    What lies beyond the lattice is shared out in its outermost shell.
+    ``offsets`` (2, number) are in standard deviations of the beam; ``weight`` (number,) sums to 1.
+    The beam is Gaussian, and cells have equal areas. Beamlets at the largest radius
+    share the power outside of all cells.
     """
     squared = (offsets**2).sum(axis=0)
     # Weights are exp(-r^2 / 2) at the radius r before the lattice was stretched.

@@ -579,7 +579,7 @@ class SceneSpec(Study):
         if floor and any(errors[name] for name in floor.fields):
             fields = {n: written for n, written in floor.fields.items() if errors[n]}
             brought = ", ".join(f"{name} {written}" for name, written in fields.items())
-            off = ", ".join(f"{name}: {_least(rules[name])}" for name in fields)
+            off = ", ".join(f"{name}: {_smallest_quantity(rules[name])}" for name in fields)
             sentences.append(
                 f"the instrument {floor.instrument} brings a floor of errors: {brought}. State "
                 f"error_floor in the study to change it; 'error_floor: {{{off}}}' switches it off"
@@ -756,6 +756,6 @@ def written(fields: Mapping[str, str]) -> dict[str, Any]:
     return document.value
 
 
-def _least(rule: Rule) -> str:
-    """Least value of a field, as a user would write it."""
+def _smallest_quantity(rule: Rule) -> str:
+    """Return the smallest value of a field, as a user would write it."""
     return rule.bounds.get("at_least", "0") if isinstance(rule, Numeric) else "0"

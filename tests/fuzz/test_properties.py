@@ -32,7 +32,7 @@ SIGNAL = ("snr_up", "snr_down", "snr_doppler", "pd_up", "pd_down", "pd_doppler",
 ROUNDING = 1e-9
 """Relative error of closed-form sums over some ten lines, 1e-13 seen, and of probabilities."""
 SHOT_ROUNDING = 1e-6
-"""That of pd_shot of segments that share speckle; 7e-8 was seen where pd_shot is 2e-16."""
+"""Relative error of pd_shot in shared speckle; 7e-8 was seen where pd_shot is 2e-16."""
 
 RANDOM = tuple(p.path for effect in EFFECTS if effect.is_random for p in effect.parameters)
 CLIPPING = ("instrument.processing.full_scale", "instrument.processing.bits")

@@ -53,7 +53,7 @@ CASES = {
 
 
 RATIOS = {"four bins": 0.6}
-"""Of |X| to the threshold; any of many bins detects more often than one."""
+"""Ratio of |X| to the threshold; any of many bins detects more often than one."""
 
 
 @pytest.mark.parametrize(

@@ -140,7 +140,7 @@ def size(points: Points) -> Size | None:
 
 
 _SMOOTH = 1e-6
-"""In coherent footprints, coherent fraction kappa below which segments' speckles are decorrelated
+"""Coherent fraction kappa of coherent footprints below which segments' speckles are decorrelated
 here."""
 _SMALLEST = 1e-300
 
