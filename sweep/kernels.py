@@ -198,6 +198,7 @@ def cache_folder() -> CacheFolder:
                 if os.path.isabs(base):  # the user's is not without a home
                     root = Path(base) / f"sweep-kernels-{os.getuid()}"
                     _make_private(root)
+                    _log.info("compiled kernels are kept in %s", root / fingerprint)
                     return CacheFolder(root / fingerprint)
             except OSError as error:
                 reasons.append(

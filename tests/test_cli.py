@@ -1,5 +1,6 @@
 import errno
 import json
+import logging
 import os
 import re
 import shutil
@@ -252,6 +253,19 @@ def test_status_tells_who_is_at_work(ran):
     held.release()
     assert "72 of 80 points, 9 of 10 blocks" in shown
     assert f"running: process {os.getpid()} on" in shown
+
+
+@pytest.mark.parametrize(
+    ("options", "steps", "tasks"),
+    [([], False, False), (["-v"], True, False), (["-v", "-v"], True, True)],
+)
+def test_the_log_of_a_command_is_shown_where_it_is_asked_for(here, options, steps, tasks):
+    result = sweep("run", "small.yaml", "--scheduler", "none", *options)
+    assert result.exit_code == 0
+    assert bool(re.search(r"sweep\.session: .* blocks computed in ", result.stderr)) == steps
+    assert ("sweep.session: committed " in result.stderr) == tasks
+    log = logging.getLogger("sweep")
+    assert not log.handlers and log.level == logging.NOTSET and log.propagate
 
 
 def test_an_error_that_is_not_the_users_exits_1(here, monkeypatch):

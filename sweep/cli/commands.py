@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import logging
 import os
 import sys
 from collections.abc import Sequence
@@ -63,12 +64,60 @@ def _make_output_printable() -> None:
             setattr(sys, name, PrintableStream(stream))
 
 
+class _StandardError(logging.StreamHandler[Any]):
+    """Log handler that writes to what is standard error at that time, above a bar if there is one.
+
+    Parallel to Python's handler of last resort.
+    """
+
+    @property
+    def stream(self) -> Any:
+        """Standard error; None if it is closed."""
+        return sys.stderr
+
+    @stream.setter
+    def stream(self, value: Any) -> None:
+        """Ignore the stream that the base class keeps."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write a record, if anything can be written."""
+        if self.stream is not None:
+            super().emit(record)
+
+
+def _show_log(ctx: click.Context, _: click.Parameter, verbosity: int) -> None:
+    """Write the log of the package to standard error: its steps, and each task if asked twice."""
+    if not verbosity:
+        return
+    log, handler = logging.getLogger("sweep"), _StandardError()
+    handler.setFormatter(logging.Formatter("%(asctime)s %(name)s: %(message)s", "%H:%M:%S"))
+    before = log.level, log.propagate
+    log.addHandler(handler)
+    log.setLevel(logging.INFO if verbosity == 1 else logging.DEBUG)
+    log.propagate = False
+
+    def restore() -> None:
+        log.removeHandler(handler)
+        log.level, log.propagate = before
+
+    ctx.call_on_close(restore)
+
+
 class Commands(click.Group):
     """Commands whose users' mistakes end in plain words and exit code 2."""
 
     def add_command(self, cmd: click.Command, name: str | None = None) -> None:
-        """Add a command, listed with the whole first paragraph of its help."""
+        """Add a command, listed with the whole first paragraph of its help, that can be verbose."""
         cmd.short_help = " ".join((cmd.help or "").split("\n\n")[0].split())
+        cmd.params.append(
+            click.Option(
+                ["-v", "--verbose"],
+                count=True,
+                expose_value=False,
+                callback=_show_log,
+                help="Log the steps of the command to standard error; -vv logs each task too.",
+            )
+        )
         super().add_command(cmd, name)
 
     def main(self, *args: Any, **options: Any) -> Any:

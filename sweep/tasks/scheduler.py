@@ -7,7 +7,9 @@ result stays on a worker that its death could lose.
 from __future__ import annotations
 
 import hashlib
+import logging
 import queue
+import textwrap
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -43,9 +45,20 @@ LEASE = 30.0
 #: knows of a folder for as long.
 LATENCY = 60.0
 
+#: Time without an answer after which a run is told to stall [s]; longer where tasks take longer.
+STALL_SECONDS = 60.0
+
+#: Times that a task should take after which a run is told to stall.
+STALL_TASKS = 5.0
+
+#: Largest number of tasks, and of workers, that a summary of the state lists.
+TASKS_SHOWN, WORKERS_SHOWN = 5, 10
+
 SAME_PLACE = "workers have to see the store's folder, under the same path"
 
 Say = Callable[[str], None]
+
+_log = logging.getLogger("sweep.scheduler")
 
 
 @dataclass
@@ -123,6 +136,9 @@ class Scheduler:
         self._unseen: list[tuple[Receipt, str, float]] = []  # of which worker, looked for till when
         self._trusted: set[str] = set()  # workers that have written to the store that is here
         self._unfit: dict[str, int] = {}  # workers that are left out, and their threads
+        self._stall_clock = time.monotonic()  # when an answer last arrived
+        self._stall_patience = STALL_SECONDS  # time from then until the next word of it
+        self._stall_told = False  # since then
 
     def answers(self, stopping: Callable[[], bool]) -> Iterator[Answer]:
         """Answers as they arrive; an empty one every `TICK` while none does.
@@ -150,6 +166,43 @@ class Scheduler:
         finally:
             self._flying.clear()  # a task without a future is cancelled
             self._outrun.clear()
+
+    def state_summary(self) -> str:
+        """Describe the blocks, tasks and workers of the run, one to a line."""
+        now = time.monotonic()
+        tasks = set(self._flying.values())
+        lines = [
+            f"{self._blocks.left:,} blocks not yet sent, {len(self._blocks.failed):,} failed once, "
+            f"{len(self._unseen):,} written but not yet found in the store",
+            f"{len(tasks):,} tasks in flight, {len(self._outrun):,} superseded; "
+            f"{self._pace.blocks:,} blocks came back in {duration(self._pace.seconds)} of work",
+        ]
+        lines += [
+            f"task of block {task.blocks[0]} and {len(task.blocks) - 1} more: sent "
+            f"{duration(now - task.sent)} ago, {len(task.futures)} times; Dask says "
+            f"{', '.join(sorted({str(future.status) for future in task.futures.values()}))}"
+            for task in sorted(tasks, key=lambda task: task.sent)[:TASKS_SHOWN]
+        ]
+        for worker, threads in sorted(self._slots.threads.items())[:WORKERS_SHOWN]:
+            answered = self._heard.get(worker)
+            heard = "never" if answered is None else f"{duration(now - answered)} ago"
+            excluded = ", left out" if worker in self._unfit else ""
+            lines.append(f"worker {worker}: {threads} threads, last answer {heard}{excluded}")
+        return "\n".join(lines)
+
+    def _watch_for_stall(self) -> None:
+        """Tell that nothing comes back, after ever longer times, and log what is out where."""
+        if not self._flying or not self._fit():  # that no worker is there is told by others
+            self._stall_clock = time.monotonic()
+        waited = time.monotonic() - self._stall_clock
+        if waited < self._stall_patience:
+            return
+        is_first = not self._stall_told
+        self._stall_patience, self._stall_told = 2 * waited, True
+        summary = self.state_summary()
+        _log.info("nothing came back for %s:\n%s", duration(waited), summary)
+        told = f"no block has come back for {duration(waited)}"
+        self._say(f"{told}:\n{textwrap.indent(summary, '  ')}" if is_first else told)
 
     def _fit(self) -> list[str]:
         """Workers that there are, but for those that are left out."""
@@ -189,6 +242,7 @@ class Scheduler:
         key = task_key(self._job, task.blocks, first in self._blocks.failed, self._copies[first])
         future = self._client.submit(work, self._job, task.blocks, key=key, retries=0, **where)
         task.sent = time.monotonic()
+        _log.debug("sent block %s and %s more as %s", first, len(task.blocks) - 1, key)
         task.futures[future.key] = future
         self._flying[future.key] = task
         future.add_done_callback(self._arrived.put)
@@ -232,9 +286,12 @@ class Scheduler:
 
     def _lease(self, task: _Task) -> float:
         """Seconds after which a task may be sent again; longer each time."""
+        return max(LEASE, 5 * self._task_seconds(task)) * 2.0 ** (len(task.futures) - 1)
+
+    def _task_seconds(self, task: _Task) -> float:
+        """Time that a task should take by the pace of those before [s]."""
         pace = self._pace
-        expected = len(task.blocks) * pace.seconds / pace.blocks if pace.blocks else LEASE
-        return max(LEASE, 5 * expected) * 2.0 ** (len(task.futures) - 1)
+        return len(task.blocks) * pace.seconds / pace.blocks if pace.blocks else LEASE
 
     def _next(self) -> Answer:
         answer = Answer()
@@ -242,6 +299,7 @@ class Scheduler:
             future = self._arrived.get(timeout=TICK)
         except queue.Empty:
             self._check()
+            self._watch_for_stall()
         else:
             if future.key in self._flying:
                 answer = self._arrival(future)
@@ -256,8 +314,14 @@ class Scheduler:
         for key in takewhile(lambda key: key != future.key, task.futures):
             self._outrun[key] = task.futures[key]  # so that its worker does not look idle
         answer = _answer(future, task.blocks)
-        self._heard[answer.worker] = time.monotonic()
+        self._heard[answer.worker] = self._stall_clock = time.monotonic()
         self._pace.learn(answer)
+        self._stall_patience = max(STALL_SECONDS, STALL_TASKS * self._task_seconds(task))
+        self._stall_told = False
+        _log.debug(
+            "%s answered: %s blocks written, %s failed, %s begun", answer.worker or "a lost worker",
+            len(answer.receipts), len(answer.failures), len(answer.begun),
+        )  # fmt: skip
         self._failed_at.update((failure.block, answer.worker) for failure in answer.failures)
         done = {r.block for r in answer.receipts} | {f.block for f in answer.failures}
         self._put_back([block for block in task.blocks if block not in done])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import logging
 import math
 import os
 import re
@@ -91,6 +92,8 @@ ABSENT = 20.0
 
 #: Figures of receipts that a run adds up.
 COUNTED = ("points", "taken", "bytes", "seconds", "write_seconds")
+
+_log = logging.getLogger("sweep.session")
 
 NOT_FOUND = (
     "block {} is computed in pieces, and what one worker saved was not found by the next: "
@@ -314,12 +317,14 @@ class Pool(ExitStack):
             path, study_id, options.evaluate, options.block_timeout, options.durable, self._code()
         )
         if self.is_plain:
+            _log.info("blocks are computed in this process, one after the other")
             if options.performance_report is not None:
                 self.told.say("no performance report: a plain loop has no scheduler to tell of it")
             return plain(job, queue, lambda: self.interrupts.stopping, seen)
         from sweep.tasks.scheduler import Scheduler
 
         client, slots, _ = self.connect()
+        _log.info("blocks are computed by the workers of %s", client)
         scheduler = Scheduler(client, slots, job, queue, seen=seen, say=self.told.say)
         return scheduler.answers(lambda: self.interrupts.stopping)
 
@@ -431,6 +436,10 @@ class Session:
             if not self._pool.options.retry_failed:
                 settled[list(given_up(self._path, done.size))] = True
             left_out = int(np.count_nonzero(settled & ~done))
+            _log.info(
+                "%s: study %s of %s blocks, %s done before, %s left out for their errors",
+                self._path, self._study.id, done.size, np.count_nonzero(done), left_out,
+            )  # fmt: skip
             stopped = self._record("begun", host=socket.gethostname(), pid=os.getpid()) or before
             stopped = stopped or self._compute(settled, done) or self._look_on(look, done)
             done &= look.whole()
@@ -454,6 +463,11 @@ class Session:
             write_seconds=committed["write_seconds"],
             rays=rays or {},
         )
+        _log.info(
+            "%s: %s blocks computed in %s, %s failed%s",
+            self._path, outcome.blocks_computed, duration(outcome.seconds), len(outcome.failures),
+            f"; stopped: {stopped}" if stopped else "",
+        )  # fmt: skip
         if outcome.complete:
             store.remove_partials(self._path)
             journal.discard_begun(self._path)
@@ -554,6 +568,7 @@ class Session:
             if not blocks.again(failure.block):
                 self._journal.record_failure(failure)
                 self._failures.append(failure)
+            _log.info("block %s failed on %s: %s", failure.block, failure.host, failure.error)
         for block, there in answer.begun.items():
             if there <= self._begun.get(block, 0.0):
                 raise StoreError(NOT_FOUND.format(block))
@@ -567,6 +582,8 @@ class Session:
         """Count the blocks whose receipts are written."""
         if not self._journal.flush(now=now):
             return
+        if self._gathered:
+            _log.debug("committed %s blocks", len(self._gathered))
         for receipt in self._gathered:
             self._committed["blocks"] += 1
             for name in COUNTED:
