@@ -191,10 +191,19 @@ _BITS = PROCESSING + "bits"
 
 
 def rounding_size(points: Points) -> Size | None:
-    """Return the noise of rounding, without clipping; the threshold follows it."""
+    """Return the noise of rounding, without clipping; the threshold follows it.
+
+    It is white, and is compared with the density of the receiver's noise at the line. A spectrum
+    in which all noise is made white scales a line by the root of both together, where the
+    receiver's alone is left out.
+    """
     if not points.has(_BITS):
         return None
-    return Size(noise=points.rounding / points.noise_variance)
+    white = points.rounding / points.noise_variance
+    least = np.finfo(float).tiny  # the density where filters let nothing pass
+    density = np.maximum(points.noise_density, least)
+    scaled = np.sqrt((1 + white) / (1 + white / density))
+    return Size(magnitude=np.abs(scaled - 1), noise=white / density)
 
 
 def add_rounding(shots: Shots, scene: Scene) -> Shots:

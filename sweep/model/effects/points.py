@@ -486,12 +486,19 @@ class Points:
         level = self.beat * (0.5 * self.window.sum) / self.deviation * self.transfer
         if self.word(RECEIVER + "noise_shape") == "white":
             return level
+        density = self.noise_density
+        if self.antialias:  # where next to no noise passes, that of the ADC is what there is
+            density = density + self.rounding / self.noise_variance
+        return level / np.sqrt(density)
+
+    @cached_property
+    def noise_density(self) -> np.ndarray | float:
+        """Density of the receiver's noise at the line over its mean over all bins, by segment."""
+        if self.word(RECEIVER + "noise_shape") == "white":
+            return 1.0
         names = "detector_bandwidth", "amplifier_bandwidth"
         filters = {name: self[RECEIVER + name] for name in names} | self.antialias
-        shape = link.noise_density(self.frequency, sample_rate=self.sample_rate, **filters)
-        if self.antialias:  # where next to no noise passes, that of the ADC is what there is
-            shape = shape + self.rounding / self.noise_variance
-        return level / np.sqrt(shape)
+        return link.noise_density(self.frequency, sample_rate=self.sample_rate, **filters)
 
     @cached_property
     def amplitude(self) -> np.ndarray:

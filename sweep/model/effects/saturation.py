@@ -25,7 +25,7 @@ from scipy.special import ndtr
 
 from sweep.model import link, waveform
 from sweep.model.constants import SPEED_OF_LIGHT
-from sweep.model.effects import atmosphere, noise_sources
+from sweep.model.effects import amplifier, atmosphere, circulator_leak, noise_sources
 from sweep.model.effects.effect import Effect, Parameter, Scene, Size
 from sweep.model.effects.points import Points
 from sweep.model.preparation import PROCESSING, Shots
@@ -100,6 +100,13 @@ def _lost(x: np.ndarray, s: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.n
 
 _FULL_SCALE = PROCESSING + "full_scale"
 
+NOISE = (
+    noise_sources.SOLAR_BACKGROUND, atmosphere.BACKSCATTER,
+    noise_sources.RELATIVE_INTENSITY_NOISE, amplifier.SPONTANEOUS_EMISSION,
+    circulator_leak.CIRCULATOR_LEAK, noise_sources.QUANTISATION,
+)  # fmt: skip
+"""Effects that add noise before the ADC clips, besides the shot noise of the echo."""
+
 MOST_BEYOND = 1e6
 """Signal or noise over full scale; what clipping leaves has lost as many digits as this has."""
 
@@ -172,13 +179,9 @@ def size(points: Points) -> Size | None:
     together = echo if points.architecture == "direct" else np.sqrt(echo)
     amplitude = (points.beat * together * points.transfer).max(axis=0)
     louder = 1 + points.echo_noise
-    sources = (
-        noise_sources.SOLAR_BACKGROUND, atmosphere.BACKSCATTER,
-        noise_sources.RELATIVE_INTENSITY_NOISE, noise_sources.QUANTISATION,
-    )  # fmt: skip
-    for source in sources:
-        if (other := source.size(points)) is not None:
-            louder = louder + other.noise
+    for effect in NOISE:
+        if (change := effect.size(points)) is not None:
+            louder = louder + change.noise
     deviation = np.sqrt(points.noise_variance * louder)
     limit = points[_FULL_SCALE]
     v = np.where(limit > 0, limit, _NO_LIMIT)

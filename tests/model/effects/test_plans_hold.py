@@ -6,6 +6,7 @@ import pytest
 from effect_points import found, kept_in, planned, points_of, scene, shots_of
 
 from sweep.model import shot
+from sweep.model.effects import saturation
 from sweep.model.effects.catalogue import CORE, DEFAULTS, EFFECTS
 from sweep.model.ground import Cast, Footprints, of_rays
 from sweep.model.shot import find, prepare_cast
@@ -245,3 +246,77 @@ def test_a_scene_calls_for_rotation_where_bodies_turn(table_4_1):
         for turns in (True, False)
     )  # fmt: skip
     assert turning.kept.all() and not still.kept.any() and not still.error.any()
+
+
+STRONG_NOISE = {
+    "signal_shot_noise": {},
+    "solar_background": {
+        "target.solar_irradiance": 1e13, "instrument.receiver.optical_passband": 1e-8,
+        "instrument.receiver.field_of_view": 1e-2,
+    },
+    "backscatter": {"atmosphere.extinction": 1e-3, "atmosphere.lidar_ratio": 30.0},
+    "relative_intensity_noise": {"instrument.laser.relative_intensity_noise": 1e-12},
+    "spontaneous_emission": {
+        "instrument.laser.spontaneous_emission": 100.0, "instrument.telescope.isolation": 1e2,
+    },
+    "circulator_leak": {
+        "instrument.telescope.leak_path": 2.0, "instrument.telescope.isolation": 1e3,
+        "instrument.laser.relative_intensity_noise": 1e-13,
+    },
+    "quantisation": {"instrument.processing.bits": 2.0},
+}  # fmt: skip
+"""Parameters of each effect that adds noise, so that it has much of it."""
+
+
+def test_saturation_knows_every_effect_that_adds_noise():
+    adding = {effect.name for effect in EFFECTS if effect.stage == "noise"}
+    assert adding == {effect.name for effect in saturation.NOISE} | {"signal_shot_noise"}
+    assert adding == set(STRONG_NOISE)
+
+
+@pytest.mark.parametrize("name", STRONG_NOISE)
+def test_noise_of_any_source_that_saturates_an_adc_is_in_the_bound_of_saturation(table_4_1, name):
+    """Full scale is 1.5 to 5 deviations of all noise: what it clips, it clips by that source."""
+    parameters = scene(
+        table_4_1, POINTS, 3, fft_size=2**13, bins_counted="all", beamlets=7,
+        range=np.geomspace(100.0, 5000.0, POINTS), window="hann",
+    ) | STRONG_NOISE[name]  # fmt: skip
+    parameters["instrument.processing.full_scale"] = 1.0
+    for _ in range(3):  # the steps of an ADC follow its full scale
+        deviation = np.sqrt(shots_of(parameters, {name}).noise_variance)
+        parameters["instrument.processing.full_scale"] = deviation * np.geomspace(1.5, 5, POINTS)
+    made = planned(points_of(parameters), {}, 1.0)
+    most = made.change[made.names.index("saturation")]
+    on, off = found(parameters, {name, "saturation"}), found(parameters, {name})
+    moved = magnitudes_moved(on, off, shots_of(parameters, {name}).bin_deviation)
+    assert (np.minimum(moved, 1) <= most + ROUNDING).all()
+    assert (np.minimum(changed(on, off), 1) <= most + ROUNDING).all()
+    assert moved.max() > 1e-3
+
+
+@pytest.mark.parametrize("antialias", [0.0, 60e6])
+def test_steps_of_an_adc_are_compared_with_the_noise_that_filters_leave_at_the_line(
+    table_4_1, antialias
+):
+    """Lines lie at up to half the sample rate, far beyond the poles of the receiver."""
+    parameters = scene(
+        table_4_1, POINTS, 5, fft_size=2**13, bins_counted="all", beamlets=1, window="hann",
+        range=np.linspace(300.0, 20e3, POINTS), power=np.geomspace(1e-2, 1e4, POINTS),
+        sample_rate=600e6, duration=500e-6,
+    ) | {
+        "instrument.receiver.noise_shape": "receiver",
+        "instrument.receiver.detector_bandwidth": 20e6,
+        "instrument.receiver.amplifier_bandwidth": 20e6,
+        "instrument.receiver.antialias_bandwidth": antialias,
+        "instrument.processing.bits": 6.0, "instrument.processing.full_scale": 1.0,
+    }  # fmt: skip
+    others = {"doppler"}
+    deviation = np.sqrt(shots_of(parameters, others).noise_variance)
+    parameters["instrument.processing.full_scale"] = deviation * np.geomspace(1, 100, POINTS)
+    made = planned(points_of(parameters), {}, 1.0)
+    most = made.change[made.names.index("quantisation")]
+    on, off = found(parameters, others | {"quantisation"}), found(parameters, others)
+    assert (np.minimum(changed(on, off), 1) <= most + ROUNDING).all()
+    moved = magnitudes_moved(on, off, shots_of(parameters, others).bin_deviation)
+    assert (np.minimum(moved, 1) <= most + ROUNDING).all()
+    assert (most < 1).any() and changed(on, off).max() > 1e-3 and moved.max() > 1e-3
