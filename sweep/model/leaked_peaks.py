@@ -18,7 +18,14 @@ the one where the sum of rates exceeds a number from the exponential distributio
 on from the next bin with another such number.
 
 An echo in developed speckle fades as a whole, and its leaked signal with it. A bin fades with the
-echo whose strongest bin is nearest. The probability of leakage is then the mean over speckle.
+echo whose strongest bin is nearest. The probability of leakage is then the mean over speckle. With
+the speckle's power u = e^t, of mean 1, and the sum R(u) of an echo's rates r(a_k sqrt(u)) it is
+
+    P = int (1 - exp(-R(e^t))) e^(t - e^t) dt,
+
+by the trapezoidal rule, which converges exponentially as the integrand vanishes at both ends. Its
+nodes are a whole number of steps of the tabulated ln(a) apart. A bin's rates at all nodes are then
+one row of a table (:func:`_rates_by_phase`), and R is a weighted sum of rows, without a logarithm.
 
 A line of leaked light (:mod:`sweep.model.effects.circulator_leak`) raises peaks in its own bins, by
 the magnitudes that it has there at one of some phases.
@@ -40,8 +47,8 @@ from sweep.model.looks import Looks
 from sweep.model.marcum import excess_crossing, marcum_q1_pair
 from sweep.model.preparation import Shots
 
-RATES = 1024
-"""Number of amplitudes at which a point's rates are tabulated."""
+RATES = 2048
+"""Number of amplitudes at which rates are tabulated."""
 
 SURE = 12.0
 """Amplitude above the threshold [sigma] from which a bin is certain to cross."""
@@ -64,14 +71,14 @@ POINTS_WITH_LINE = 4
 HALVINGS = 40
 """Bisection steps for the magnitude of a raised peak; relative error 1e-11."""
 
-_PANELS = np.array([0.0, 0.125, 0.25, 0.5, 1.0, 2.0, 3.0, 4.5, 6.5, 9.0, 12.0, 16.0, 21.0, 28.0])
-_NODE, _WEIGHT = np.polynomial.legendre.leggauss(8)
-SPECKLE_POWER = (_PANELS[:-1, None] + np.diff(_PANELS)[:, None] * 0.5 * (_NODE + 1)).ravel()
-"""Nodes in speckle power (mean 1) of the average over speckle; weights are SPECKLE_WEIGHT."""
-SPECKLE_WEIGHT = (np.diff(_PANELS)[:, None] * 0.5 * _WEIGHT).ravel() * np.exp(-SPECKLE_POWER)
+LOG_POWER_MIN, LOG_POWER_MAX = -10.0, 3.5
+"""Ends of the average over speckle in ln(power), whose mean power is 1."""
 
-CLASS_WIDTH = 0.02
-"""Width in ln(amplitude) of the histogram bins whose members are averaged over speckle together."""
+LOG_POWER_STEP_MAX = 0.25
+"""Largest step of this average, which errs by 1e-8 of the mean for e^(2 t - e^t)."""
+
+CROSSING_STEP_MAX = 0.5
+"""Largest step of ln(rate) between nodes: what crosses within fewer ones errs by more than 1e-7."""
 
 
 class LeakedPeaks(NamedTuple):
@@ -100,10 +107,12 @@ class LeakedPeaks(NamedTuple):
     """(m, 3, 2) int64: begin and end of each segment in ``barred_bin``."""
     barred_bin: np.ndarray
     """int64: bins in which noise alone raises no peak."""
+    law: np.ndarray
+    """(m,) int64: row of ``rates`` and ``scale`` of each point."""
     rates: np.ndarray
-    """(m, RATES): ln(rate) at evenly spaced ln(amplitude)."""
+    """(laws, RATES): ln(rate) at evenly spaced ln(amplitude)."""
     scale: np.ndarray
-    """(m, 2): first of these ln(amplitude), and their step."""
+    """(laws, 2): first of these ln(amplitude), and their step."""
 
     @classmethod
     def nothing(cls, points: int) -> "LeakedPeaks":
@@ -111,21 +120,20 @@ class LeakedPeaks(NamedTuple):
         none, bins, sums = np.zeros((points, 3, 2), np.int64), np.empty(0, np.int64), (points, 3)
         return cls(
             none, bins, np.empty(0), bins, np.empty(0), np.zeros(sums), none, bins,
-            np.empty((PHASES, 0)), np.zeros(sums), none, bins, np.zeros((points, 1)),
-            np.zeros((points, 2)),
+            np.empty((PHASES, 0)), np.zeros(sums), none, bins, np.zeros(points, np.int64),
+            np.zeros((1, 1)), np.zeros((1, 2)),
         )  # fmt: skip
 
     def of(self, points: np.ndarray) -> "LeakedPeaks":
         """Bins of some points by their numbers, or a mask; lists of bins stay whole."""
-        by_point = ("stretch", "total", "line_stretch", "line_total", "barred_stretch", "rates",
-                    "scale")  # fmt: skip
+        by_point = ("stretch", "total", "line_stretch", "line_total", "barred_stretch", "law")
         return self._replace(**{name: getattr(self, name)[points] for name in by_point})
 
     def mean_leakage(self) -> np.ndarray:
         """Return the mean probability of leakage over speckle and the line's phase, (m, 3)."""
-        found = np.empty(self.total.shape)
-        _average(self, SPECKLE_POWER, SPECKLE_WEIGHT, found)
-        return found
+        means = np.empty(self.total.shape)
+        _average(self, means)
+        return means
 
 
 def leaking_points(shots: Shots, found: Groups) -> np.ndarray:
@@ -170,15 +178,12 @@ def leaked_peaks(
             leaks = LeakedPeaks.nothing(part.size)
             if shots.leak_amplitude is not None:
                 seen, echo, leaks = _with_line(shots, part, seen, echo)
-            level, floor = (
-                np.broadcast_to(v, shots.size)[part]
-                for v in (shots.threshold / shots.bin_deviation, shots.floor)
-            )
-            rates, scale = _rates(shots.looks, level, floor)
+            level = np.broadcast_to(shots.threshold / shots.bin_deviation, shots.size)[part]
+            law, rates, scale = _rates(shots.looks, level)
             leaks = leaks._replace(
                 stretch=seen.stretch, bin=_leaked_bins(seen)[0],
-                amplitude=np.empty(seen.aside.size), echo=echo, edge=seen.edge, rates=rates,
-                scale=scale,
+                amplitude=np.empty(seen.aside.size), echo=echo, edge=seen.edge, law=law,
+                rates=rates, scale=scale,
             )  # fmt: skip
             _sum_rates(seen.leaked, leaks)
             yield part, leaks
@@ -238,23 +243,19 @@ def _with_line(
     )  # fmt: skip
 
 
-def _rates(looks: Looks, level: np.ndarray, floor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return :attr:`LeakedPeaks.rates` and ``scale`` of points, by threshold and floor [sigma].
+def _rates(looks: Looks, level: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return :attr:`LeakedPeaks.law`, ``rates`` and ``scale`` of points by threshold [sigma].
 
     Thresholds of shots of a flight differ by rounding alone, and have one table.
     """
-    law = np.round(np.stack([level, np.maximum(floor, FAINTEST)], axis=1), 9)
-    law, row = np.unique(law, axis=0, return_inverse=True)
-    rates, scale = _rates_by_law(looks, *np.ascontiguousarray(law.T))
-    return rates[row.ravel()], scale[row.ravel()]
+    levels, law = np.unique(np.round(level, 9), return_inverse=True)
+    return law.ravel().astype(np.int64), *_rates_by_level(looks, levels)
 
 
-def _rates_by_law(
-    looks: Looks, level: np.ndarray, floor: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the tables of :func:`_rates`, one of each threshold and floor."""
+def _rates_by_level(looks: Looks, level: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Compute the tables of :func:`_rates`, one of each threshold."""
     rates, scale = np.empty((level.size, RATES)), np.empty((level.size, 2))
-    _fill_rates(level, floor, rates, scale)
+    _fill_rates(level, rates, scale)
     if looks.several:
         for j in range(level.size):
             amplitude = np.exp(scale[j, 0] + scale[j, 1] * np.arange(RATES))
@@ -264,14 +265,14 @@ def _rates_by_law(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _fill_rates(level, floor, rates, scale):
+def _fill_rates(level, rates, scale):
     """Tabulate ln(rate) for single looks, into ``rates`` (m, RATES) and ``scale`` (m, 2).
 
-    ``level`` and ``floor`` (m,): threshold and lowest amplitude [sigma].
+    ``level`` (m,): threshold [sigma].
     """
     for j in range(level.size):
         b = level[j]
-        scale[j, 0] = math.log(min(floor[j], b + 1.0))
+        scale[j, 0] = math.log(FAINTEST)
         scale[j, 1] = (math.log(b + SURE) - scale[j, 0]) / (RATES - 1)
         stays = -math.expm1(-0.5 * b * b)
         for k in range(RATES):
@@ -310,7 +311,7 @@ def _sum_rates(amplitude, leaks):
         for k in range(leaks.line_amplitude.shape[1]):
             leaks.line_amplitude[p, k] = math.log(max(leaks.line_amplitude[p, k], 1e-300))
     for j in range(leaks.total.shape[0]):
-        rates, scale = leaks.rates[j], leaks.scale[j]
+        rates, scale = leaks.rates[leaks.law[j]], leaks.scale[leaks.law[j]]
         for s in range(3):
             leaks.total[j, s] = leaks.line_total[j, s] = 0.0
             for k in range(leaks.stretch[j, s, 0], leaks.stretch[j, s, 1]):
@@ -322,48 +323,119 @@ def _sum_rates(amplitude, leaks):
                 leaks.line_total[j, s] = max(leaks.line_total[j, s], whole)
 
 
+class SpeckleRule(NamedTuple):
+    """Trapezoidal rule of the average over speckle, for one law of rates."""
+
+    stride: int
+    """Distance of nodes in steps of the tabulated ln(amplitude)."""
+    below: int
+    """Number of nodes whose power is less than 1."""
+    weights: np.ndarray
+    """(nodes,): weights at the powers e^(2 stride step (i - below)), in rising order."""
+    rates: np.ndarray
+    """(stride * columns,): rates at ln(amplitude), beginning ``below`` strides under the table.
+
+    That with the number stride c + p is at p columns + c, so that the nodes of a bin are adjacent.
+    """
+
+
+@njit(cache=True, error_model="numpy")
+def _speckle_rule(log_rates, scale):
+    """Return the :class:`SpeckleRule` of one row of :attr:`LeakedPeaks.rates` and ``scale``."""
+    step, steepest = scale[1], 0.0
+    for k in range(1, log_rates.size):
+        if log_rates[k] < 1.0:  # beyond, a bin crosses at almost any power
+            steepest = max(steepest, log_rates[k] - log_rates[k - 1])
+    stride = max(int(min(0.5 * LOG_POWER_STEP_MAX / step, CROSSING_STEP_MAX / steepest)), 1)
+    spacing = 2.0 * stride * step
+    below, above = int(-LOG_POWER_MIN / spacing) + 1, int(LOG_POWER_MAX / spacing) + 1
+    weights = np.empty(below + above + 1)
+    for i in range(weights.size):
+        power = math.exp((i - below) * spacing)
+        weights[i] = spacing * power * math.exp(-power)
+    # A bin crosses at the faintest node too from ``below`` strides beyond the table.
+    columns = 2 * below + above + log_rates.size // stride + 4
+    rates = np.empty(stride * columns)
+    for k in range(rates.size):
+        place = float(k - below * stride - 1)
+        rate = _rate(scale[0] + place * step, log_rates, scale)
+        rates[k % stride * columns + k // stride] = rate
+    return SpeckleRule(stride, below, weights, rates)
+
+
+@njit(cache=True, error_model="numpy")
+def _add_rates(amplitude, scale, rule, sums):
+    """Add the rates of a bin at all nodes to ``sums`` (nodes,), by cubic interpolation.
+
+    ``amplitude`` is ln(|X| / sigma) at mean power.
+    """
+    share, place = 1.0, (amplitude - scale[0]) / scale[1]
+    if place < 0.0:  # rates go as the amplitude squared
+        share, place = math.exp(2.0 * (amplitude - scale[0])), 0.0
+    columns = rule.rates.size // rule.stride
+    k = int(min(place, float(rule.rates.size - rule.stride * rule.weights.size - 4)))
+    x = min(place - k, 1.0)
+    first = share * x * (x - 1.0) * (2.0 - x) / 6.0
+    second = share * (x + 1.0) * (x - 1.0) * (x - 2.0) / 2.0
+    third = share * (x + 1.0) * x * (2.0 - x) / 2.0
+    fourth = share * (x + 1.0) * x * (x - 1.0) / 6.0
+    a = k % rule.stride * columns + k // rule.stride
+    b = (k + 1) % rule.stride * columns + (k + 1) // rule.stride
+    c = (k + 2) % rule.stride * columns + (k + 2) // rule.stride
+    d = (k + 3) % rule.stride * columns + (k + 3) // rule.stride
+    rates, nodes = rule.rates, rule.weights.size
+    one, two = rates[a : a + nodes], rates[b : b + nodes]
+    three, four = rates[c : c + nodes], rates[d : d + nodes]
+    for i in range(nodes):
+        sums[i] += (first * one[i] + second * two[i]) + (third * three[i] + fourth * four[i])
+
+
+@njit(cache=True, error_model="numpy")
+def _faded_leakage(sums, weights):
+    """Return the mean over speckle of 1 - exp(-R), of the sums of rates R at its nodes (nodes,).
+
+    Terms below the first node go on as a geometric series: in proportion to the power where all
+    draws leak, and else to its square.
+    """
+    mean, lowest, next_ = 0.0, 0.0, 0.0
+    for i in range(sums.size - 1, -1, -1):
+        term = -weights[i] * math.expm1(-sums[i])
+        mean += term
+        lowest, next_ = term, lowest
+    return mean + (lowest * lowest / (next_ - lowest) if next_ > lowest else 0.0)
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
-def _average(leaks, powers, weights, out):
+def _average(leaks, out):
     """Average the probability of leakage over speckle and the line's phase, into ``out`` (m, 3).
 
-    Each echo fades independently. Bins are binned by ln(amplitude), CLASS_WIDTH wide.
+    Each echo fades independently.
     """
-    classes = int(40.0 / CLASS_WIDTH)
-    number, mean = np.zeros(classes), np.zeros(classes)
-    listed = np.empty(classes, np.int64)
-    for j in range(out.shape[0]):
-        rates, scale = leaks.rates[j], leaks.scale[j]
-        for s in range(3):
-            begin, end = leaks.stretch[j, s]
-            quiet, echoes = 1.0, 0
-            for k in range(begin, end):
-                echoes = max(echoes, leaks.echo[k] + 1)
-            for g in range(echoes):
-                number[:], mean[:] = 0.0, 0.0
+    for law in range(leaks.scale.shape[0]):
+        rates, scale = leaks.rates[law], leaks.scale[law]
+        rule = _speckle_rule(rates, scale)
+        sums = np.empty(rule.weights.size)
+        for j in range(out.shape[0]):
+            if leaks.law[j] != law:
+                continue
+            for s in range(3):
+                begin, end = leaks.stretch[j, s]
+                leakage, echoes = 0.0, 0
                 for k in range(begin, end):
-                    if leaks.echo[k] == g:
-                        place = int((leaks.amplitude[k] - scale[0]) / CLASS_WIDTH)
-                        place = min(max(place, 0), classes - 1)
-                        number[place] += 1.0
-                        mean[place] += leaks.amplitude[k]
-                raised, filled = 0.0, 0
-                for c in range(classes):
-                    if number[c] > 0.0:
-                        listed[filled], mean[c] = c, mean[c] / number[c]
-                        filled += 1
-                for node in range(powers.size):
-                    whole, shift = 0.0, 0.5 * math.log(powers[node])
-                    for c in listed[:filled]:
-                        whole += number[c] * _rate(mean[c] + shift, rates, scale)
-                    raised -= weights[node] * math.expm1(-whole)
-                quiet *= 1.0 - raised
-            phases, alarm = leaks.line_amplitude.shape[0], 0.0
-            for p in range(phases):
-                whole = 0.0
-                for k in range(leaks.line_stretch[j, s, 0], leaks.line_stretch[j, s, 1]):
-                    whole += _rate(leaks.line_amplitude[p, k], rates, scale)
-                alarm -= math.expm1(-whole) / phases
-            out[j, s] = 1.0 - quiet * (1.0 - alarm)
+                    echoes = max(echoes, leaks.echo[k] + 1)
+                for g in range(echoes):
+                    sums[:] = 0.0
+                    for k in range(begin, end):
+                        if leaks.echo[k] == g:
+                            _add_rates(leaks.amplitude[k], scale, rule, sums)
+                    leakage += _faded_leakage(sums, rule.weights) * (1.0 - leakage)
+                phases, alarm = leaks.line_amplitude.shape[0], 0.0
+                for p in range(phases):
+                    whole = 0.0
+                    for k in range(leaks.line_stretch[j, s, 0], leaks.line_stretch[j, s, 1]):
+                        whole += _rate(leaks.line_amplitude[p, k], rates, scale)
+                    alarm -= math.expm1(-whole) / phases
+                out[j, s] = leakage + alarm * (1.0 - leakage)
 
 
 @njit(cache=True, error_model="numpy")
@@ -415,9 +487,10 @@ def draw_leaked(address, at, leaks, fading, level, looks, tables, bins, ratios):
         Number of peaks in the list.
     """
     (a, b, draw), (i, s) = address, at
+    rates, scale = leaks.rates[leaks.law[i]], leaks.scale[leaks.law[i]]
     number = _list_raised(
         address, s, 0, leaks.stretch[i, s], leaks.bin, leaks.amplitude, leaks.echo, leaks.edge,
-        fading[:, s], leaks.total[i, s], leaks.rates[i], leaks.scale[i],
+        fading[:, s], leaks.total[i, s], rates, scale,
         (level, looks, tables.sidelobe_correlation), bins, ratios, 0,
     )  # fmt: skip
     if leaks.line_total[i, s] > 0.0:
@@ -426,8 +499,8 @@ def draw_leaked(address, at, leaks, fading, level, looks, tables, bins, ratios):
         number = _list_raised(
             address, s, LINE + 1, leaks.line_stretch[i, s], leaks.line_bin,
             leaks.line_amplitude[phase], np.zeros(leaks.line_bin.size, np.int64),
-            np.zeros(leaks.line_bin.size), np.ones(1), leaks.line_total[i, s], leaks.rates[i],
-            leaks.scale[i], (level, looks, 0.0), bins, ratios, number,
+            np.zeros(leaks.line_bin.size), np.ones(1), leaks.line_total[i, s], rates,
+            scale, (level, looks, 0.0), bins, ratios, number,
         )  # fmt: skip
     return number
 

@@ -20,6 +20,8 @@ from sweep.model.effects.catalogue import CORE, DEFAULTS
 from sweep.model.geometry.mesh import Surface
 from sweep.model.groups import groups
 from sweep.model.interpolation import interpolator
+from sweep.model.looks import ONE
+from sweep.model.marcum import excess_crossing, marcum_q1_pair
 from sweep.model.pairing import FALSE_ALARM
 from sweep.model.window import window
 
@@ -133,6 +135,64 @@ def test_any_split_of_draws_has_the_same_false_peaks(method, table_4_1):
 
 
 # One segment
+
+
+def _rate(amplitude, level):
+    """-ln(1 - c) of a bin by Marcum's Q, without the tables of the module."""
+    stays = -math.expm1(-0.5 * level * level)
+    if amplitude < level:
+        return -math.log1p(-excess_crossing(amplitude, level) / stays)
+    return -math.log(max(marcum_q1_pair(amplitude, level)[1], 1e-300) / stays)
+
+
+def _leakage_by_quadrature(amplitudes, level):
+    """Mean over developed speckle of 1 - exp(-R), by 1,920 Gauss points in ln(power)."""
+    node, weight = np.polynomial.legendre.leggauss(32)
+    edges = np.linspace(-20.0, 4.0, 61)
+    half = 0.5 * np.diff(edges)[:, None]
+    log_power = edges[:-1, None] + half * (node + 1)
+    mean = 0.0
+    for t, w in zip(log_power.ravel(), (half * weight).ravel(), strict=True):
+        whole = sum(n * _rate(a * math.exp(0.5 * t), level) for a, n in amplitudes.items())
+        mean -= w * math.exp(t - math.exp(t)) * math.expm1(-whole)
+    return mean
+
+
+@pytest.mark.parametrize("level", [0.5, 2.0, 3.93, 6.65, 8.0, 10.0])
+@pytest.mark.parametrize(
+    "amplitudes",
+    [
+        {0.15: 40},
+        {0.15: 40, 0.4: 7, 1.3: 2},
+        {0.3: 5, 2.5: 1},
+        {"half": 1},
+        {"half": 3000},
+        {"level": 2},
+        {"beyond": 1},
+        {"far": 1, 0.2: 30},
+    ],
+)
+def test_mean_leakage_is_that_of_a_fine_quadrature(amplitudes, level):
+    places = {"half": level / 2, "level": level, "beyond": level + 11.9, "far": 1e4 * level}
+    signal = {places.get(a, a): n for a, n in amplitudes.items()}
+    bins = np.repeat(list(signal), list(signal.values()))
+    law, rates, scale = leaked._rates(ONE, np.full(2, level))
+    stretch = np.zeros((2, 3, 2), np.int64)
+    stretch[1, 2] = 0, bins.size  # the other point and segments have none
+    leaks = leaked.LeakedPeaks.nothing(2)._replace(
+        stretch=stretch, bin=np.arange(bins.size), amplitude=np.log(bins),
+        echo=np.zeros(bins.size, np.int64), law=law, rates=rates, scale=scale,
+    )  # fmt: skip
+    means = leaks.mean_leakage()
+    within = {"rel": 1e-6, "abs": 1e-6 * leaked.SELDOM}
+    assert means[1, 2] == pytest.approx(_leakage_by_quadrature(signal, level), **within)
+    assert np.count_nonzero(means) == 1
+    # Echoes fade each for itself.
+    apart = leaks._replace(echo=np.arange(bins.size) % 2).mean_leakage()[1, 2]
+    halves = [dict(zip(*np.unique(half, return_counts=True), strict=True))
+              for half in (bins[::2], bins[1::2])]  # fmt: skip
+    stays = [1 - _leakage_by_quadrature(half, level) for half in halves]
+    assert apart == pytest.approx(1 - stays[0] * stays[1], **within)
 
 
 def _raised(leaks, level, draws, *, fading=None, room=3):
