@@ -8,12 +8,21 @@ threshold b with Q_1(a, b); over the e^-y of noise alone that is
 (the Poisson mixture of chi-square tails less its value at a = 0). All terms are positive, so it
 keeps its digits however small it is; and c_n depends on the threshold alone, so a run of bins
 costs one polynomial in x, which vectorises.
+
+Adjacent bins that cross are one group. Those next to an echo whose outermost bin crosses with
+probability q are part of its group. If bins 1, 2 .. beside it cross with c_1, c_2 .., a further
+group stands in them with the probability
+
+    (1 - c_1) B_2 + c_1 (1 - q + q A_2),    A_j = c_j A_(j+1) + (1 - c_j) B_(j+1),
+
+B_j that any of the bins from j on crosses, A_j that one does after a bin that does not. Bins
+between two echoes may join either.
 """
 
 import math
 
 from sweep.kernels import njit
-from sweep.model.marcum import excess_crossing
+from sweep.model.marcum import excess_crossing, marcum_q1_pair
 
 STRETCH = 256
 """Bins for which the polynomial is evaluated together."""
@@ -22,6 +31,12 @@ LARGEST_SERIES = 450.0
 """y up to which the series serves; above, and for amplitudes that dwarf the noise, Marcum's Q."""
 
 MOST_TERMS = 800
+
+JOINED_CHANCE_MIN = 1e-9
+"""Probability that all bins of a run cross, below which no further one is taken to join it."""
+
+EDGE_DEVIATION_MIN = 0.01
+"""Smallest deviation [sigma] of an outermost bin's noise, given that its neighbour crosses."""
 
 _EXPONENTIAL = tuple((-1) ** n / math.factorial(n) for n in range(12))
 """Of e^-z, to 1e-16 for z <= 1/4."""
@@ -157,3 +172,111 @@ def weighted_silence(chances, weights):
         a += weights[i] * silence(chances[i])
         i += 1
     return (a + b) + (c + d)
+
+
+@njit(cache=True, error_model="numpy")
+def edge_crossing(edge, signal, level, correlation):
+    """Return the probability that an echo's outermost bin crosses, given that its neighbour does.
+
+    Parameters
+    ----------
+    edge, signal
+        |X| / sigma of the outermost bin, and of its neighbour outside the echo.
+    level
+        Threshold [sigma].
+    correlation
+        Correlation of their noise in phase with the signal.
+
+    Notes
+    -----
+    A bin crosses by noise n > b - a in phase with its signal. This has the mean m = phi / (1 - Phi)
+    at d = b - a and the variance 1 - m (m - d). In the outermost bin it leaves noise of the mean
+    rho m and the variance s^2 = 1 - rho^2 m (m - d), whose distance from the threshold is that of a
+    bin of the amplitude b - (b - a_edge - rho m) / s in noise of unit variance.
+    """
+    if correlation != 0.0:
+        below = level - signal
+        mean = max(below, 0.0)
+        if -8.0 < below < 30.0:
+            tail = 0.5 * math.erfc(math.sqrt(0.5) * below)
+            mean = math.exp(-0.5 * below * below) / (math.sqrt(2.0 * math.pi) * tail)
+        square = 1.0 - correlation * correlation * mean * (mean - below)
+        deviation = math.sqrt(max(square, EDGE_DEVIATION_MIN * EDGE_DEVIATION_MIN))
+        edge = max(level - (level - edge - correlation * mean) / deviation, 0.0)
+    return marcum_q1_pair(edge, level)[0]
+
+
+@njit(cache=True, error_model="numpy")
+def leave_out_joined(chances, first, last, magnitude, exempt, noise, correlation):
+    """Leave runs of bins that join an echo out of probabilities, in place.
+
+    The first bin beside an echo takes the probability of a further group in all bins that may join
+    it, and these take 0.
+
+    Parameters
+    ----------
+    chances
+        Probabilities that signal makes bins cross.
+    first, last
+        First bin, and that after the last, of those that are looked at.
+    magnitude, exempt
+        |X|, and whether bins are of an echo.
+    noise
+        Noise per quadrature sigma, and threshold on |X|.
+    correlation
+        Correlation of neighbours' noise in phase with the signal.
+    """
+    sigma, level, end = noise[0], noise[1], first
+    while end < last:
+        begin = end
+        while end < last and not exempt[end]:
+            end += 1
+        count = end - begin
+        below, above, joins_below, joins_above = 0, 0, 0.0, 0.0
+        if count > 0 and begin > first and chances[begin] > 0.0:
+            below = _joining(chances, begin, 1, count)
+            joins_below = edge_crossing(
+                magnitude[begin - 1] / sigma, magnitude[begin] / sigma, level / sigma, correlation
+            )
+        if count > 0 and end < last and chances[end - 1] > 0.0:
+            above = _joining(chances, end - 1, -1, count)
+            joins_above = edge_crossing(
+                magnitude[end] / sigma, magnitude[end - 1] / sigma, level / sigma, correlation
+            )
+        if below + above > count:
+            _join(chances, begin, 1, count, joins_below, joins_above)
+        else:
+            _join(chances, begin, 1, below, joins_below, 0.0)
+            _join(chances, end - 1, -1, above, joins_above, 0.0)
+        end += 1
+
+
+@njit(cache=True, error_model="numpy")
+def _joining(chances, begin, step, count):
+    """Return how many of ``count`` bins from ``begin`` on may all cross."""
+    number, all_cross = 1, 1.0
+    while number < count and all_cross > JOINED_CHANCE_MIN:
+        all_cross *= chances[begin + number * step]
+        number += 1
+    return number
+
+
+@njit(cache=True, error_model="numpy")
+def _join(chances, begin, step, count, joins, joins_last):
+    """Replace the probability of bin ``begin`` by that of a further group in ``count`` bins.
+
+    ``joins`` and ``joins_last``: probabilities that the first and the last join an echo if they
+    cross. The other bins take 0.
+    """
+    quiet, of_echo, waits, further = 1.0 - joins, joins, 0.0, 0.0
+    # Probabilities of no further group yet: after a bin that does not cross, that is of the echo
+    # or that may join one at the end. Before the first bin there stands an echo or none.
+    for i in range(begin, begin + count * step, step):
+        crosses = chances[i]
+        further += (1.0 - crosses) * waits
+        waits = crosses * (waits + quiet)
+        quiet = (1.0 - crosses) * (quiet + of_echo)
+        of_echo *= crosses
+        chances[i] = 0.0
+    if count > 0:
+        chances[begin] = further + waits * (1.0 - joins_last)

@@ -71,6 +71,9 @@ class DetectionRule(NamedTuple):
     """Speckle modes of echoes that any bin may detect."""
     correlation: float = 0.0
     """Correlation of the noise of neighbouring bins."""
+    sidelobe_correlation: float = 0.0
+    """Correlation of their noise in phase with a line's sidelobes, which change sign from one to
+    the next, -1..1."""
 
 
 class PedestalShape(NamedTuple):

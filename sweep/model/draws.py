@@ -66,7 +66,7 @@ def count_by_chance(
     nothing = Seen.nothing(size), np.empty((0, size))
     circular = np.zeros((3, size), np.int64), np.zeros((1, 0)), 0
     levels = np.zeros((2, size)), np.zeros((7, size))
-    _count(rows, ends, *levels, chances, none, *nothing, circular, counts)
+    _count(rows, ends, *levels, chances, none, *nothing, circular, 0.0, counts)
 
 
 def count_in_noise(rows: Rows, ends: np.ndarray, shots: Shots, counts: np.ndarray) -> None:
@@ -87,6 +87,7 @@ def count_in_noise(rows: Rows, ends: np.ndarray, shots: Shots, counts: np.ndarra
             seen,
             mixing[:, part].copy(),
             (speckle.row[:, part].copy(), speckle.quadratures, shots.fft_size // 2),
+            shots.echo_rule.sidelobe_correlation,
         )
         _count(some, ends, *own, counts)
 
@@ -276,7 +277,9 @@ def seen_spectra(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _count(rows, ends, levels, of_bins, chances, how, seen, mixing, quadratures, counts):
+def _count(
+    rows, ends, levels, of_bins, chances, how, seen, mixing, quadratures, correlation, counts
+):  # fmt: skip
     """Add the draws of each row to the counts.
 
     ``how``: whether in noise; filter of an echo's noise, as of :func:`echo_filter`; whether any
@@ -287,13 +290,14 @@ def _count(rows, ends, levels, of_bins, chances, how, seen, mixing, quadratures,
     with one in the up segment. ``mixing`` (6, m): :meth:`sweep.model.detection.Fading.mixing`, or
     nothing.
     ``quadratures``: rows (3, m) of the pseudo-variances near DC and Nyquist
-    (:class:`sweep.model.quadratures.SignalQuadratures`), these, and N/2.
+    (:class:`sweep.model.quadratures.SignalQuadratures`), these, and N/2. ``correlation``: that of
+    neighbours' noise in phase with the signal.
     """
     noisy, weights, start, real_ends, any_two = how
     noise_of_bins = np.empty((4, weights.shape[0] + weights.shape[1]))
     words = np.empty((4, _AT_ONCE), np.uint64)
     factors, amplitudes = np.ones((3, _AT_ONCE)), np.zeros((3, 2, _AT_ONCE))
-    along, across, nothing = np.ones(_AT_ONCE), np.zeros(_AT_ONCE), np.zeros(_AT_ONCE)
+    along, across = np.ones(_AT_ONCE), np.zeros(_AT_ONCE)
     hits, alarms = np.empty((2, 3, _AT_ONCE), np.bool_)
     for j in range(rows.point.size):
         threshold, under_lines = levels[0, j] * levels[0, j], levels[1, j]
@@ -337,9 +341,9 @@ def _count(rows, ends, levels, of_bins, chances, how, seen, mixing, quadratures,
                     largest = STREAM_NOISE_MAXIMUM[s] if noisy else STREAM_FALSE_ALARM[s]
                     chance = chances[0, s, j], chances[0, s, j]
                     _happen(address, largest, chance, hits[0], words, alarms[s])
-                for k in range(seen.stretch[j, s, 0], seen.stretch[j, s, 1]):
-                    line = seen.leaked[k], (1.0, 1.0), threshold, factors[s], nothing
-                    _cross(address, stream, seen.aside[k], line, words, alarms[s])
+                _alarm_by_leakage(
+                    address, (j, s), seen, levels[0, j], correlation, factors[s], words, alarms[s]
+                )
             for d in range(number):
                 while first + d >= ends[batch + 1]:
                     batch += 1
@@ -351,6 +355,64 @@ def _count(rows, ends, levels, of_bins, chances, how, seen, mixing, quadratures,
                 counts[4, i, batch] += alarms[0, d]
                 counts[5, i, batch] += alarms[2, d]
                 counts[6, i, batch] += alarms[0, d] & alarms[2, d]
+
+
+@njit(cache=True, error_model="numpy")
+def _alarm_by_leakage(address, at, seen, level, correlation, factors, words, alarms):
+    """Mark the draws in which bins of leaked signal, with their noise, raise a further group.
+
+    Bins that cross next to an echo whose outermost bin crosses are part of the echo.
+
+    Parameters
+    ----------
+    address
+        Key (two uint64), first draw, and number of draws.
+    at
+        Point and segment.
+    seen
+        :class:`Seen`.
+    level
+        Threshold [sigma].
+    correlation
+        Correlation of neighbours' noise in phase with the signal.
+    factors
+        (draws,): factors on magnitudes by speckle.
+    words
+        Room for random numbers (4, draws).
+    alarms
+        Result (draws,), bool: True where they do.
+    """
+    stream, number = STREAM_NOISE[at[1]], address[3]
+    rest = math.sqrt(1.0 - correlation * correlation)
+    nothing, of_echo = np.zeros(number), np.zeros(number, np.bool_)
+    begin, end = seen.stretch[at]
+    # A group that begins beside an echo is the echo's to its end, and one that ends beside an echo
+    # from its begin: an alarm waits until its group ends.
+    waits, crosses = np.zeros(number, np.bool_), np.empty(number, np.bool_)
+    for k in range(begin, end):
+        if k > begin and seen.aside[k] != seen.aside[k - 1] + 1:
+            for d in range(number):
+                alarms[d] |= waits[d]
+                waits[d] = of_echo[d] = False
+        crosses[:] = False
+        line = seen.leaked[k], (1.0, 1.0), level * level, factors, nothing
+        _cross(address, stream, seen.aside[k], line, words, crosses)
+        for d in range(number):
+            if not crosses[d]:
+                alarms[d] |= waits[d]
+                waits[d] = of_echo[d] = False
+                continue
+            if seen.edge[k] > 0.0:
+                draw = address[2] + d
+                re, im = philox.normal_pair(address[0], address[1], draw, stream, seen.aside[k])
+                edge = seen.aside[k] + seen.side[k]
+                re_edge, im_edge = philox.normal_pair(address[0], address[1], draw, stream, edge)
+                along = seen.edge[k] * factors[d] + correlation * re + rest * re_edge
+                across = correlation * im + rest * im_edge
+                of_echo[d] |= math.hypot(along, across) >= level
+            waits[d] = not of_echo[d]
+    for d in range(number):
+        alarms[d] |= waits[d]
 
 
 @njit(cache=True, error_model="numpy")

@@ -85,12 +85,22 @@ class Interpolator(NamedTuple):
     """(m,): position error by |delta| over the variance of lines that add as powers [1/bins]."""
 
 
+@lru_cache(maxsize=64)
 def noise_correlation(window: Window, fft_size: int) -> tuple[float, float]:
     """Return the noise correlation of bins one and two apart, in phase with a tone's signal."""
     squared = samples(window.name, window.length) ** 2
     turns = (np.arange(window.length) - window.length / 2) / fft_size
     near, far = (float((squared * np.cos(2 * np.pi * d * turns)).sum()) for d in (1, 2))
     return near / window.energy, far / window.energy
+
+
+def sidelobe_correlation(window: Window, fft_size: int) -> float:
+    """Return the noise correlation of adjacent bins in phase with a tone's sidelobes there.
+
+    See :attr:`Interpolator.sidelobe_correlation`.
+    """
+    near, _ = noise_correlation(window, fft_size)
+    return near * (1.0 - 2.0 * window.length / fft_size)
 
 
 @lru_cache(maxsize=32)
@@ -119,7 +129,7 @@ def interpolator(window: Window, fft_size: int) -> Interpolator:
         weight=0 * weight if vanishing else weight,
         error=error,
         mixing=_mixing(near, far),
-        sidelobe_correlation=near * (1.0 - 2.0 * window.length / fft_size),
+        sidelobe_correlation=sidelobe_correlation(window, fft_size),
         widening=np.zeros(0),
     )
     return tables._replace(widening=_widening(window, fft_size, tables))

@@ -19,6 +19,9 @@ bins of power u |X|^2 leak with the probability 1 - exp(-R(u)), and the mean is
 
 ln R is computed at powers a factor of 2 apart and interpolated by a monotone cubic
 (:func:`fading_mean`). Bins that are exempt at the mean power are exempt at any power.
+
+Bins that cross next to an echo whose outermost bin crosses are part of the echo
+(:func:`sweep.model.crossings.leave_out_joined`), and no leakage.
 """
 
 import math
@@ -30,6 +33,7 @@ from sweep.model.crossings import (
     added_crossings,
     any_crossing,
     largest,
+    leave_out_joined,
     silence,
     weighted_silence,
 )
@@ -99,7 +103,8 @@ def inspect(origin, lines, noise, table, form, sizes, tangent, room, exempt, ser
     ----------
     noise
         Noise per quadrature sigma; threshold on |X|; probability of leakage that may be neglected;
-        and LOUDEST if the echo is in developed speckle, else 1.
+        LOUDEST if the echo is in developed speckle, else 1; and the correlation of neighbours'
+        noise in phase with the signal.
     series
         :func:`sweep.model.crossings.crossing_series` of the threshold over sigma.
 
@@ -110,11 +115,11 @@ def inspect(origin, lines, noise, table, form, sizes, tangent, room, exempt, ser
         probability that leaked signal raises at least one false alarm.
     """
     n, lowest, highest, total, faint = lines
-    sigma, level, tolerance, loudest = noise
-    noise = sigma, level, tolerance
+    sigma, level, tolerance, loudest, correlation = noise
+    noise = sigma, level, tolerance, correlation
     # Bounds are those of the brightest speckle.
     dark = 1.0 / math.sqrt(loudest)
-    bright = sigma * dark, level * dark, tolerance
+    bright = sigma * dark, level * dark, tolerance, correlation
     half, beside, afar = sizes[0] // 2, sizes[6], total
     if sizes[8] > beside // 2:  # an echo whose pedestal reaches far
         beside += sizes[8]
@@ -139,10 +144,10 @@ def inspect(origin, lines, noise, table, form, sizes, tangent, room, exempt, ser
         peak, exempted = mark(room[OUT], count, noise[1], exempt, sizes[8])
         chance = 0.0
         if not (left > 0.0 and _at_most(count, bright, exempt, room) <= left):
-            _chances(count, noise, room, exempt, series)
-            chance = any_crossing(room[CHANCE], ZERO, count)
             if loudest > 1.0:
                 chance = _faded_bins(count, noise, room, exempt, series)
+            else:
+                chance = _any_further(count, noise, room, exempt, series)
         return low, count, peak, exempted, chance
     near_low, near_high = run_of(float(beside), place, sizes)
     reach = _least_reach(afar, highest - lowest, bright, crossing, form, sizes)
@@ -167,22 +172,36 @@ def inspect(origin, lines, noise, table, form, sizes, tangent, room, exempt, ser
 def of_bins(count, noise, floor, room, exempt, series):
     """Return the leakage of those bins of a run that exceed ``floor`` [sigma], bin by bin.
 
-    Bins below the floor become exempt. ``noise`` begins with sigma and the threshold.
+    Magnitudes of the others become 0. ``noise`` is as of :func:`inspect` without what fades.
     """
-    for i in range(count):
-        if room[OUT, i] < floor * noise[0]:
-            exempt[i] = True
-    _chances(count, noise, room, exempt, series)
-    return any_crossing(room[CHANCE], ZERO, count)
+    _leave_out_faint(count, noise[0], floor, room, exempt)
+    return _any_further(count, noise, room, exempt, series)
 
 
 @njit(cache=True, error_model="numpy")
 def of_fading_bins(count, noise, floor, room, exempt, series):
     """Return the mean of :func:`of_bins` over developed speckle."""
-    for i in range(count):
-        if room[OUT, i] < floor * noise[0]:
-            exempt[i] = True
+    _leave_out_faint(count, noise[0], floor, room, exempt)
     return _faded_bins(count, noise, room, exempt, series)
+
+
+@njit(cache=True, error_model="numpy")
+def _leave_out_faint(count, sigma, floor, room, exempt):
+    """Set bins of a run that are of no echo and below ``floor`` [sigma] to 0."""
+    for i in range(count):
+        if not exempt[i] and room[OUT, i] < floor * sigma:
+            room[OUT, i] = 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def _any_further(count, noise, room, exempt, series):
+    """Return the probability of a further group in a run's bins; probabilities are in row CHANCE.
+
+    ``noise``: sigma, threshold, tolerance, and correlation of neighbours' noise.
+    """
+    _chances(count, noise, room, exempt, series)
+    leave_out_joined(room[CHANCE], ZERO, count, room[OUT], exempt, noise, noise[3])
+    return any_crossing(room[CHANCE], ZERO, count)
 
 
 @njit(cache=True, error_model="numpy")
@@ -191,11 +210,12 @@ def _faded_bins(count, noise, room, exempt, series):
     log_rates = np.empty(SPECKLE_POWERS.size)
     for k in range(SPECKLE_POWERS.size):
         root = math.sqrt(SPECKLE_POWERS[k])
-        _chances(count, (noise[0] / root, noise[1] / root), room, exempt, series)
-        chance = any_crossing(room[CHANCE], ZERO, count)
-        if k == 0 and chance < 1e-12:
+        faded = noise[0] / root, noise[1] / root
+        _chances(count, faded, room, exempt, series)
+        if k == 0 and any_crossing(room[CHANCE], ZERO, count) < 1e-12:
             return 0.0
-        log_rates[k] = _log_rate(chance)
+        leave_out_joined(room[CHANCE], ZERO, count, room[OUT], exempt, faded, noise[3])
+        log_rates[k] = _log_rate(any_crossing(room[CHANCE], ZERO, count))
     return fading_mean(log_rates)
 
 
@@ -252,10 +272,10 @@ def _all_beyond(weight, first, mirror, noise, form):
 
     so that all of them together add at most y e^{-y} g(nearest) times the sum of x. Images are no
     nearer to a bin than the lines, nor than ``mirror`` bins; inf if there are no images.
-    ``weight``: summed magnitude of the lines; ``noise``: sigma, threshold, tolerance. Returns inf
+    ``weight``: summed magnitude of the lines; ``noise`` begins with sigma, threshold. Returns inf
     where the bound does not hold (z > 2 y).
     """
-    sigma, level, _ = noise
+    sigma, level, _, _ = noise
     weight /= sigma
     b = level / sigma
     y = 0.5 * b * b
@@ -290,7 +310,7 @@ def _at_most(count, noise, exempt, room):
     this at most e^{-(b - a)^2 / 2}; the factor 1.2 covers that noise alone stays below the
     threshold with a probability of at least 1 - e^-2.
     """
-    sigma, level, _ = noise
+    sigma, level, _, _ = noise
     most, squares = 0.0, 0.0
     for i in range(count):
         loud = 0.0 if exempt[i] else room[OUT, i]
@@ -321,7 +341,7 @@ def _least_reach(weight, spread, noise, crossing, form, sizes):
     Heuristic: far enough for the threshold, for a smooth rate, and for 3/4 of the lines' spread;
     rounded up to a multiple of 8. :func:`inspect` doubles it until :func:`_leakage` is accurate.
     """
-    sigma, level, _ = noise
+    sigma, level, _, _ = noise
     clearance = sizes[6]
     beside = form[1, clearance] * weight / sigma
     gentle = 4.0 + 1.5 * math.sqrt(beside * clearance * level / sigma)
@@ -336,29 +356,31 @@ def _leakage(run, lines, place, noise, form, sizes, tangent, room, exempt, serie
     If ``loudest`` is above 1 the echo fades, and the leakage is the mean over its speckle.
     """
     low, count, peak, origin = run
-    sigma, level, _ = noise
+    sigma, level, _, correlation = noise
     fft_size, half = sizes[0], sizes[0] // 2
     beta, scale = level / sigma, 0.5 / (sigma * sigma)
-    _chances(count, noise, room, exempt, series)
     below, above = low > 0, low + count - 1 < half
-    some = any_crossing(room[CHANCE], APRON if below else ZERO, count - APRON if above else count)
     if not below and not above:
         if loudest > 1.0:
-            some = _faded_bins(count, noise, room, exempt, series)
-        return some, True
+            return _faded_bins(count, noise, room, exempt, series), True
+        return _any_further(count, noise, room, exempt, series), True
+    _chances(count, noise, room, exempt, series)
     centre = abs(math.floor(0.5 * (place[0] + place[1]) + 0.5))
     centre = fft_size - centre if centre > half else centre
     tail, rest, points = 0.0, 0.0, ZERO
     for side in (-1, 1):
         if not (below if side < 0 else above):
             continue
-        correction, last, steepness, found = _near_end(side, count, room[CHANCE], exempt)
+        correction, term, steepness, found = _near_end(side, count, room[CHANCE], exempt)
         if not found:
             return 0.0, False
         tail += correction
-        rest += last
+        rest += term
         end = centre - low - APRON if side < 0 else low + count - 1 - APRON - centre
         points = _points_beyond(side, end, centre, steepness, sizes, tangent, room, points)
+    first, last = APRON if below else ZERO, count - APRON if above else count
+    leave_out_joined(room[CHANCE], first, last, room[OUT], exempt, noise, correlation)
+    some = any_crossing(room[CHANCE], first, last)
     while points % 8:  # whole vectors: what is left over costs as much as all of them
         room[POINT, points], room[WEIGHT, points] = room[POINT, points - 1], 0.0
         points += 1
@@ -386,24 +408,28 @@ def _leakage(run, lines, place, noise, form, sizes, tangent, room, exempt, serie
 def _faded(run, points, noise, below, above, sizes, room, exempt, series):
     """Return the mean leakage, over developed speckle, of a run and of the integral beyond it."""
     count = run[1]
-    sigma, level, _ = noise
+    sigma, level, _, correlation = noise
     log_rates = np.empty(SPECKLE_POWERS.size)
-    first, last = APRON if below else 0, count - APRON if above else count
+    first, last = APRON if below else ZERO, count - APRON if above else count
     for k in range(SPECKLE_POWERS.size):
         power = SPECKLE_POWERS[k]
         root, tail = math.sqrt(power), 0.0
-        _chances(count, (sigma / root, level / root), room, exempt, series)
-        some = any_crossing(room[CHANCE], first, last)
+        faded = sigma / root, level / root
+        _chances(count, faded, room, exempt, series)
         for side in (-1, 1):
             if below if side < 0 else above:
                 tail += _near_end(side, count, room[CHANCE], exempt)[0]
+        if k == 0:
+            brightest = any_crossing(room[CHANCE], first, last)
+        leave_out_joined(room[CHANCE], first, last, room[OUT], exempt, faded, correlation)
+        some = any_crossing(room[CHANCE], first, last)
         for i in range(points):
             room[HALF_SQUARE, i] = room[AFAR, i] * power
         added_crossings(room[HALF_SQUARE], points, level / sigma, series, room[CHANCE])
         tail += weighted_silence(room[CHANCE, :points], room[WEIGHT, :points])
-        chance = some - (1.0 - some) * math.expm1(-max(tail, 0.0))
-        if k == 0 and chance < 1e-12:
+        if k == 0 and brightest - (1.0 - brightest) * math.expm1(-max(tail, 0.0)) < 1e-12:
             return 0.0
+        chance = some - (1.0 - some) * math.expm1(-max(tail, 0.0))
         log_rates[k] = _log_rate(chance)
     return fading_mean(log_rates)
 

@@ -17,6 +17,9 @@ Bins are independent. With the rates r_k = -ln(1 - c_k), the first bin in which 
 the one where the sum of rates exceeds a number from the exponential distribution. The search goes
 on from the next bin with another such number.
 
+Bins that cross next to an echo whose outermost bin crosses are part of the echo, where peaks are
+drawn as in probabilities (:mod:`sweep.model.crossings`).
+
 An echo in developed speckle fades as a whole, and its leaked signal with it. A bin fades with the
 echo whose strongest bin is nearest. The probability of leakage is then the mean over speckle. With
 the speckle's power u = e^t, of mean 1, and the sum R(u) of an echo's rates r(a_k sqrt(u)) it is
@@ -40,6 +43,7 @@ import numpy as np
 
 from sweep.kernels import njit
 from sweep.model import philox
+from sweep.model.crossings import edge_crossing, silence
 from sweep.model.draws import Seen, seen_spectra
 from sweep.model.effects.circulator_leak import PHASES, bins_of_line, line_of
 from sweep.model.groups import Groups
@@ -74,8 +78,21 @@ HALVINGS = 40
 LOG_POWER_MIN, LOG_POWER_MAX = -10.0, 3.5
 """Ends of the average over speckle in ln(power), whose mean power is 1."""
 
+LOG_POWER_MIN_FAINT = -5.0
+"""Lower end where rates at mean power are FAINT_RATES or less in all, and below it go as power."""
+FAINT_RATES = 0.1
+
 LOG_POWER_STEP_MAX = 0.25
 """Largest step of this average, which errs by 1e-8 of the mean for e^(2 t - e^t)."""
+
+JOINED_RATE_MIN = 1e-2
+"""Rate at the power e^(2 BRIGHT) of bins in a row below which the next one joins no echo."""
+BRIGHT = math.log(4.0)
+
+EDGE_STEP = 0.75
+"""Step in ln(power) at which the probability that an echo's outermost bin crosses is computed."""
+EDGE_DEPTH = 3.0
+"""-ln(power) below which this probability is taken to be that at it."""
 
 CROSSING_STEP_MAX = 0.5
 """Largest step of ln(rate) between nodes: what crosses within fewer ones errs by more than 1e-7."""
@@ -94,6 +111,8 @@ class LeakedPeaks(NamedTuple):
     """int64: index of the group (echo) with which each bin fades."""
     edge: np.ndarray
     """|X| / sigma of the bin next to it that is exempt from false alarms, 0 for none."""
+    side: np.ndarray
+    """int64: 1 where that bin is above, else -1."""
     total: np.ndarray
     """(m, 3): sum of the rates of these bins at mean speckle power."""
     line_stretch: np.ndarray
@@ -113,15 +132,21 @@ class LeakedPeaks(NamedTuple):
     """(laws, RATES): ln(rate) at evenly spaced ln(amplitude)."""
     scale: np.ndarray
     """(laws, 2): first of these ln(amplitude), and their step."""
+    level: np.ndarray
+    """(laws,): threshold [sigma] of a record that detects as all looks do."""
+    sharper: float
+    """Factor on |X| / sigma with which that record has it."""
+    correlation: float
+    """Correlation of neighbours' noise in phase with the signal."""
 
     @classmethod
     def nothing(cls, points: int) -> "LeakedPeaks":
         """Return no bins at all, for ``points`` points."""
         none, bins, sums = np.zeros((points, 3, 2), np.int64), np.empty(0, np.int64), (points, 3)
         return cls(
-            none, bins, np.empty(0), bins, np.empty(0), np.zeros(sums), none, bins,
+            none, bins, np.empty(0), bins, np.empty(0), bins, np.zeros(sums), none, bins,
             np.empty((PHASES, 0)), np.zeros(sums), none, bins, np.zeros(points, np.int64),
-            np.zeros((1, 1)), np.zeros((1, 2)),
+            np.zeros((1, 1)), np.zeros((1, 2)), np.zeros(1), 1.0, 0.0,
         )  # fmt: skip
 
     def of(self, points: np.ndarray) -> "LeakedPeaks":
@@ -179,11 +204,14 @@ def leaked_peaks(
             if shots.leak_amplitude is not None:
                 seen, echo, leaks = _with_line(shots, part, seen, echo)
             level = np.broadcast_to(shots.threshold / shots.bin_deviation, shots.size)[part]
-            law, rates, scale = _rates(shots.looks, level)
+            levels, law = _laws(level)
+            rates, scale = _rates(shots.looks, levels)
             leaks = leaks._replace(
                 stretch=seen.stretch, bin=_leaked_bins(seen)[0],
-                amplitude=np.empty(seen.aside.size), echo=echo, edge=seen.edge, law=law,
-                rates=rates, scale=scale,
+                amplitude=np.empty(seen.aside.size), echo=echo, edge=seen.edge, side=seen.side,
+                law=law, rates=rates, scale=scale, level=shots.looks.scaled(levels),
+                sharper=float(shots.looks.sharper),
+                correlation=shots.echo_rule.sidelobe_correlation,
             )  # fmt: skip
             _sum_rates(seen.leaked, leaks)
             yield part, leaks
@@ -243,17 +271,17 @@ def _with_line(
     )  # fmt: skip
 
 
-def _rates(looks: Looks, level: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return :attr:`LeakedPeaks.law`, ``rates`` and ``scale`` of points by threshold [sigma].
+def _laws(level: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return different thresholds of points [sigma], and the number of each point's.
 
-    Thresholds of shots of a flight differ by rounding alone, and have one table.
+    Thresholds within 1e-7 of each other, which those of a flight are, have one table of rates.
     """
-    levels, law = np.unique(np.round(level, 9), return_inverse=True)
-    return law.ravel().astype(np.int64), *_rates_by_level(looks, levels)
+    levels, law = np.unique(np.round(level, 7), return_inverse=True)
+    return levels, law.ravel().astype(np.int64)
 
 
-def _rates_by_level(looks: Looks, level: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the tables of :func:`_rates`, one of each threshold."""
+def _rates(looks: Looks, level: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return :attr:`LeakedPeaks.rates` and ``scale``, by threshold (laws,) [sigma]."""
     rates, scale = np.empty((level.size, RATES)), np.empty((level.size, 2))
     _fill_rates(level, rates, scale)
     if looks.several:
@@ -365,7 +393,7 @@ def _speckle_rule(log_rates, scale):
 
 @njit(cache=True, error_model="numpy")
 def _add_rates(amplitude, scale, rule, sums):
-    """Add the rates of a bin at all nodes to ``sums`` (nodes,), by cubic interpolation.
+    """Add the rates of a bin at the last nodes to ``sums``, by cubic interpolation.
 
     ``amplitude`` is ln(|X| / sigma) at mean power.
     """
@@ -383,26 +411,101 @@ def _add_rates(amplitude, scale, rule, sums):
     b = (k + 1) % rule.stride * columns + (k + 1) // rule.stride
     c = (k + 2) % rule.stride * columns + (k + 2) // rule.stride
     d = (k + 3) % rule.stride * columns + (k + 3) // rule.stride
-    rates, nodes = rule.rates, rule.weights.size
-    one, two = rates[a : a + nodes], rates[b : b + nodes]
-    three, four = rates[c : c + nodes], rates[d : d + nodes]
-    for i in range(nodes):
+    rates, end, start = rule.rates, rule.weights.size, rule.weights.size - sums.size
+    one, two = rates[a + start : a + end], rates[b + start : b + end]
+    three, four = rates[c + start : c + end], rates[d + start : d + end]
+    for i in range(sums.size):
         sums[i] += (first * one[i] + second * two[i]) + (third * three[i] + fourth * four[i])
 
 
 @njit(cache=True, error_model="numpy")
 def _faded_leakage(sums, weights):
-    """Return the mean over speckle of 1 - exp(-R), of the sums of rates R at its nodes (nodes,).
+    """Return the mean over speckle of 1 - exp(-R), of the sums of rates R at some last nodes.
 
     Terms below the first node go on as a geometric series: in proportion to the power where all
     draws leak, and else to its square.
     """
     mean, lowest, next_ = 0.0, 0.0, 0.0
     for i in range(sums.size - 1, -1, -1):
-        term = -weights[i] * math.expm1(-sums[i])
+        term = weights[weights.size - sums.size + i] * _crossing(sums[i])
         mean += term
         lowest, next_ = term, lowest
     return mean + (lowest * lowest / (next_ - lowest) if next_ > lowest else 0.0)
+
+
+@njit(cache=True, error_model="numpy")
+def _joined_chances(k, stretch, leaks, law, rule, joined, joins):
+    """Evaluate a bin beside an echo, and further ones that may join the echo with it.
+
+    Parameters
+    ----------
+    k
+        Index of the bin in ``leaks.bin``.
+    stretch
+        First and last index + 1 of the segment's bins.
+    law
+        Row of ``leaks.rates``.
+    rule
+        :class:`SpeckleRule` of this law.
+    joined
+        True of bins that have been evaluated so.
+    joins
+        Result: rates of a further group in these bins at some last nodes.
+
+    Returns
+    -------
+    int
+        Index of the last of these bins.
+    """
+    rates, scale, step = leaks.rates[law], leaks.scale[law], -leaks.side[k]
+    nodes = joins.size
+    end = k + step
+    while stretch[0] <= end < stretch[1] and leaks.bin[end] - leaks.bin[k] == end - k:
+        bright = leaks.amplitude[end - step] + BRIGHT  # as long as the bins so far all cross
+        if abs(end - k) > 1 and _rate(bright, rates, scale) < JOINED_RATE_MIN:
+            break
+        if joined[end] or leaks.echo[end] != leaks.echo[k] or leaks.edge[end] > 0.0:
+            break
+        end += step
+    of_bin, after_quiet, any_ = np.empty(nodes), np.zeros(nodes), np.zeros(nodes)
+    for j in range(end - step, k, -step):
+        of_bin[:] = 0.0
+        _add_rates(leaks.amplitude[j], scale, rule, of_bin)
+        for i in range(nodes):
+            chance = _crossing(of_bin[i])
+            after_quiet[i] = chance * after_quiet[i] + (1.0 - chance) * any_[i]
+            any_[i] = chance + (1.0 - chance) * any_[i]
+    of_bin[:] = 0.0
+    _add_rates(leaks.amplitude[k], scale, rule, of_bin)
+    spacing = 2.0 * rule.stride * scale[1]
+    every = max(int(EDGE_STEP / spacing), 1)
+    below = nodes - rule.weights.size + rule.below
+    first = max(below - int(EDGE_DEPTH / spacing), 0)
+    edge, signal = leaks.sharper * leaks.edge[k], leaks.sharper * math.exp(leaks.amplitude[k])
+    after, begin = 0.0, -every
+    while begin < nodes:
+        end_of_step = first if begin < 0 else begin + every
+        root = math.exp(0.5 * spacing * (end_of_step - below))
+        before = after
+        after = edge_crossing(edge * root, signal * root, leaks.level[law], leaks.correlation)
+        slope = (after - before) / every
+        if begin < 0:
+            begin, before, slope = 0, after, 0.0
+        for i in range(begin, min(end_of_step, nodes)):
+            crosses = before + slope * (i - begin)
+            chance = _crossing(of_bin[i])
+            apart = 1.0 - crosses + crosses * after_quiet[i]
+            joins[i] = silence(chance * apart + (1.0 - chance) * any_[i])
+        begin = end_of_step
+    return end - step
+
+
+@njit(cache=True, error_model="numpy")
+def _crossing(rate):
+    """Return 1 - e^-rate."""
+    if rate < 1e-4:
+        return rate * (1.0 - rate * (0.5 - rate / 6.0))
+    return -math.expm1(-rate)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -411,22 +514,33 @@ def _average(leaks, out):
 
     Each echo fades independently.
     """
+    joined = np.zeros(leaks.bin.size, np.bool_)
     for law in range(leaks.scale.shape[0]):
         rates, scale = leaks.rates[law], leaks.scale[law]
         rule = _speckle_rule(rates, scale)
-        sums = np.empty(rule.weights.size)
+        at_nodes, faint = (
+            np.empty((2, rule.weights.size)),
+            int((LOG_POWER_MIN_FAINT - LOG_POWER_MIN) / (2.0 * rule.stride * scale[1])),
+        )
         for j in range(out.shape[0]):
             if leaks.law[j] != law:
                 continue
             for s in range(3):
                 begin, end = leaks.stretch[j, s]
+                first = faint if leaks.total[j, s] <= FAINT_RATES else 0
+                sums, joins = at_nodes[0, first:], at_nodes[1, first:]
                 leakage, echoes = 0.0, 0
                 for k in range(begin, end):
                     echoes = max(echoes, leaks.echo[k] + 1)
                 for g in range(echoes):
                     sums[:] = 0.0
                     for k in range(begin, end):
-                        if leaks.echo[k] == g:
+                        if leaks.edge[k] > 0.0 and leaks.echo[k] == g and not joined[k]:
+                            last = _joined_chances(k, (begin, end), leaks, law, rule, joined, joins)
+                            joined[min(k, last) : max(k, last) + 1] = True
+                            sums += joins
+                    for k in range(begin, end):
+                        if leaks.echo[k] == g and not joined[k]:
                             _add_rates(leaks.amplitude[k], scale, rule, sums)
                     leakage += _faded_leakage(sums, rule.weights) * (1.0 - leakage)
                 phases, alarm = leaks.line_amplitude.shape[0], 0.0

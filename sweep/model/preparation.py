@@ -657,6 +657,7 @@ class Shots:
     def echo_rule(self) -> "DetectionRule":
         """Return the rule of detection of one record's bins."""
         from sweep.model.detection import DetectionRule
+        from sweep.model.interpolation import sidelobe_correlation
         from sweep.model.quadratures import noise_quadratures
         from sweep.model.speckle_modes import NO_MODES, mode_table
 
@@ -667,15 +668,17 @@ class Shots:
             if self.real_ends:
                 noise = noise_quadratures(self.window, self.fft_size)
         pairs = alarms.pair_nodes(self.correlation)
+        beside = sidelobe_correlation(self.window, self.fft_size)
         if self.detection == "peak_bin":
             return DetectionRule(
-                self.real_ends, 0, pairs, fades, half, noise, NO_MODES, self.correlation
+                self.real_ends, 0, pairs, fades, half, noise, NO_MODES, self.correlation, beside
             )
         lobe = main_lobe(self.window) * self.fft_size / self.window.length
         modes = NO_MODES if self.fading is None else mode_table(self.window, self.fft_size)
         return DetectionRule(
-            self.real_ends, math.ceil(lobe), pairs, fades, half, noise, modes, self.correlation
-        )
+            self.real_ends, math.ceil(lobe), pairs, fades, half, noise, modes, self.correlation,
+            beside,
+        )  # fmt: skip
 
     @cached_property
     def speckle_table(self) -> "SpeckleTable":

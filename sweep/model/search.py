@@ -7,6 +7,7 @@ import numpy as np
 
 from sweep.kernels import njit
 from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.crossings import any_crossing, leave_out_joined
 from sweep.model.detection import echo_of, found_pair, levels_of, speckle_of
 from sweep.model.marcum import excess_crossing
 
@@ -148,8 +149,9 @@ def _cut(numbers, where, levels, how, speckle, magnitudes, exempts, chances):
                 )  # fmt: skip
             if leaks[s]:
                 chances[2, s, j] = leakage_of(
-                    run, exempt, (levels[1, j], levels[2, j], levels[7, j])
-                )
+                    run, exempt, (levels[1, j], levels[2, j], levels[7, j]), levels[1, j],
+                    rule.sidelobe_correlation,
+                )  # fmt: skip
 
 
 @njit(cache=True, error_model="numpy")
@@ -176,12 +178,25 @@ def _keep_echoes(run, exempt, low, level, beside, band, lines):
 
 
 @njit(cache=True, error_model="numpy")
-def leakage_of(run, exempt, levels):
-    """Probability that any bin of a run that is not exempt adds a crossing to that of noise."""
+def leakage_of(run, exempt, levels, threshold, correlation):
+    """Return the probability that leaked signal in a run raises a further group to a level.
+
+    Parameters
+    ----------
+    run, exempt
+        |X| of its bins, and whether they are of an echo.
+    levels
+        Level, noise per quadrature sigma, and lowest |X| / sigma that is looked at.
+    threshold
+        Threshold on |X|, which groups hang together by.
+    correlation
+        Correlation of neighbours' noise in phase with the signal.
+    """
     level, sigma, floor = levels
-    b, any_ = level / sigma, 0.0
+    b, chances = level / sigma, np.zeros(run.size)
     stays = -math.expm1(-0.5 * b * b)
     for k in range(run.size):
         if not exempt[k] and run[k] >= floor * sigma and run[k] > 0.0:
-            any_ += excess_crossing(run[k] / sigma, b) / stays * (1.0 - any_)
-    return any_
+            chances[k] = excess_crossing(run[k] / sigma, b) / stays
+    leave_out_joined(chances, 0, run.size, run, exempt, (sigma, threshold), correlation)
+    return any_crossing(chances, 0, run.size)

@@ -14,7 +14,7 @@ import numpy as np
 
 from sweep.kernels import njit
 from sweep.model import line_shape
-from sweep.model.crossings import MOST_TERMS, crossing_series
+from sweep.model.crossings import MOST_TERMS, any_crossing, crossing_series, leave_out_joined
 from sweep.model.detection import (
     BinLevels,
     PedestalShape,
@@ -211,14 +211,24 @@ def _of_looks(shots: Shots, runs: Runs, leakage: bool) -> Runs:
         np.broadcast_to(v, shots.size)[runs.part]
         for v in (shots.floor, shots.bin_deviation, shots.threshold)
     )
-    leaked = runs.leakage.copy()
+    leaked, looks = runs.leakage.copy(), shots.looks
+    scaled = looks.scaled(level / sigma)
     for s, i in np.argwhere(runs.bins > 0) if leakage and shots.leakage else ():
         if shots.waveform[s].leaks:
-            start, end = runs.start[s, i] + np.array([0, runs.bins[s, i]])
-            signal = runs.magnitudes[start:end][~runs.exempt[start:end]] / sigma[i]
-            more = shots.looks.excess(signal[signal >= floor[i]], level[i] / sigma[i])
-            with np.errstate(divide="ignore"):  # sure to leak
-                leaked[s, i] = 0.0 - np.expm1(np.log1p(-np.minimum(more, 1.0)).sum())
+            stretch = slice(runs.start[s, i], runs.start[s, i] + runs.bins[s, i])
+            magnitude, exempt = runs.magnitudes[stretch], runs.exempt[stretch]
+            counts = ~exempt & (magnitude >= floor[i] * sigma[i])
+            chances = np.zeros(magnitude.size)
+            chances[counts] = np.minimum(
+                looks.excess(magnitude[counts] / sigma[i], level[i] / sigma[i]), 1.0
+            )
+            # In terms of a record that detects as the looks do.
+            noise = sigma[i] / looks.sharper, scaled[i] * sigma[i] / looks.sharper
+            leave_out_joined(
+                chances, 0, chances.size, magnitude, exempt, noise,
+                shots.echo_rule.sidelobe_correlation,
+            )  # fmt: skip
+            leaked[s, i] = any_crossing(chances, 0, chances.size)
     pd, miss = shots.detected(runs.magnitude, runs.low + runs.peak, runs.part)
     pd, miss = np.where(runs.inside, pd, 0.0), np.where(runs.inside, miss, 1.0)
     return runs._replace(pd=pd, miss=miss, leakage=leaked)
@@ -643,7 +653,8 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
             )
             lines = n, lowest, highest, total, p[15] * sigma / LINE_STEPS
             fades = rule.fades >= 0.0
-            noise, leakage = (sigma, level, p[14], LOUDEST if fades else 1.0), 0.0
+            loudest, leakage = LOUDEST if fades else 1.0, 0.0
+            noise = sigma, level, p[14], loudest, rule.sidelobe_correlation
             if leaks[s] == INTEGRAL:
                 low, count, peak, exempted, leakage = inspect(
                     origin, lines, noise, table[s], form[s], sizes, tangent, room, exempt, series
@@ -668,11 +679,12 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
                     speckle_of(speckle, s, where[2, i]),
                 )  # fmt: skip
             if leaks[s] == BIN_BY_BIN:
+                bins = sigma, level, p[14], rule.sidelobe_correlation
                 if fades:
                     least = p[12] / math.sqrt(LOUDEST)
-                    leakage = of_fading_bins(count, noise[:3], least, room, exempt, series)
+                    leakage = of_fading_bins(count, bins, least, room, exempt, series)
                 else:
-                    leakage = of_bins(count, noise[:3], p[12], room, exempt, series)
+                    leakage = of_bins(count, bins, p[12], room, exempt, series)
                     if p[16] > 0.0 and rule.pairs.size > 0:
                         leakage = any_neighbour(room[CHANCE], count, rule.pairs)
             low += sizes[0] * (sizes[7] == COMPLEX)  # never below 0

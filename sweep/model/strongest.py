@@ -182,7 +182,11 @@ def _at_levels(numbers, inside, bins, levels, noise, how, speckle, lost, silence
                     more = missed - missed_first if missed < 0.5 else found_first - found
                     lost[s, j, k] = max(more, 0.0)
                 if how[1]:
-                    leaks = min(leakage_of(run, echo, (level, sigma[j], floor[j])), 1.0 - 1e-16)
+                    leaks = leakage_of(
+                        run, echo, (level, sigma[j], floor[j]), levels[s, j, 0],
+                        how[0].sidelobe_correlation,
+                    )  # fmt: skip
+                    leaks = min(leaks, 1.0 - 1e-16)
                     silence[s, j, k] -= math.log1p(-leaks)
 
 

@@ -11,8 +11,9 @@ from scipy import stats
 
 from sweep.model import shot, truth
 from sweep.model.accuracy import AUTOMATIC
-from sweep.model.crossings import MOST_TERMS, crossing_series
+from sweep.model.crossings import MOST_TERMS, crossing_series, edge_crossing
 from sweep.model.detection import RAYLEIGH_DEVIATION, mark, quiet_below, threshold
+from sweep.model.interpolation import sidelobe_correlation
 from sweep.model.leakage import of_bins
 from sweep.model.marcum import excess_crossing, marcum_q1
 from sweep.model.segments import spectrum as segment_spectrum
@@ -58,7 +59,7 @@ def test_a_single_beamlet_on_a_bin_is_detected_as_its_closed_snr_says(target_ran
 # Groups, exemptions and leakage
 
 
-def assess(magnitude, sigma, level, floor):
+def assess(magnitude, sigma, level, floor, correlation=0.0):
     """Peak, exempt bins and leakage of a run of bins, as the model has them one by one."""
     count = magnitude.size
     room, exempt = np.empty((ROOM, count + 16)), np.empty(count, np.bool_)
@@ -67,10 +68,11 @@ def assess(magnitude, sigma, level, floor):
     peak, exempted = mark(room[OUT], count, level, exempt, 0)
     assert exempted == exempt.sum()
     marked = set(np.flatnonzero(exempt))
-    return peak, marked, of_bins(count, (sigma, level, 0.0), floor, room, exempt, series)
+    noise = sigma, level, 0.0, correlation
+    return peak, marked, of_bins(count, noise, floor, room, exempt, series)
 
 
-def by_brute_force(magnitude, sigma, level, floor):
+def by_brute_force(magnitude, sigma, level, floor, correlation=0.0):
     """Peak, exempt bins and leakage, bin by bin in Python and many digits."""
     above = [m >= level for m in magnitude]
     peak = max(range(len(magnitude)), key=lambda i: (magnitude[i], -i))
@@ -78,13 +80,31 @@ def by_brute_force(magnitude, sigma, level, floor):
         j for i in range(len(magnitude)) if above[i] or i == peak for j in (i - 1, i, i + 1)
     } & set(range(len(magnitude)))
     with mpmath.workdps(130):  # of chances of 1e-90, thirty
-        beta = mpmath.mpf(level) / sigma
-        silence = mpmath.mpf(1)
+        beta, further = mpmath.mpf(level) / sigma, mpmath.mpf(0)
+        # No further group yet: after a quiet bin, in an echo's group, in one that may join one.
+        quiet, of_echo, waits = mpmath.mpf(1), mpmath.mpf(0), mpmath.mpf(0)
         for i, m in enumerate(magnitude):
-            if i not in exempt and m >= floor * sigma:
-                # Q_1 by its series, to 1e-35 of itself
-                silence *= (1 - q1(mpmath.mpf(m) / sigma, beta)) / (1 - q1(0, beta))
-        return peak, exempt, float(1 - silence)
+            if i in exempt or m < floor * sigma:
+                if waits:
+                    joins = i in exempt and edge_crossing(
+                        m / sigma, magnitude[i - 1] / sigma, level / sigma, correlation
+                    )
+                    quiet, further = quiet + joins * waits, further + (1 - joins) * waits
+                quiet, of_echo, waits = quiet + of_echo, mpmath.mpf(0), mpmath.mpf(0)
+                continue
+            crosses = 1 - (1 - q1(mpmath.mpf(m) / sigma, beta)) / (1 - q1(0, beta))
+            joins = mpmath.mpf(0)
+            if i > 0 and i - 1 in exempt:
+                joins = edge_crossing(
+                    magnitude[i - 1] / sigma, m / sigma, level / sigma, correlation
+                )
+            further += (1 - crosses) * waits
+            waits, quiet, of_echo = (
+                crosses * (waits + quiet * (1 - joins)),
+                (1 - crosses) * (quiet + of_echo),
+                crosses * (of_echo + quiet * joins),
+            )
+        return peak, exempt, float(further + waits)
 
 
 def q1(a, b):
@@ -105,14 +125,18 @@ def q1(a, b):
 def test_groups_exemptions_and_leakage_are_those_of_brute_force(level):
     rng = np.random.default_rng((50, int(10 * level)))
     for count in (1, 2, 3, 12, 40):
-        for scale in (0.01, 0.5, 2.0):
+        for scale, correlation in ((0.01, 0.0), (0.5, 0.0), (0.5, -0.62), (2.0, 0.0), (1.0, 0.4)):
             sigma = rng.uniform(0.5, 3)
             magnitude = sigma * scale * rng.exponential(level, count)
             for floor in (0.0, 0.1, 1.0):
-                peak, exempt, leakage = assess(magnitude, sigma, level * sigma, floor)
-                best, excluded, chance = by_brute_force(magnitude, sigma, level * sigma, floor)
+                run = magnitude, sigma, level * sigma, floor, correlation
+                (peak, exempt, leakage), (best, excluded, chance) = (
+                    assess(*run),
+                    by_brute_force(*run),
+                )
                 assert (peak, exempt) == (best, excluded)
-                assert leakage == pytest.approx(chance, rel=1e-12, abs=1e-300)
+                # Runs of bins that all cross with less than 1e-9 join nothing.
+                assert leakage == pytest.approx(chance, rel=1e-8, abs=1e-300)
 
 
 def test_the_first_of_equal_peaks_is_the_detection_and_a_threshold_met_is_crossed():
@@ -138,7 +162,8 @@ def test_evaluate_reports_what_brute_force_finds_in_the_truths_spectrum(window, 
         pfa, alarms = np.exp(-0.5 * (level / sigma) ** 2), {}
         for segment, name in ((0, "up"), (2, "down")):
             exact = truth.spectrum(shots, 0, segment, range_walk=False)
-            peak, excluded, leakage = by_brute_force(exact, sigma, level, 0.0)
+            near = sidelobe_correlation(shots.window, shots.fft_size)
+            peak, excluded, leakage = by_brute_force(exact, sigma, level, 0.0, near)
             assert results[f"snr_{name}"][0] == pytest.approx(
                 exact[peak] ** 2 / (2 * sigma**2), rel=1e-8
             )

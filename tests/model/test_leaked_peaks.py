@@ -176,12 +176,15 @@ def test_mean_leakage_is_that_of_a_fine_quadrature(amplitudes, level):
     places = {"half": level / 2, "level": level, "beyond": level + 11.9, "far": 1e4 * level}
     signal = {places.get(a, a): n for a, n in amplitudes.items()}
     bins = np.repeat(list(signal), list(signal.values()))
-    law, rates, scale = leaked._rates(ONE, np.full(2, level))
+    levels, law = leaked._laws(np.full(2, level))
+    rates, scale = leaked._rates(ONE, levels)
     stretch = np.zeros((2, 3, 2), np.int64)
     stretch[1, 2] = 0, bins.size  # the other point and segments have none
     leaks = leaked.LeakedPeaks.nothing(2)._replace(
         stretch=stretch, bin=np.arange(bins.size), amplitude=np.log(bins),
-        echo=np.zeros(bins.size, np.int64), law=law, rates=rates, scale=scale,
+        echo=np.zeros(bins.size, np.int64), edge=np.zeros(bins.size), law=law, rates=rates,
+        scale=scale, level=levels,
+        total=np.full((2, 3), sum(n * _rate(a, level) for a, n in signal.items())),
     )  # fmt: skip
     means = leaks.mean_leakage()
     within = {"rel": 1e-6, "abs": 1e-6 * leaked.SELDOM}
