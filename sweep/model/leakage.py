@@ -17,7 +17,7 @@ bins of power u |X|^2 leak with the probability 1 - exp(-R(u)), and the mean is
 
     P = int_0^inf e^{-u} (1 - exp(-R(u))) du.
 
-ln R is computed at powers a factor of 2 apart and interpolated by a monotone cubic
+ln R is computed at powers an octave or half of one apart and interpolated by a monotone cubic
 (:func:`fading_mean`). Bins that are exempt at the mean power are exempt at any power.
 
 Bins that cross next to an echo whose outermost bin crosses are part of the echo
@@ -38,6 +38,7 @@ from sweep.model.crossings import (
     weighted_silence,
 )
 from sweep.model.detection import mark
+from sweep.model.marcum import excess_crossing
 from sweep.model.spectrum import (
     AFAR,
     CHANCE,
@@ -82,7 +83,12 @@ would compile the function anew for Python's."""
 
 LOUDEST = 16.0
 """Largest speckle power (mean 1) in averages of leakage; a fraction e^-16 of draws exceeds it."""
-SPECKLE_POWERS = LOUDEST * 2.0 ** -np.arange(10.0)
+OCTAVES = 9
+"""Octaves of speckle power below LOUDEST at which leakage is computed."""
+FINER_POWERS = 2
+"""Number of powers an octave where runs of bins join the echo in bright speckle, else 1."""
+BRIGHTEST_MAX = 0.1
+"""Leakage of the brightest speckle up to which one power an octave is enough."""
 _SPECKLE_STEPS = 160
 FAINTEST_RATE = 1e-30
 """Rate R below which leakage is taken to be 0."""
@@ -207,16 +213,29 @@ def _any_further(count, noise, room, exempt, series):
 @njit(cache=True, error_model="numpy")
 def _faded_bins(count, noise, room, exempt, series):
     """Return the mean leakage of a run's bins over developed speckle."""
-    log_rates = np.empty(SPECKLE_POWERS.size)
-    for k in range(SPECKLE_POWERS.size):
-        root = math.sqrt(SPECKLE_POWERS[k])
+    per_octave, log_rates, k = 1, np.empty(FINER_POWERS * OCTAVES + 1), 0
+    while k <= per_octave * OCTAVES:
+        root = math.sqrt(LOUDEST * 2.0 ** (-k / per_octave))
         faded = noise[0] / root, noise[1] / root
         _chances(count, faded, room, exempt, series)
-        if k == 0 and any_crossing(room[CHANCE], ZERO, count) < 1e-12:
-            return 0.0
+        if k == 0:
+            brightest = any_crossing(room[CHANCE], ZERO, count)
+            if brightest < 1e-12:
+                return 0.0
+            per_octave = _powers_per_octave(brightest)
         leave_out_joined(room[CHANCE], ZERO, count, room[OUT], exempt, faded, noise[3])
         log_rates[k] = _log_rate(any_crossing(room[CHANCE], ZERO, count))
-    return fading_mean(log_rates)
+        k += 1
+    return fading_mean(log_rates[:k], per_octave)
+
+
+@njit(cache=True, error_model="numpy")
+def _powers_per_octave(brightest):
+    """Return how many speckle powers an octave leakage is computed at, by that of the brightest.
+
+    Where runs of bins join the echo in bright speckle, leakage does not rise with the power.
+    """
+    return FINER_POWERS if brightest > BRIGHTEST_MAX else 1
 
 
 @njit(cache=True, error_model="numpy")
@@ -232,10 +251,11 @@ def _common_slope(one, other):
 
 
 @njit(cache=True, error_model="numpy")
-def fading_mean(log_rates):
-    """Return int_0^inf e^-u (1 - exp(-R(u))) du, ln R given at SPECKLE_POWERS.
+def fading_mean(log_rates, per_octave):
+    """Return int_0^inf e^-u (1 - exp(-R(u))) du, ln R given at powers from LOUDEST down.
 
-    Below the smallest of these powers R is proportional to u; above LOUDEST nothing is added.
+    ``per_octave`` is the number of these in a factor of 2. Below the smallest of these powers R is
+    proportional to u; above LOUDEST nothing is added.
     """
     last = log_rates.size - 1
     mean, before, chance_before = 0.0, 0.0, 0.0
@@ -243,10 +263,10 @@ def fading_mean(log_rates):
         # Places closer together where powers are small, up to LOUDEST.
         share = i / _SPECKLE_STEPS
         power = LOUDEST * share * share
-        place = -math.log2(share * share)
+        place = -per_octave * math.log2(share * share)
         k = int(place)
         if k >= last:
-            log_rate = log_rates[last] - (place - last) * math.log(2.0)
+            log_rate = log_rates[last] - (place - last) * math.log(2.0) / per_octave
         else:
             x, rest = place - k, log_rates[k + 1] - log_rates[k]
             before_it = log_rates[k] - log_rates[k - 1] if k > 0 else rest
@@ -326,12 +346,24 @@ def _at_most(count, noise, exempt, room):
 
 @njit(cache=True, error_model="numpy")
 def _chances(count, noise, room, exempt, series):
-    """Store in row CHANCE the crossing probability that signal adds in each bin of a run."""
+    """Store in row CHANCE the crossing probability that signal adds in each bin of a run.
+
+    Bins above the threshold, which bright speckle lifts over it, are no matter of the series.
+    """
     sigma, level = noise[0], noise[1]
-    scale = 0.5 / (sigma * sigma)
+    beta, scale = level / sigma, 0.5 / (sigma * sigma)
+    is_beyond = False
     for i in range(count):
-        room[HALF_SQUARE, i] = 0.0 if exempt[i] else room[OUT, i] * room[OUT, i] * scale
-    added_crossings(room[HALF_SQUARE], count, level / sigma, series, room[CHANCE])
+        is_above = room[OUT, i] > level and not exempt[i]
+        is_beyond |= is_above
+        square = room[OUT, i] * room[OUT, i] * scale
+        room[HALF_SQUARE, i] = 0.0 if exempt[i] or is_above else square
+    added_crossings(room[HALF_SQUARE], count, beta, series, room[CHANCE])
+    if is_beyond:
+        stays = -math.expm1(-0.5 * beta * beta)
+        for i in range(count):
+            if room[OUT, i] > level and not exempt[i]:
+                room[CHANCE, i] = min(excess_crossing(room[OUT, i] / sigma, beta) / stays, 1.0)
 
 
 @njit(cache=True, error_model="numpy")
@@ -409,10 +441,10 @@ def _faded(run, points, noise, below, above, sizes, room, exempt, series):
     """Return the mean leakage, over developed speckle, of a run and of the integral beyond it."""
     count = run[1]
     sigma, level, _, correlation = noise
-    log_rates = np.empty(SPECKLE_POWERS.size)
+    per_octave, log_rates, k = 1, np.empty(FINER_POWERS * OCTAVES + 1), 0
     first, last = APRON if below else ZERO, count - APRON if above else count
-    for k in range(SPECKLE_POWERS.size):
-        power = SPECKLE_POWERS[k]
+    while k <= per_octave * OCTAVES:
+        power = LOUDEST * 2.0 ** (-k / per_octave)
         root, tail = math.sqrt(power), 0.0
         faded = sigma / root, level / root
         _chances(count, faded, room, exempt, series)
@@ -427,11 +459,15 @@ def _faded(run, points, noise, below, above, sizes, room, exempt, series):
             room[HALF_SQUARE, i] = room[AFAR, i] * power
         added_crossings(room[HALF_SQUARE], points, level / sigma, series, room[CHANCE])
         tail += weighted_silence(room[CHANCE, :points], room[WEIGHT, :points])
-        if k == 0 and brightest - (1.0 - brightest) * math.expm1(-max(tail, 0.0)) < 1e-12:
-            return 0.0
-        chance = some - (1.0 - some) * math.expm1(-max(tail, 0.0))
-        log_rates[k] = _log_rate(chance)
-    return fading_mean(log_rates)
+        beyond = -math.expm1(-max(tail, 0.0))
+        if k == 0:
+            brightest += (1.0 - brightest) * beyond
+            if brightest < 1e-12:
+                return 0.0
+            per_octave = _powers_per_octave(brightest)
+        log_rates[k] = _log_rate(some + (1.0 - some) * beyond)
+        k += 1
+    return fading_mean(log_rates[:k], per_octave)
 
 
 @njit(cache=True, error_model="numpy")
