@@ -57,6 +57,8 @@ MOST_PLACES = 64
 _SURE = 40.0
 """Distance of magnitude and threshold over sigma from where on a tail is 0 to float64."""
 _HALVINGS = 60
+_LOG_POWERS = -5.0, math.log(16.0), 64
+"""Ends and number of the nodes of a mean over speckle, in ln(power)."""
 _NODES = 24
 """Gauss points of each stretch of a mean over speckle."""
 
@@ -486,6 +488,22 @@ class Looks(NamedTuple):
         """Probabilities that enough records cross, and that they do not."""
         enough, rest = self.votes, self.number - self.votes + 1
         return special.betainc(enough, rest, crosses), special.betainc(rest, enough, stays)
+
+    def speckle_powers(
+        self, speckle: "LookSpeckle | None", segment: int, point: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Powers of the speckle of all looks together, of mean 1, and weights, which add to 1.
+
+        Their mean power is taken to be a gamma variable, of the shape M of as many independent
+        looks. ``speckle`` is that of looks which share it in part.
+        """
+        shape = float(self.number if self.independent else 1)
+        if speckle is not None:
+            shape = float(speckle.shape[segment, point])
+        log_power = np.linspace(*_LOG_POWERS)
+        density = shape * (log_power - np.exp(log_power))
+        weights = np.exp(density - density.max())
+        return np.exp(log_power), weights / weights.sum()
 
     def speckle_nodes(
         self, level: np.ndarray, *signals: np.ndarray, shape: np.ndarray | float = 1.0

@@ -76,14 +76,12 @@ OUTPUTS: dict[str, Output] = {
     "p_leakage_up": Output(
         "1",
         "probability that leaked signal raises a further group, up-chirp",
-        "over noise alone; with runs of bins that join on to the echo's, of which flights and "
-        "drawn spectra make no point",
+        "over noise alone",
     ),
     "p_leakage_down": Output(
         "1",
         "probability that leaked signal raises a further group, down-chirp",
-        "over noise alone; with runs of bins that join on to the echo's, of which flights and "
-        "drawn spectra make no point",
+        "over noise alone",
     ),
     **_by_segment(
         "snr_{}", "signal-to-noise ratio", shot=None,

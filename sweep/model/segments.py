@@ -212,23 +212,29 @@ def _of_looks(shots: Shots, runs: Runs, leakage: bool) -> Runs:
         for v in (shots.floor, shots.bin_deviation, shots.threshold)
     )
     leaked, looks = runs.leakage.copy(), shots.looks
-    scaled = looks.scaled(level / sigma)
     for s, i in np.argwhere(runs.bins > 0) if leakage and shots.leakage else ():
-        if shots.waveform[s].leaks:
-            stretch = slice(runs.start[s, i], runs.start[s, i] + runs.bins[s, i])
-            magnitude, exempt = runs.magnitudes[stretch], runs.exempt[stretch]
-            counts = ~exempt & (magnitude >= floor[i] * sigma[i])
-            chances = np.zeros(magnitude.size)
-            chances[counts] = np.minimum(
-                looks.excess(magnitude[counts] / sigma[i], level[i] / sigma[i]), 1.0
-            )
-            # In terms of a record that detects as the looks do.
-            noise = sigma[i] / looks.sharper, scaled[i] * sigma[i] / looks.sharper
-            leave_out_joined(
-                chances, 0, chances.size, magnitude, exempt, noise,
-                shots.echo_rule.sidelobe_correlation,
-            )  # fmt: skip
-            leaked[s, i] = any_crossing(chances, 0, chances.size)
+        if not shots.waveform[s].leaks:
+            continue
+        stretch = slice(runs.start[s, i], runs.start[s, i] + runs.bins[s, i])
+        signal, exempt = runs.magnitudes[stretch] / sigma[i], runs.exempt[stretch]
+        faintest = floor[i]
+        powers, weights = np.ones(1), np.ones(1)
+        if shots.fading is not None:
+            powers, weights = looks.speckle_powers(shots.look_speckle, s, int(runs.part[i]))
+            faintest = floor[i] / math.sqrt(LOUDEST)
+        counts = ~exempt & (signal >= faintest)
+        roots, chances = np.sqrt(powers), np.zeros((powers.size, signal.size))
+        chances[:, counts] = np.minimum(
+            looks.excess(np.outer(roots, signal[counts]), level[i] / sigma[i]), 1.0
+        )
+        # Groups join by one record that detects as the looks do.
+        scaled = float(looks.scaled(level[i] / sigma[i]))
+        near, mean = shots.echo_rule.sidelobe_correlation, 0.0
+        for root, weight, raised in zip(roots, weights, chances, strict=True):
+            noise = 1 / (looks.sharper * root), scaled / (looks.sharper * root)
+            leave_out_joined(raised, 0, raised.size, signal, exempt, noise, near)
+            mean += weight * any_crossing(raised, 0, raised.size)
+        leaked[s, i] = mean
     pd, miss = shots.detected(runs.magnitude, runs.low + runs.peak, runs.part)
     pd, miss = np.where(runs.inside, pd, 0.0), np.where(runs.inside, miss, 1.0)
     return runs._replace(pd=pd, miss=miss, leakage=leaked)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from drawn_leakage import drawn_leakage
 
 from sweep.model import leakage
 from sweep.model.crossings import any_crossing, leave_out_joined
@@ -9,7 +10,6 @@ from sweep.model.detection import mark
 from sweep.model.effects.catalogue import CORE, DEFAULTS
 from sweep.model.interpolation import sidelobe_correlation
 from sweep.model.marcum import marcum_q1
-from sweep.model.search import centre_lines
 from sweep.model.segments import spectrum
 from sweep.model.shot import evaluate, prepare
 
@@ -45,7 +45,7 @@ def test_the_mean_of_few_powers_is_that_of_all(signals, level, per_octave):
 def test_leakage_of_a_grid_is_the_mean_over_speckle_of_all_bins(table_4_1, window, every_bin):
     """Bins that the mean echo leaves exempt stay so; the others cross with the faded echo.
 
-    Runs that join the echo are none of them (:func:`drawn_leakage` holds that).
+    Runs that join the echo are none of them (drawn spectra hold that).
     """
     effects = (*CORE, "fading")
     p = DEFAULTS | table_4_1(window=window, beamlets=1, fft_size=4096, radial_velocity=0.0)
@@ -77,49 +77,6 @@ def test_leakage_of_a_grid_is_the_mean_over_speckle_of_all_bins(table_4_1, windo
         expected = np.trapezoid(np.array(raised) * np.exp(-powers), powers)
         if expected > 1e-7:
             assert told[i] == pytest.approx(expected, rel=0.05)
-
-
-def drawn_leakage(shots, i, *, draws, looks=1, seed=1, fades=True, own=True, strongest=False):
-    """Draw whole spectra of a line in noise; the probability of a further group by its signal.
-
-    ``own``: looks have independent speckle; else they share it. A further group is a run of bins
-    over the threshold, of which none is exempt. What noise alone raises is taken out.
-    """
-    rng, size = np.random.default_rng(seed), shots.fft_size
-    window, time = shots.window.samples(), np.arange(size)
-    bins, magnitude = spectrum(shots, i, 0)
-    sigma, level = float(shots.bin_deviation[i]), float(shots.threshold[i])
-    exempt = np.zeros(magnitude.size, bool)
-    mark(magnitude, magnitude.size, level, exempt, shots.echo_rule.beside)
-    place = centre_lines(shots)[0, i]
-    turn = np.exp(2j * np.pi * place * time / size)
-    lines = np.fft.rfft(window * turn.real)[bins], np.fft.rfft(window * turn.imag)[bins]
-    peak = magnitude.argmax()
-    lines = np.array(lines) * (magnitude[peak] / sigma / abs(lines[0][peak]))
-    raised = np.zeros(2)
-    for _ in range(draws // 500):
-        power = np.zeros((2, 500, bins.size))
-        amplitude = rng.normal(size=(looks, 2, 500)) / np.sqrt(2)
-        amplitude = amplitude if own else amplitude[:1] + 0 * amplitude
-        for look in range(looks):
-            scale = np.sqrt(2 / (window**2).sum())
-            noise = np.fft.rfft(window * rng.normal(size=(500, size)))[:, bins] * scale
-            cos, sin = amplitude[look]
-            if not fades:
-                phase = rng.uniform(0, 2 * np.pi, 500)
-                cos, sin = np.cos(phase), np.sin(phase)
-            signal = np.multiply.outer(cos, lines[0]) - np.multiply.outer(sin, lines[1])
-            power[0] += abs(noise) ** 2 / looks
-            power[1] += abs(noise + signal) ** 2 / looks
-        for k in range(2):
-            crosses = power[k] >= (level / sigma) ** 2
-            crosses[:, bins == 0] = False
-            run = np.cumsum(np.diff(crosses, axis=1, prepend=False) & crosses, axis=1)
-            for row in range(500):
-                groups = set(run[row][crosses[row] & ~exempt])
-                raised[k] += bool(groups - set(run[row][crosses[row] & exempt]))
-    noisy, either = raised / draws
-    return (either - noisy) / (1 - noisy), np.sqrt(2 * either * (1 - either) / draws)
 
 
 @pytest.mark.parametrize("fades", [False, True])

@@ -4,12 +4,14 @@ from functools import partial
 
 import numpy as np
 import pytest
+from drawn_leakage import drawn_leakage
 from engine import every, keys
 from scipy import special, stats
 
 from sweep.analysis.shot_figure import simulated
 from sweep.model import alarms, truth, window
 from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.crossings import leave_out_joined
 from sweep.model.detection import RAYLEIGH_DEVIATION
 from sweep.model.effects.line_width import coherent_share, seen_line
 from sweep.model.effects.segment_motion import looks_of
@@ -322,12 +324,35 @@ def test_leakage_is_that_of_all_bins_by_the_law_of_the_looks(scene):
     sigma, level = float(shots.bin_deviation[0]), float(shots.threshold[0])
     own = magnitude >= level
     own |= np.convolve(own, np.ones(3), "same") > 0
-    signal = 2 * (magnitude[~own & (bins > 0) & (bins < 512)] / sigma) ** 2 * 4 / 2
-    crosses = stats.ncx2.sf(4 * (level / sigma) ** 2, 8, signal)
+    counts = ~own & (bins > 0) & (bins < 512)
+    crosses = stats.ncx2.sf(4 * (level / sigma) ** 2, 8, 4 * (magnitude / sigma) ** 2)
     quiet = special.gammaincc(4, 2 * (level / sigma) ** 2)
-    expected = 1 - np.prod(1 - (crosses - quiet) / (1 - quiet))
-    assert 1e-3 < expected < 0.9
+    chances = np.where(counts, (crosses - quiet) / (1 - quiet), 0.0)
+    # By one record that detects as often: groups that join the echo are no further ones.
+    scaled = sigma * np.sqrt((level / sigma) ** 2 - 2 * 3 / 4)
+    near = shots.echo_rule.sidelobe_correlation
+    alone = 1 - np.prod(1 - chances)
+    leave_out_joined(chances, 0, chances.size, magnitude, own, (sigma / 2, scaled), near)
+    expected = 1 - np.prod(1 - chances)
+    assert 1e-3 < expected < alone < 0.9
     assert told["p_leakage_up"][0] == pytest.approx(expected, rel=1e-2)
+
+
+@pytest.mark.parametrize("speckle", ["common", "independent"])
+def test_leakage_of_fading_looks_is_that_of_drawn_spectra(scene, speckle):
+    """The mean over the fade of further groups in averaged spectra."""
+    given = scene(**{NUMBER: 4, SPECKLE: speckle, "accuracy.leakage_floor": -1.0})
+    given |= {
+        "target.range": np.array([ON_A_BIN + 0.3]), "instrument.laser.power": 8e-3,
+        "footprint.speckle": "developed", "footprint.phases": "incoherent",
+    }  # fmt: skip
+    told = evaluate(given, ("image", "leakage", "fading"))["p_leakage_up"][0]
+    ((_, shots),) = prepare(given, ("image", "fading"))
+    drawn, deviation = drawn_leakage(shots, 0, draws=6000, looks=4, own=speckle == "independent")
+    print(speckle, told, drawn, deviation)
+    steady = evaluate(given, ("image", "leakage"))["p_leakage_up"][0]
+    print(steady)
+    assert told == pytest.approx(drawn, abs=4 * deviation + 0.05 * drawn)
 
 
 def test_votes_of_one_and_of_all_are_any_and_every_record():
