@@ -95,5 +95,4 @@ def test_leakage_is_that_of_further_groups_in_drawn_spectra(table_4_1, window, p
     ((_, shots),) = prepare(p, effects)
     for i in range(shots.size):
         drawn, deviation = drawn_leakage(shots, i, draws=4000, fades=fades)
-        print(window, fades, told[i], drawn, deviation)
         assert told[i] == pytest.approx(drawn, abs=4 * deviation + 0.1 * drawn)

@@ -349,9 +349,6 @@ def test_leakage_of_fading_looks_is_that_of_drawn_spectra(scene, speckle):
     told = evaluate(given, ("image", "leakage", "fading"))["p_leakage_up"][0]
     ((_, shots),) = prepare(given, ("image", "fading"))
     drawn, deviation = drawn_leakage(shots, 0, draws=6000, looks=4, own=speckle == "independent")
-    print(speckle, told, drawn, deviation)
-    steady = evaluate(given, ("image", "leakage"))["p_leakage_up"][0]
-    print(steady)
     assert told == pytest.approx(drawn, abs=4 * deviation + 0.05 * drawn)
 
 

@@ -28,7 +28,7 @@ differ over the beam, by :mod:`sweep.model.speckle_correlation`. It is in
 closed form, as beamlets that are enough for the power of a bin may be too few for it. It acts on
 the detection, and on leakage: what an echo leaks fades with it, in closed form
 (:mod:`sweep.model.leakage`) as where false peaks are drawn (:mod:`sweep.model.leaked_peaks`). Of
-several looks leakage is that of the mean echo.
+several looks it is a mean over the mean power of all.
 """
 
 import math
