@@ -10,7 +10,7 @@ keeps its digits however small it is; and c_n depends on the threshold alone, so
 costs one polynomial in x, which vectorises.
 
 Adjacent bins that cross are one group. Those next to an echo whose outermost bin crosses with
-probability q are part of its group. If bins 1, 2 .. beside it cross with c_1, c_2 .., a further
+probability q are part of its group. If bins 1, 2 .. next to it cross with c_1, c_2 .., a further
 group stands in them with the probability
 
     (1 - c_1) B_2 + c_1 (1 - q + q A_2),    A_j = c_j A_(j+1) + (1 - c_j) B_(j+1),
@@ -210,7 +210,7 @@ def edge_crossing(edge, signal, level, correlation):
 def leave_out_joined(chances, first, last, magnitude, exempt, noise, correlation):
     """Leave runs of bins that join an echo out of probabilities, in place.
 
-    The first bin beside an echo takes the probability of a further group in all bins that may join
+    The first bin next to an echo takes the probability of a further group in all bins that may join
     it, and these take 0.
 
     Parameters

@@ -87,7 +87,7 @@ OCTAVES = 9
 """Octaves of speckle power below LOUDEST at which leakage is computed."""
 FINER_POWERS = 2
 """Number of powers an octave where runs of bins join the echo in bright speckle, else 1."""
-BRIGHTEST_MAX = 0.1
+BRIGHTEST_MAX = 0.5
 """Leakage of the brightest speckle up to which one power an octave is enough."""
 _SPECKLE_STEPS = 160
 FAINTEST_RATE = 1e-30

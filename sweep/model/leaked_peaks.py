@@ -435,7 +435,7 @@ def _faded_leakage(sums, weights):
 
 @njit(cache=True, error_model="numpy")
 def _joined_chances(k, stretch, leaks, law, rule, joined, joins):
-    """Evaluate a bin beside an echo, and further ones that may join the echo with it.
+    """Evaluate a bin next to an echo, and further ones that may join the echo with it.
 
     Parameters
     ----------
