@@ -36,7 +36,7 @@ def bin_share(bin_, half, shares):
     return shares[k] if 0 <= k < shares.size else 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def hoyt_pair(power, share, level):
     """Return P(|X| >= level) and P(|X| < level) of a noncircular complex Gaussian number X.
 

@@ -88,7 +88,7 @@ def columns(shots: Any, values: np.ndarray | float, dims: int = 1) -> np.ndarray
     return np.broadcast_to(values, shots.size).reshape(-1, *[1] * dims)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def _is_in(bin_, band, period):
     """Return true for a bin of the band (2,): first, number; ``period`` N of complex records."""
     apart = bin_ - band[0]
@@ -175,7 +175,7 @@ def _keep_echoes(run, exempt, low, level, beside, band, lines):
             exempt[max(min(begin, first - 1), 0) : max(end, at) + 1] = True
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def leakage_of(run, exempt, levels):
     """Probability that any bin of a run that is not exempt adds a crossing to that of noise."""
     level, sigma, floor = levels
