@@ -367,7 +367,7 @@ def test_a_kernel_that_borrows_returns_no_array(returns_array):
     # Numba refuses to return an array alone.
     with pytest.raises((TypeError, TypingError), match=r"borrows arrays|returning of array"):
         kernel(np.ones((2, 3)))
-    # Another process would take it from the cache.
+    # Uncached, as the cache would hand it to the kernel that borrows.
     assert sweep.kernels.njit()(returns_array)(np.ones((2, 3))) is not None
 
 
