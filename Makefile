@@ -6,7 +6,7 @@ READY := .venv/.ready
 KERNELS := .venv/.kernels
 TIMED := .ci/timed
 
-.PHONY: install-core install demo test timed-lint timed-kernels test-all lint size stability validate-speckle fuzz chaos side-by-side effects accuracy stopping frozen promise detectors peers scaling validation instruments docs pictures fields scale million lock clean
+.PHONY: install-core install demo test timed-lint timed-kernels test-all lint size stability validate-speckle speckle-time fuzz chaos side-by-side effects accuracy stopping frozen promise detectors peers scaling validation instruments docs pictures fields scale million lock clean
 SEED ?= 1
 
 # What grids and figures need; the demo needs no more.
@@ -100,6 +100,12 @@ effects: $(READY)
 side-by-side: $(READY)
 	$(BIN)/pip install --quiet embreex  # which model 19 casts rays with
 	$(BIN)/python benchmarks/side_by_side.py
+
+# Smooth points and flights against a commit, and points in developed speckle against smooth ones;
+# a quarter of an hour.
+EARLIER ?= 7881fb1
+speckle-time: $(READY)
+	$(BIN)/python benchmarks/side_by_side.py --group speckle --earlier $(EARLIER) --rounds 3
 
 scale: $(READY)
 	$(BIN)/python benchmarks/scale.py

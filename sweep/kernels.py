@@ -35,6 +35,7 @@ from typing import Any, NamedTuple
 import llvmlite
 import numba
 import numpy as np
+from numba import types
 from numba.core.caching import FunctionCache
 from numba.core.dispatcher import Dispatcher
 from numba.core.sigutils import normalize_signature
@@ -84,7 +85,10 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     Parameters
     ----------
     **options
-        Those of `numba.njit`.
+        Those of `numba.njit`, and `borrows`: true of a kernel that neither makes arrays nor returns
+        any. It then counts no references to the arrays of its arguments, which else takes most of
+        the time of a short kernel that is handed records of arrays. An array that is made in it
+        or returned is an error of compilation.
 
     Examples
     --------
@@ -94,12 +98,14 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     >>> halve(3)
     1.5
     """
-    is_cached = options.pop("cache", False)
+    is_cached, borrows = options.pop("cache", False), options.pop("borrows", False)
+    # Numba has no public name for it. Unless it is said, a kernel has it from the one that calls.
+    options["_nrt"] = not borrows
 
     def declare(function: Callable[..., Any]) -> Any:
         kernel = numba.njit(**(DEFAULT_OPTIONS | options))(function)
         if is_cached and isinstance(kernel, Dispatcher):  # else compilation is disabled
-            _enable_cache(kernel)
+            _enable_cache(kernel, borrows)
         return kernel
 
     return declare
@@ -110,6 +116,8 @@ class KernelCache(FunctionCache):
 
     A file that is damaged, cut short or out of reach counts as absent.
     """
+
+    borrows = False
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Return the kernel compiled for a signature, or None."""
@@ -130,6 +138,9 @@ class KernelCache(FunctionCache):
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Save a compiled kernel; log once where that can't be done."""
+        if self.borrows and _holds_arrays(data.signature.return_type):
+            name = data.fndesc.qualname
+            raise TypeError(f"{name} borrows arrays, and returns {data.signature.return_type}")
         if not _CacheState.writes:
             return
         if _have_changed():  # a constant that is built in may be of another state
@@ -154,8 +165,17 @@ class KernelCache(FunctionCache):
             _remove_unused(folder)
 
 
-def _enable_cache(kernel: Any) -> None:
-    """Have a kernel cached in the folder of the fingerprint, if there is one."""
+def _holds_arrays(kind: Any) -> bool:
+    """Tell whether a type of numba's is that of an array, or of a tuple with one."""
+    parts = getattr(kind, "types", ())  # of a tuple
+    return isinstance(kind, types.Array) or any(map(_holds_arrays, parts))
+
+
+def _enable_cache(kernel: Any, borrows: bool) -> None:
+    """Have a kernel cached in the folder of the fingerprint, if there is one.
+
+    ``borrows``: as of :func:`njit`.
+    """
     folder = cache_folder()
     if folder.path is None:
         _warn_uncached(folder.reason)
@@ -168,6 +188,7 @@ def _enable_cache(kernel: Any) -> None:
             kernel_cache = KernelCache(kernel.py_func)
         except RuntimeError:  # numba has no place to cache it in
             return
+    kernel_cache.borrows = borrows
     if folder.path in Path(kernel_cache.cache_path).parents:
         # As numba's `enable_caching` does with its own class. There is no public way to another
         # one, and that one ends a program on a damaged file, and takes those of other signatures.

@@ -10,7 +10,9 @@ import time
 from pathlib import Path
 
 import numba
+import numpy as np
 import pytest
+from numba.core.errors import TypingError
 
 import sweep
 import sweep.kernels
@@ -330,3 +332,55 @@ def test_kernels_are_cached_among_temporary_files_where_the_user_has_no_home(mon
 def test_the_model_is_cached_by_the_fingerprint():
     folder = sweep.kernels.cache_folder()
     assert Path(detect_rows.stats.cache_path).parent == folder.path and folder.reason == ""
+
+
+def _sum_of_first_row(table):
+    row, total = table[0], 0.0
+    for value in row:
+        total += value
+    return total
+
+
+def _first_row(table):
+    return table[0]
+
+
+def _first_row_and_sum(table):
+    return table[0], table.sum()
+
+
+def _doubled(table):
+    return (2.0 * table).sum()
+
+
+def test_a_kernel_that_borrows_leaves_counts_of_references_as_they_are():
+    table = np.arange(6.0).reshape(2, 3)
+    before = sys.getrefcount(table)
+    kernel = sweep.kernels.njit(cache=True, borrows=True)(_sum_of_first_row)
+    assert [kernel(table) for _ in range(100)] == [3.0] * 100
+    assert sys.getrefcount(table) == before
+
+
+@pytest.mark.parametrize("returns_array", [_first_row, _first_row_and_sum])
+def test_a_kernel_that_borrows_returns_no_array(returns_array):
+    kernel = sweep.kernels.njit(cache=True, borrows=True)(returns_array)
+    # Numba refuses to return an array alone.
+    with pytest.raises((TypeError, TypingError), match=r"borrows arrays|returning of array"):
+        kernel(np.ones((2, 3)))
+    # Uncached, as the cache would hand it to the kernel that borrows.
+    assert sweep.kernels.njit()(returns_array)(np.ones((2, 3))) is not None
+
+
+def test_a_kernel_that_borrows_makes_no_array():
+    kernel = sweep.kernels.njit(cache=True, borrows=True)(_doubled)
+    with pytest.raises(TypingError, match="NRT required"):
+        kernel(np.ones((2, 3)))
+
+
+def test_a_kernel_makes_arrays_though_the_one_that_calls_it_borrows():
+    inner = sweep.kernels.njit()(_doubled)
+
+    def call(table):
+        return inner(table)
+
+    assert sweep.kernels.njit(borrows=True)(call)(np.ones((2, 3))) == 12.0

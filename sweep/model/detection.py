@@ -146,14 +146,14 @@ class SpeckleTable(NamedTuple):
         return SpeckleTable(spread, row, self.quadratures, self.factors)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def levels_of(table, i):
     """Return the :class:`BinLevels` of point i from an array (7, n)."""
     shape = PedestalShape(table[4, i], table[5, i], table[6, i])
     return BinLevels(table[0, i], table[1, i], table[2, i], table[3, i], shape)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def pedestal_density(shape, bins):
     """Return the pedestal's power ``bins`` bins from its line, over that under the line."""
     gamma, delay = 2.0 * math.pi * shape.width, shape.delay
@@ -188,7 +188,7 @@ def pedestal_reaches(ratio, width, delay, most):
     return reaches
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def pedestal_of_bins(magnitude, echo, levels, pedestal):
     """Put the power of the pedestal in bins of an echo, over that of the noise, to ``pedestal``.
 
@@ -350,7 +350,7 @@ def any_two(chances: np.ndarray, others: np.ndarray) -> np.ndarray:
     return np.asarray(a * b * c + a * b * no_c + a * no_b * c + no_a * b * c)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def mark(magnitude, count, level, exempt, beside):
     """Find the strongest bin of a run, and mark the bins that cannot raise a false alarm.
 
@@ -401,7 +401,7 @@ def mark(magnitude, count, level, exempt, beside):
     return peak, exempted
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def is_end(bin_, ends):
     """Return whether a bin is DC or Nyquist of a real record, where noise is real.
 
@@ -410,7 +410,7 @@ def is_end(bin_, ends):
     return ends > 0 and (bin_ == 0 or 2 * bin_ == ends)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def crossing_pair(a, b, real):
     """Return P(|X| >= b) and P(|X| < b) of a bin with a steady signal a, both over sigma.
 
@@ -425,7 +425,7 @@ def crossing_pair(a, b, real):
     return above, 0.5 * (math.erfc(0.5 * (a - b)) - math.erfc(0.5 * (a + b)))
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def found_pair(magnitude, echo, peak, low, rule, levels, speckle):
     """Return the probabilities that an echo is detected, and that it is missed.
 
@@ -449,11 +449,7 @@ def found_pair(magnitude, echo, peak, low, rule, levels, speckle):
         if rule.beside > 0:
             return any_faded(magnitude, echo, low, rule, levels, speckle)
         if deviation > levels.quiet:
-            steady = np.empty((4, 1))
-            steady[0, 0], steady[1, 0] = magnitude[peak] / levels.quiet, level / levels.quiet
-            steady[2, 0] = 0.0
-            steady[3, 0] = (deviation / levels.quiet) ** 2 - 1.0
-            return _mean_over_phases(steady, np.array([True]), low + peak, rule, speckle)
+            return _peak_on_pedestal(magnitude[peak], low + peak, rule, levels, speckle)
         signal, noise = magnitude[peak] * magnitude[peak], 2.0 * deviation * deviation
         share = 0.0
         if speckle.quadratures.size > 0:
@@ -470,6 +466,15 @@ def found_pair(magnitude, echo, peak, low, rule, levels, speckle):
 
 
 @njit(cache=True, error_model="numpy")
+def _peak_on_pedestal(magnitude, bin_, rule, levels, speckle):
+    """Return pd and 1 - pd of a bin in developed speckle, by itself, whose pedestal fades too."""
+    steady = np.zeros((4, 1))
+    steady[0, 0], steady[1, 0] = magnitude / levels.quiet, levels.threshold / levels.quiet
+    steady[3, 0] = (levels.line / levels.quiet) ** 2 - 1.0
+    return _mean_over_phases(steady, np.ones(1, np.bool_), bin_, rule, speckle)
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
 def any_pair(magnitude, echo, low, ends, levels, pairs):
     """Return the probabilities that any bin of an echo reaches the threshold, and that none does.
 
@@ -517,7 +522,7 @@ def _any_on_pedestal(magnitude, echo, low, rule, levels):
     return _any_steady(steady, 1.0, echo, low, rule.ends)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def _after_neighbour(chances, before, t_before, pairs):
     """Probabilities that a bin crosses, and that it does not, where the bin before has not.
 
@@ -537,7 +542,7 @@ def _after_neighbour(chances, before, t_before, pairs):
     return crosses - joint, stays + joint, t
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def any_neighbour(chances, count, pairs):
     """Return the probability that any of ``count`` adjacent bins crosses, given each bin's own.
 
@@ -560,7 +565,7 @@ def any_neighbour(chances, count, pairs):
     return found
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def free_images(magnitude, exempt, low, size, gain):
     """Clear the exemption of bins dominated by an I/Q image; return the number still exempt.
 
@@ -579,7 +584,7 @@ def free_images(magnitude, exempt, low, size, gain):
     return exempted
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def any_faded(magnitude, echo, low, rule, levels, speckle):
     """Return the probabilities that any, and that no, bin of an echo in developed speckle crosses.
 
@@ -673,7 +678,7 @@ def _stretch_faded(magnitude, echo, bounds, low, rule, levels, speckle):
     return _mean_over_phases(steady, echo[begin:end], low + begin, rule, speckle)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def _mean_over_phases(steady, echo, low, rule, speckle):
     """Average :func:`_mean_over_mode` over the phase of the mode, where bins are noncircular.
 
@@ -681,6 +686,12 @@ def _mean_over_phases(steady, echo, low, rule, speckle):
     """
     if speckle.quadratures.size == 0:
         return _mean_over_mode(steady, echo, low, rule.ends)
+    return _mean_over_angles(steady, echo, low, rule, speckle)
+
+
+@njit(cache=True, error_model="numpy")
+def _mean_over_angles(steady, echo, low, rule, speckle):
+    """Average as :func:`_mean_over_phases` does, for noncircular bins."""
     found, missed = 0.0, 0.0
     turned = steady.copy()
     for angle in range(ANGLES):
@@ -698,7 +709,7 @@ def _mean_over_phases(steady, echo, low, rule, speckle):
     return found, missed
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def _mean_over_mode(steady, echo, low, ends):
     """Return the probabilities that any, and that no, bin crosses, averaged over the mode's power.
 
@@ -707,8 +718,9 @@ def _mean_over_mode(steady, echo, low, ends):
     over that of the rest. Given z the signal is z times row 0. The average is over |z| with the
     density 2 z e^(-z^2).
     """
-    first, last, middle = _Z_MAX, _Z_MAX, _Z_MAX
+    first, last, middle, pedestal = _Z_MAX, _Z_MAX, _Z_MAX, 0.0
     for k in range(echo.size):
+        pedestal = max(pedestal, steady[3, k])
         if echo[k] and steady[0, k] > 0.0:
             wide = _REACH * math.sqrt(steady[3, k])
             middle = min(middle, steady[1, k] / steady[0, k])
@@ -717,7 +729,7 @@ def _mean_over_mode(steady, echo, low, ends):
                 last = min(last, (steady[1, k] + _REACH) / (steady[0, k] - wide))
     last = min(last, math.sqrt(middle * middle + 10.0))  # what is beyond is 5e-5 of it all
     ends_of_pieces = (first, last, last)
-    if steady[3].max() > 0.0:
+    if pedestal > 0.0:
         # Where a pedestal fades they rise about the middle, or slowly all the way.
         last = max(first, min(last, 4.5))  # what is beyond is 2e-9
         half_way = middle if first < middle < last else 0.5 * (first + last)
@@ -738,7 +750,7 @@ def _mean_over_mode(steady, echo, low, ends):
     return found / whole, missed / whole
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def _any_steady(steady, z, echo, low, ends):
     """Return the probabilities that any, and that no, bin crosses, given the mode's magnitude z.
 
@@ -781,7 +793,7 @@ def _any_steady(steady, z, echo, low, ends):
     return (found if found < 0.5 else 1.0 - missed), missed
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def _deviate(chance):
     """Return the normal deviate exceeded with probability ``chance`` <= 1/2, to about 1e-4."""
     if chance < 1e-300:
@@ -793,7 +805,7 @@ def _deviate(chance):
     return t + math.log(tail / chance) * tail / slope
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def echo_of(magnitude, first, last, level, beside):
     """Return the first and last bin of the echo around a group of bins first .. last.
 
@@ -802,7 +814,10 @@ def echo_of(magnitude, first, last, level, beside):
     """
     if beside == 0:
         return first, last
-    floor = 0.5 * magnitude[first : last + 1].max()
+    largest = magnitude[first]
+    for k in range(first + 1, last + 1):
+        largest = max(largest, magnitude[k])
+    floor = 0.5 * largest
     while first > 0 and floor <= magnitude[first - 1] < level:
         first -= 1
     while last < magnitude.size - 1 and floor <= magnitude[last + 1] < level:
@@ -813,7 +828,7 @@ def echo_of(magnitude, first, last, level, beside):
     return first, last
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def _survey(magnitude, level):
     """Return the largest magnitude, and the number of bins at or above a level."""
     largest, above = magnitude[0], 0
@@ -823,7 +838,7 @@ def _survey(magnitude, level):
     return largest, above
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def _exempt(first, last, count, exempt):
     """Mark the bins first .. last and their two neighbours as exempt; return their number."""
     first, last = max(first - 1, 0), min(last + 1, count - 1)

@@ -415,14 +415,14 @@ def _alarm_by_leakage(address, at, seen, level, correlation, factors, words, ala
         alarms[d] |= waits[d]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def fading_factors(key, draw, group, mixing):
     """Factors of a draw on a group's magnitudes in the three segments; their mean square is 1."""
     one, other, last = fading_amplitudes(key, draw, group, mixing)
     return math.hypot(one[0], one[1]), math.hypot(other[0], other[1]), math.hypot(last[0], last[1])
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def fading_amplitudes(key, draw, group, mixing):
     """Amplitudes of a draw of a group in the three segments, complex; their mean square is 1.
 
@@ -439,7 +439,7 @@ def fading_amplitudes(key, draw, group, mixing):
     return (half * a, half * b), second, (half * last_re, half * last_im)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def _happen(address, stream, chances, given, words, found):
     """Mark the draws (key, first, number) in which something happens, by two probabilities.
 
@@ -488,7 +488,7 @@ def _cross_any(address, at, seen, rule, levels, fading, room, found):
             found[d] |= echo[i] and re * re + im * im >= threshold * threshold
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def draw_noise(draw, number, low, count, rule, room):
     """Noise of adjacent bins over sigma, in phase with the signal and across, to rows 0 and 1.
 
@@ -517,7 +517,7 @@ def draw_noise(draw, number, low, count, rule, room):
         room[0, i], room[1, i] = re, im
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def draw_noise_by_root(draw, number, count, root, room):
     """Noise of ``count`` adjacent bins over sigma, to rows 0 and 1 of ``room`` (4, >= count).
 
@@ -537,7 +537,7 @@ def draw_noise_by_root(draw, number, count, root, room):
         room[0, k], room[1, k] = re, im
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def _cross(address, stream, index, line, words, found):
     """Mark the draws in which a bin, with its noise, reaches the threshold.
 

@@ -120,7 +120,7 @@ def _find_groups(part, runs, of_bins, levels, how, bins, neighbours, pd):
                     bins[field, i, s, g] += low[s, j]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def _beside(magnitude, low, k, half):
     """Magnitude k of a run that starts at bin ``low``; mirrored at DC and Nyquist, 0 past it."""
     if half > 0:
@@ -129,7 +129,7 @@ def _beside(magnitude, low, k, half):
     return magnitude[k] if 0 <= k < magnitude.size else 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def _list_groups(magnitude, exempt, peak, level, bins):
     """List the strongest groups of a run in bins (3, most), as indices; return their number.
 

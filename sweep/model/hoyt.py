@@ -25,7 +25,7 @@ ANGLES = 8
 COSINES = np.cos(np.pi * (np.arange(ANGLES) + 0.5) / ANGLES)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def bin_share(bin_, half, shares):
     """Return the pseudo-variance ratio q = E[X^2] / E[|X|^2] of a bin; 0 far from DC and Nyquist.
 
@@ -36,7 +36,7 @@ def bin_share(bin_, half, shares):
     return shares[k] if 0 <= k < shares.size else 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def hoyt_pair(power, share, level):
     """Return P(|X| >= level) and P(|X| < level) of a noncircular complex Gaussian number X.
 

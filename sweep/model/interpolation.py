@@ -208,7 +208,7 @@ def _mixing(near: float, far: float) -> tuple[float, float, float, float]:
     return near, rest, across, math.sqrt(max(1 - near**2 - across**2, 0.0))
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def sub_bin(below, centre, above, tables):
     """Estimate a tone's offset from the centre bin [bins, -1 .. 1] from three magnitudes."""
     position, weight = tables.position, tables.weight
@@ -227,7 +227,7 @@ def sub_bin(below, centre, above, tables):
     return delta if above >= below else -delta
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def _at(values, place):
     """Linear interpolation in a table at a fractional index, which is clipped to the table."""
     place = min(max(place, 0.0), values.size - 1.0)
@@ -235,7 +235,7 @@ def _at(values, place):
     return values[i] + (place - i) * (values[i + 1] - values[i])
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def sub_bin_error(delta, ratio, tables):
     """Return the standard error of :func:`sub_bin` [bins], at most 1/2.
 
@@ -365,7 +365,7 @@ def _late_tables(window: Window, fft_size: int) -> tuple[np.ndarray, np.ndarray]
     return shift, wider
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def spread_error(delta, spread, power, tables):
     """Return the error of :func:`sub_bin` [bins] for lines that spread about their mean.
 

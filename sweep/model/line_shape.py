@@ -540,7 +540,7 @@ def build(segment, numbers, parts, shapes, table, form):
     _put_envelope(raw[0, :number], ends, sizes, reach, envelope)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def same_part(segment, which, parts, lengths, segments):
     """First segment before this one whose shape is the same, -1 for none; as of :func:`build`."""
     number = parts[2][segment, which]

@@ -93,7 +93,7 @@ def _left_out(log_z: np.ndarray, order: np.ndarray, weights: np.ndarray) -> np.n
     return np.asarray(np.exp(first) * total / (1 - z / (2 * order + 2)))
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def place_lines(p, segment, footprint, row, sizes, room):
     """Lines of a segment: places and complex weights C_b, into rows PLACE, RE and IM.
 
@@ -154,7 +154,7 @@ def place_lines(p, segment, footprint, row, sizes, room):
     return origin
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def add_images(room, n, origin, gain, power):
     """Add the lines' images at negative frequencies, scaled by ``gain``; return the new count."""
     for b in range(n):
@@ -164,7 +164,7 @@ def add_images(room, n, origin, gain, power):
     return 2 * n
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def fold_lines(room, n, sizes):
     """Move n lines by whole FFT lengths to within half of one from the origin."""
     for b in range(n):
@@ -174,7 +174,7 @@ def fold_lines(room, n, sizes):
             room[RE, b], room[IM, b] = -room[RE, b], -room[IM, b]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def survey(room, n, power):
     """Sum of n lines' magnitudes, or a little more, and of their squares; the ends of their places.
 
@@ -213,7 +213,7 @@ def survey(room, n, power):
     return total, squares, lowest, highest
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def relative_error(total, squares, n, power, window_sum, allowed, level):
     """Error that few lines for n may make, over what the peak of all of them may come to.
 
@@ -237,7 +237,7 @@ def relative_error(total, squares, n, power, window_sum, allowed, level):
     return allowed * min(level, 0.5 * math.sqrt(whole)) / whole
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def nodes_for(turn, tolerance, limits):
     """Nodes that serve lines within +-``turn`` radians of the band, or one more than any.
 
@@ -252,7 +252,7 @@ def nodes_for(turn, tolerance, limits):
     return nodes
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def put_on_nodes(room, re_row, im_row, n, nodes, span, out_re, out_im):
     """Move n weights onto Chebyshev nodes ``middle`` +- ``half`` (``span``), if these are fewer.
 
@@ -296,7 +296,7 @@ def put_on_nodes(room, re_row, im_row, n, nodes, span, out_re, out_im):
     return nodes
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def _add_moments(room, nodes):
     """Add sums over a block of lines of their weights times T_0(x) .. T_nodes(x)."""
     for i in range(TOGETHER):

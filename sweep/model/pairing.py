@@ -113,7 +113,7 @@ def pair_peaks(up, doppler, down, third, fft_size, signed, assumed, tolerance, p
     return confirmed, number
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def confirm(up, doppler, down, third, fft_size, signed, tolerance):
     """Doppler peak and reading of an up and a down peak that fit best, within a tolerance [bins].
 
@@ -183,7 +183,7 @@ def _match(cost):
     return best, used
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def judge(group, centres, bins, lines, amplitude):
     """Flag of a return, but for its reading; and the beamlet next to its peaks that all hold.
 

@@ -188,7 +188,9 @@ def draw_returns(
             filtered = filtered._replace(
                 end_rule=end_rule, noise_quadratures=np.ascontiguousarray(quadratures[:near])
             )
-        _draw(keys[part], filtered, of_part, seen, of_signal, tables, own)
+        bins = max(around, filtered.end_rule[0].shape[0], int(seen.bins.max(initial=0)))
+        work = Workspace.of(bins, found.bin.shape[2])
+        _draw(keys[part], filtered, of_part, seen, of_signal, tables, work, own)
         for column, values in zip(drawn, own, strict=True):
             column[part] = values
     return measured(shots, known, drawn, motion)
@@ -325,6 +327,33 @@ class Known(NamedTuple):
         return Known(
             *(v.of(part) if isinstance(v, LineFan) else v[part] for v in self)  # type: ignore[arg-type]
         )
+
+
+class Workspace(NamedTuple):
+    """Arrays that kernels write to within a draw, made once for all draws."""
+
+    noise: np.ndarray
+    """(4, bins + TAPS): noise of an echo's bins, and what it is made of."""
+    power: np.ndarray
+    """(bins,): power of an echo's bins over sigma^2."""
+    pedestal: np.ndarray
+    """(bins,): power of the pedestal in an echo's bins, over that of noise."""
+    is_echo: np.ndarray
+    """(bins,) bool: true."""
+    false_bin: np.ndarray
+    """(most + 1,) int64: bins of a segment's false peaks."""
+    false_ratio: np.ndarray
+    """(most + 1,): their |X| / sigma."""
+    centre: np.ndarray
+    """(3,): positions of a return's peaks [bins]."""
+
+    @classmethod
+    def of(cls, bins: int, most: int) -> "Workspace":
+        """Make room for echoes of so many bins, and for ``most`` groups of a segment."""
+        return cls(
+            np.empty((4, bins + TAPS)), np.empty(bins), np.empty(bins), np.ones(bins, np.bool_),
+            np.empty(most + 1, np.int64), np.empty(most + 1), np.empty(3),
+        )  # fmt: skip
 
 
 class Drawn(NamedTuple):
@@ -778,7 +807,7 @@ def _with_common_wander(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _draw(keys, how, known, seen, leaks, tables, out):
+def _draw(keys, how, known, seen, leaks, tables, work, out):
     """All draws of all points: peaks of the three segments, and which make returns."""
     n, draws, most = out.flags.shape
     peaks, which = np.zeros((3, most + 1, 4)), np.empty((3, most + 1), np.int64)
@@ -797,9 +826,9 @@ def _draw(keys, how, known, seen, leaks, tables, out):
                 if s != 1 or how.doppler:
                     number[s] = draw_peaks(
                         address, (i, s), how, known, seen, leaks, fading, speckle, tables,
-                        peaks[s], which[s], up,
+                        work, peaks[s], which[s], up,
                     )  # fmt: skip
-            report((i, d), how, known, (peaks, which, number), pairs, out)
+            report((i, d), how, known, (peaks, which, number), pairs, work, out)
 
 
 class Speckle(NamedTuple):
@@ -868,7 +897,7 @@ def speckled_bins(i, how, known, seen):
     return Speckle(first, count, power, pseudo, drawn, rank, factor)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def draw_speckle(address, i, known, speckle, fading):
     """Draw the speckle of a point's groups, and the factors (most, 3) by which they fade."""
     for g in range(speckle.number.shape[0]):
@@ -898,8 +927,8 @@ def draw_speckle(address, i, known, speckle, fading):
             fading[g, s] = math.sqrt(total / speckle.drawn.shape[1])
 
 
-@njit(cache=True, error_model="numpy")
-def report(at, how, known, found, pairs, out):
+@njit(cache=True, error_model="numpy", borrows=True)
+def report(at, how, known, found, pairs, work, out):
     """Pair the peaks of one point (i, draw) into returns, and judge each.
 
     ``found``: peaks (3, most + 1, 4), their groups, and their number in each segment.
@@ -917,7 +946,8 @@ def report(at, how, known, found, pairs, out):
             pairs[r, 0], pairs[r, 1], pairs[r, 2], pairs[r, 3] = r, -1, r, how.alone
     for r in range(min(count, out.flags.shape[2])):
         u, k, v, out.code[i, d, r] = pairs[r]
-        group, centres = out.group[i, d, r], np.zeros(3)
+        group, centres = out.group[i, d, r], work.centre
+        centres[1] = 0.0
         group[0], group[2] = which[0, u], which[2, v]
         centres[0], centres[2] = peaks[0, u, FINE], peaks[2, v, FINE]
         if k >= 0:
@@ -939,8 +969,10 @@ def report(at, how, known, found, pairs, out):
         out.flags[i, d, r] = flag | (UNCONFIRMED if r >= confirmed else 0)
 
 
-@njit(cache=True, error_model="numpy")
-def draw_peaks(address, at, how, known, seen, leaks, fading, speckle, tables, peaks, which, up):
+@njit(cache=True, error_model="numpy", borrows=True)
+def draw_peaks(
+    address, at, how, known, seen, leaks, fading, speckle, tables, work, peaks, which, up
+):
     """Peaks (most + 1, 4) of a segment in a draw and their groups; returns how many there are.
 
     ``address`` is the key of the point and the number of the draw, ``at`` point and segment.
@@ -955,11 +987,13 @@ def draw_peaks(address, at, how, known, seen, leaks, fading, speckle, tables, pe
         if bins[BIN, g] < 0:
             break
         if how.noisy and how.beside > 0:
-            there = look_at_all(address, at, g, how, known, seen, speckle, tables, peaks[count])
+            there = look_at_all(
+                address, at, g, how, known, seen, speckle, tables, work, peaks[count]
+            )
         elif how.noisy:
-            there = look(address, at, g, how, known, seen, speckle, tables, peaks[count])
+            there = look(address, at, g, how, known, seen, speckle, tables, work, peaks[count])
         elif speckle.number[g, s] > 0:
-            there = detect_faded(address, at, g, how, known, speckle, tables, peaks[count])
+            there = detect_faded(address, at, g, how, known, speckle, tables, work, peaks[count])
         else:
             chance = known.beside[i, 1 if up[g] else 0, g] if s == 2 else known.pd[i, s, g]
             uniform = philox.uniform(a, b, draw, philox.STREAM_DETECTION[s], g)
@@ -979,7 +1013,8 @@ def draw_peaks(address, at, how, known, seen, leaks, fading, speckle, tables, pe
             which[count] = g
             count += 1
     room = peaks.shape[0] - count
-    false, ratios, number = np.empty(room, np.int64), np.zeros(room), 0
+    false, ratios, number = work.false_bin[:room], work.false_ratio[:room], 0
+    ratios[:] = 0.0
     if how.noisy:
         number = list_noisy(address, at, seen, leaks, fading[:, s], beta, tables, false, ratios)
     else:
@@ -1002,7 +1037,7 @@ def draw_peaks(address, at, how, known, seen, leaks, fading, speckle, tables, pe
     return count
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def list_noisy(address, at, seen, leaks, fading, level, tables, bins, ratios):
     """List the strongest peaks of bins of leaked signal with their noise; return their number.
 
@@ -1035,8 +1070,8 @@ def list_noisy(address, at, seen, leaks, fading, level, tables, bins, ratios):
     return list_peak((np.int64(-1) if is_echo else peak, largest), bins, ratios, number)
 
 
-@njit(cache=True, error_model="numpy")
-def look(address, at, g, how, known, seen, speckle, tables, peak):
+@njit(cache=True, error_model="numpy", borrows=True)
+def look(address, at, g, how, known, seen, speckle, tables, work, peak):
     """Look at a group's strongest bin with its noise: True, and its peak, where it crosses."""
     (a, b, draw), (i, s) = address, at
     sigma, beta, under_lines = known.levels[i]
@@ -1047,13 +1082,13 @@ def look(address, at, g, how, known, seen, speckle, tables, peak):
     if real:
         re, im = math.sqrt(2.0) * re, 0.0
     re, im = re * under_lines, im * under_lines
-    m = known.magnitude[i, s, g] / sigma
+    m = known.magnitude[i, s, g]
     near_end = speckle.number[g, s] > 0 and is_near_end(centre - 1, 3, how)
-    room = np.empty((4, how.end_rule[0].shape[0] + TAPS if near_end else 0))
+    room = work.noise
     if near_end:
         noise_near_end((a, b, draw, stream), ECHO * (1 + g), (centre - 1, 3), how, room)
         re, im = under_lines * room[0, 1], under_lines * room[1, 1]
-    echo = speckled(m[1], speckle, g, s, 1)
+    echo = speckled(m[1] / sigma, speckle, g, s, 1)
     if (echo.real + re) ** 2 + (echo.imag + im) ** 2 < beta * beta:
         return False
     # Neighbours are exempt from false alarms, so their bins' own numbers are free.
@@ -1062,7 +1097,8 @@ def look(address, at, g, how, known, seen, speckle, tables, peak):
     re_below, im_below = re_below * under_lines, im_below * under_lines
     re_above, im_above = re_above * under_lines, im_above * under_lines
     near, rest, across, own = tables.mixing
-    low, high = speckled(m[0], speckle, g, s, 0), speckled(m[2], speckle, g, s, 2)
+    low = speckled(m[0] / sigma, speckle, g, s, 0)
+    high = speckled(m[2] / sigma, speckle, g, s, 2)
     below = math.hypot(
         low.real + (near * re + across * re_above + own * re_below),
         low.imag + (near * im + across * im_above + own * im_below),
@@ -1083,7 +1119,7 @@ def look(address, at, g, how, known, seen, speckle, tables, peak):
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def speckled(magnitude, speckle, g, s, k):
     """Complex amplitude of bin k of a group in a draw, of a mean square magnitude."""
     if speckle.number[g, s] == 0:
@@ -1091,8 +1127,8 @@ def speckled(magnitude, speckle, g, s, k):
     return magnitude * speckle.drawn[g, 0, s, k]
 
 
-@njit(cache=True, error_model="numpy")
-def detect_faded(address, at, g, how, known, speckle, tables, peak):
+@njit(cache=True, error_model="numpy", borrows=True)
+def detect_faded(address, at, g, how, known, speckle, tables, work, peak):
     """Draw a group in developed speckle: True, and its peak, where it is detected.
 
     Its amplitude, echo and noise, is normal, of the echo's share in the mean power. It is detected
@@ -1107,9 +1143,9 @@ def detect_faded(address, at, g, how, known, speckle, tables, peak):
     share, near_end = known.share[i, s, g], is_near_end(first, count, how)
     if not chance > 0.0:
         return False
-    power = np.zeros(count)
-    room = np.empty((4, TAPS + (how.end_rule[0].shape[0] if near_end else count)))
-    scale, votes, total = known.magnitude[i, s, g] / sigma, 0, complex(0.0, 0.0)
+    power, room = work.power[:count], work.noise
+    power[:] = 0.0
+    magnitude, votes, total = known.magnitude[i, s, g], 0, complex(0.0, 0.0)
     for look in range(how.looks):
         own = draw + look * NEXT_LOOK
         address_of_noise = a, b, own, philox.STREAM_NOISE[s]
@@ -1120,9 +1156,13 @@ def detect_faded(address, at, g, how, known, speckle, tables, peak):
         echo = speckle.drawn[g, look if speckle.drawn.shape[1] > 1 else 0, s]
         for k in range(count):
             if abs(k - middle) <= 1:
-                size = scale[1 + k - middle]
+                size = magnitude[1 + k - middle] / sigma
             else:
-                size = scale[1] * math.sqrt(speckle.power[g, s, k] / speckle.power[g, s, middle])
+                size = (
+                    magnitude[1]
+                    / sigma
+                    * math.sqrt(speckle.power[g, s, k] / speckle.power[g, s, middle])
+                )
             noise = complex(room[0, k], room[1, k])
             amplitude = size * echo[k] + under_lines * noise
             if k == middle and look == 0:
@@ -1158,7 +1198,7 @@ def detect_faded(address, at, g, how, known, speckle, tables, peak):
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def bins_of_noise(address, number, bins, how, room):
     """Noise of adjacent bins over sigma, to rows 0 and 1 of ``room`` (4, >= bins + TAPS).
 
@@ -1177,14 +1217,14 @@ def bins_of_noise(address, number, bins, how, room):
         draw_noise(address, number, first, count, how.rule, room)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def is_near_end(first, count, how):
     """Return true of adjacent bins so near to DC or Nyquist that the noise's quadratures differ."""
     near = how.noise_quadratures.size
     return near > 0 and (first < near or first + count - 1 > how.half - near)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def noise_near_end(address, number, bins, how, room):
     """Noise of :func:`bins_of_noise` near DC or Nyquist, beyond which bins are conjugate."""
     first, count = bins
@@ -1202,7 +1242,7 @@ def noise_near_end(address, number, bins, how, room):
         room[0, k], room[1, k] = room[2, bin_], sign * room[3, bin_]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def three_bins_of_noise(address, number, tables, room):
     """Noise of three adjacent bins over sigma, to rows 0 and 1 of ``room``.
 
@@ -1219,8 +1259,8 @@ def three_bins_of_noise(address, number, tables, room):
     room[0, 2], room[1, 2] = near * re + rest * re_above, near * im + rest * im_above
 
 
-@njit(cache=True, error_model="numpy")
-def look_at_all(address, at, g, how, known, seen, speckle, tables, peak):
+@njit(cache=True, error_model="numpy", borrows=True)
+def look_at_all(address, at, g, how, known, seen, speckle, tables, work, peak):
     """Look at all bins of a group's echo with their noise: True, and its peak, where any crosses.
 
     The peak is the largest of them.
@@ -1232,13 +1272,14 @@ def look_at_all(address, at, g, how, known, seen, speckle, tables, peak):
     first, last = known.bins[i, s, FIRST, g] - low, known.bins[i, s, LAST, g] - low
     first, last = echo_of(run, first, last, beta, max(how.beside, int(known.of_bins[i, 4])))
     count, best = last - first + 1, 0
-    pedestal = np.zeros(count)
+    pedestal, room = work.pedestal[:count], work.noise
+    pedestal[:] = 0.0
     if under_lines > 1.0:
-        echo = np.ones(count, np.bool_)
-        pedestal_of_bins(
-            sigma * run[first : last + 1], echo, levels_of(known.of_bins.T, i), pedestal
-        )
-    room = np.empty((4, max(count, how.end_rule[0].shape[0]) + TAPS))
+        magnitude = work.power[:count]
+        for k in range(count):
+            magnitude[k] = sigma * run[first + k]
+        levels = levels_of(known.of_bins.T, i)
+        pedestal_of_bins(magnitude, work.is_echo[:count], levels, pedestal)
     address_of_noise, numbers = (a, b, draw, philox.STREAM_NOISE[s]), ECHO * (1 + g)
     if speckle.number[g, s] > 0:
         bins_of_noise(address_of_noise, numbers, (low + first, count), how, room)
@@ -1263,7 +1304,7 @@ def look_at_all(address, at, g, how, known, seen, speckle, tables, peak):
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def put(peak, whole, fine, error, ratio, spread, how, tables):
     """Write a peak's fields, mirrored into 0..N/2 where it lies past DC or Nyquist.
 

@@ -89,7 +89,7 @@ def columns(shots: Any, values: np.ndarray | float, dims: int = 1) -> np.ndarray
     return np.broadcast_to(values, shots.size).reshape(-1, *[1] * dims)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def _is_in(bin_, band, period):
     """Return true for a bin of the band (2,): first, number; ``period`` N of complex records."""
     apart = bin_ - band[0]

@@ -551,7 +551,7 @@ def _shifts(shots: Shots, part: np.ndarray) -> np.ndarray:
     return np.concatenate([moved, weight], axis=2)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def _take_lines(p, where, footprint, centre, shift, window_sum, limits, sizes, room):
     """Lines of a point's segment into rows PLACE .., few for many; origin, number, survey."""
     segment, row = where
@@ -594,7 +594,7 @@ def _take_lines(p, where, footprint, centre, shift, window_sum, limits, sizes, r
     return origin, n, total, lowest, highest
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def _keep(at, count, room, exempt, magnitudes, exempts):
     """Hands a run on, from ``at`` on; where the next one begins."""
     for k in range(count):

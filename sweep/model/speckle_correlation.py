@@ -29,11 +29,13 @@ The probability that both bins cross a threshold is that of two correlated Rayle
 :func:`sweep.model.detection.fading_together`, by |mu|.
 """
 
+import math
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
+from sweep.kernels import njit
 from sweep.model.window import Window, samples
 
 SEGMENT_PAIRS = ((0, 1), (0, 2), (1, 2))
@@ -48,7 +50,7 @@ REACH = 6.0
 
 OVERSAMPLING = 64
 """Samples of the tabulated window transform per bin of fs/L."""
-_NODES = 48
+_NODE, _WEIGHT = np.polynomial.legendre.leggauss(48)
 _DEVIATIONS_MAX = 5.0
 """Largest half-width of the integration interval [standard deviations of the beam]."""
 _RESOLVED_PHASE_MAX = 40.0
@@ -102,18 +104,61 @@ def bin_correlation(window: Window, lines: LineSpread) -> np.ndarray:
     transform of the same half-width, which is close to 0 there.
     """
     end = np.minimum(_DEVIATIONS_MAX, REACH / np.maximum(lines.widest, 1e-300))
-    node, weight = np.polynomial.legendre.leggauss(_NODES)
-    y = end[:, None] * node
-    power = np.exp(-0.5 * y * y) * np.maximum(1 + lines.lean[:, None] * y, 0.0) * weight
-    first, second = (
-        window_transform(window, distance[:, None] - spread[:, None] * y)
-        for distance, spread in zip(lines.distance, lines.spread, strict=True)
-    )
-    shared = (power * first * second * np.exp(1j * lines.turn[:, None] * y)).sum(axis=1)
-    strengths = (power * first * first).sum(axis=1) * (power * second * second).sum(axis=1)
-    correlation = shared / np.sqrt(np.maximum(strengths, 1e-300))
     is_resolved = np.abs(lines.turn) * end <= _RESOLVED_PHASE_MAX
-    return np.where(is_resolved, correlation, _gaussian_correlation(window, lines))
+    correlation = _gaussian_correlation(window, lines).astype(complex)
+    _integrate(
+        np.flatnonzero(is_resolved), end, np.stack(lines.distance), np.stack(lines.spread),
+        lines.turn, lines.lean, transform_table(window)[1], _NODE, _WEIGHT, correlation,
+    )  # fmt: skip
+    return correlation
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _integrate(points, end, distance, spread, turn, lean, transform, nodes, weights, correlation):
+    """Put equation (3) of some points into ``correlation`` (n,) complex, by quadrature.
+
+    Parameters
+    ----------
+    points
+        Indices of these points.
+    end
+        (n,): half-width of the interval of y [standard deviations of the beam].
+    distance, spread, turn, lean
+        Of :class:`LineSpread`, the first two (2, n).
+    transform
+        G of :func:`transform_table`.
+    nodes, weights
+        Of a rule of quadrature on -1 .. 1.
+    """
+    power, last = np.empty(nodes.size), -1.0
+    for i in points:
+        if end[i] != last:  # alike of all footprints within a bin
+            last = end[i]
+            for j in range(nodes.size):
+                power[j] = weights[j] * math.exp(-0.5 * (last * nodes[j]) ** 2)
+        re, im, first_strength, second_strength = 0.0, 0.0, 0.0, 0.0
+        for j in range(nodes.size):
+            y = last * nodes[j]
+            share = power[j] * max(1.0 + lean[i] * y, 0.0)
+            first = _transform_at(distance[0, i] - spread[0, i] * y, transform)
+            second = _transform_at(distance[1, i] - spread[1, i] * y, transform)
+            both = share * first * second
+            re += both * math.cos(turn[i] * y)
+            im += both * math.sin(turn[i] * y)
+            first_strength += share * first * first
+            second_strength += share * second * second
+        strength = math.sqrt(max(first_strength * second_strength, 1e-300))
+        correlation[i] = complex(re / strength, im / strength)
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def _transform_at(distance, transform):
+    """Interpolate G, tabulated from 0 on, at a distance [bins of fs/L]; 0 beyond the table."""
+    place = abs(distance) * OVERSAMPLING
+    if place >= transform.size - 1:
+        return transform[transform.size - 1] if place == transform.size - 1 else 0.0
+    k = int(place)
+    return transform[k] + (place - k) * (transform[k + 1] - transform[k])
 
 
 def _gaussian_correlation(window: Window, lines: LineSpread) -> np.ndarray:

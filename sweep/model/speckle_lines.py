@@ -173,7 +173,7 @@ def directions(shots: "Shots") -> np.ndarray:
     return found
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def transform_at(distance, fan):
     """Interpolate the window transform G at a distance from the line [bins of fs/N]."""
     place = abs(distance) * fan.steps
@@ -189,7 +189,7 @@ def image_of(place, half):
     return -place if place < 0.5 * half else 2.0 * half - place
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def line_powers(fan, i, middle, first, power, pseudo):
     """Mean powers (3, bins) of bins by lines of a total power of 1, into ``power``.
 
@@ -229,7 +229,7 @@ def line_powers(fan, i, middle, first, power, pseudo):
     return imaged
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def draw_lines(address, group, fan, i, middle, first, power, out):
     """Draw complex speckle amplitudes of bins, of mean power 1, into ``out`` (3, bins).
 
@@ -368,7 +368,7 @@ def factor_bins(fan, i, middle, first, power, factor):
     return factor.shape[0]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def draw_factored(address, group, factor, rank, out):
     """Draw amplitudes (3, bins) into ``out`` by the rows of :func:`factor_bins`.
 
@@ -380,13 +380,16 @@ def draw_factored(address, group, factor, rank, out):
         words = philox.words4(
             address[0], address[1], address[2], philox.STREAM_SPECKLE, (first + pair) >> 1
         )
-        for r in range(pair, min(pair + 2, rank)):
-            word, other = (words[0], words[1]) if r == pair else (words[2], words[3])
-            re, im = philox.to_normals(word, other)
-            amplitude = complex(re, im)
+        one = complex(*philox.to_normals(words[0], words[1]))
+        if pair + 1 == rank:
             for s in range(out.shape[0]):
                 for k in range(out.shape[1]):
-                    out[s, k] += amplitude * factor[r, s, k]
+                    out[s, k] += one * factor[pair, s, k]
+            return
+        other = complex(*philox.to_normals(words[2], words[3]))
+        for s in range(out.shape[0]):
+            for k in range(out.shape[1]):
+                out[s, k] = (out[s, k] + one * factor[pair, s, k]) + other * factor[pair + 1, s, k]
 
 
 def drawn_speckle(

@@ -113,7 +113,7 @@ def _strongest_mode(covariance: np.ndarray) -> np.ndarray:
     return mode * math.sqrt(value)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def lean_of(below, middle, above):
     """Return (P_above - P_below) / (P_above + P_below) of the largest bin's neighbours; 0 if faint.
 
@@ -125,7 +125,7 @@ def lean_of(below, middle, above):
     return (above * above - below * below) / whole
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def modes_of(table, spread, lean):
     """Return the cell (s, d) of a table around a spread and an asymmetry, and the weights in it.
 
@@ -144,7 +144,7 @@ def modes_of(table, spread, lean):
     return s, over, d, min(max(aside, 0.0), 1.0)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def interpolated(values, at, k):
     """Interpolate a table (s, OFFSETS, bins) k bins from the bin nearest to the echo's centre.
 

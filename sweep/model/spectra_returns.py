@@ -39,7 +39,7 @@ from sweep.model.noisy_spectra import (
 from sweep.model.own_motion import OwnMotion
 from sweep.model.pairing import FALSE
 from sweep.model.preparation import Parameters, Shots
-from sweep.model.returns import Drawn, How, Returns, known_of, measured, put, report
+from sweep.model.returns import Drawn, How, Returns, Workspace, known_of, measured, put, report
 from sweep.model.waveform import STRONGEST
 
 
@@ -63,6 +63,7 @@ def spectra_returns(
     how, tables = How.of(shots, first_draw, True), interpolator(shots.window, shots.fft_size)
     peaks, which = np.zeros((3, most + 1, 4)), np.empty((3, most + 1), np.int64)
     pairs, looks = np.empty((most + 1, 4), np.int64), math.sqrt(shots.looks.number)
+    work = Workspace.of(0, most)
     zero, kept = index_of_zero(shots), 1 if shots.peaks == STRONGEST else most + 1
     rounded = math.sqrt(1 / 12) if str(p[ESTIMATOR + "kind"]) == PEAK_BIN else 0.0
     for i in range(shots.size):
@@ -88,7 +89,7 @@ def spectra_returns(
                     put(peaks[s, k], *at, error, ratio, wide, how, tables)
                     which[s, k] = groups[k]
                 number[s] = bins.size
-            report((i, d), how, known, (peaks, which, number), pairs, drawn)
+            report((i, d), how, known, (peaks, which, number), pairs, work, drawn)
     return measured(shots, known, drawn, motion, from_three_bins=False)
 
 

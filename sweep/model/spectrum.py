@@ -72,7 +72,7 @@ BESIDE = WINDOW + EDGE + 1
 """Bins by which tables may hold less about a line than on either side of a cell."""
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def add_near(first, count, lines, table, sizes, room):
     """Add n lines to F in bins ``first`` .. where their shape's table holds these.
 
@@ -97,7 +97,7 @@ def add_near(first, count, lines, table, sizes, room):
             _add_cells(first, count, (start, number, lap), table, sizes, room)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def _share_out(place, re, im, room):
     """Share a line at a place among cells out among POINTS of them."""
     cell = np.uint64(math.floor(place))
@@ -110,14 +110,14 @@ def _share_out(place, re, im, room):
         room[CELL_IM, cell + j] += im * weight
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def held_of(start, lap, sizes):
     """First bin, and one past the last, that tables hold of all lines of a window."""
     beside, start = sizes[2], start + lap * sizes[0]
     return start + WINDOW + EDGE - beside, start - EDGE + beside
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def _add_cells(first, count, window, table, sizes, room):
     """Add a window's cells, which begin six before it, to F; arguments as of :func:`add_near`."""
     start, number, lap = window
@@ -149,7 +149,7 @@ def _add_cells(first, count, window, table, sizes, room):
                 room[F_IM, to + i] += re * h + im * g
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def take_sources(n, lowest, highest, distance, digits, sizes, room):
     """Strengths of n lines as the record's ends see them, and sources that stand for them.
 
@@ -177,7 +177,7 @@ def take_sources(n, lowest, highest, distance, digits, sizes, room):
     return number
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def weight_afar(total, sources, sizes, room):
     """Sum the weight of lines as bins beyond the table see them; for powers, take its root."""
     first, last = 0.0, 0.0
@@ -188,14 +188,14 @@ def weight_afar(total, sources, sizes, room):
     return min(total, math.sqrt(first) if sizes[4] else first)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def tangent_of(k, fft_size, tangent):
     """tan(pi k / N) for any whole k; ``tangent`` holds those of 0 .. N/2."""
     k %= fft_size
     return tangent[k] if 2 * k <= fft_size else -tangent[fft_size - k]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def prepare_far(first, count, sizes, tangent, room):
     """Tangents and turns of bins ``first`` .., count <= STRIP, into rows TAN and TURN."""
     fft_size = sizes[0]
@@ -212,7 +212,7 @@ def prepare_far(first, count, sizes, tangent, room):
         room[TURN_RE, i], room[TURN_IM, i] = turn[1], turn[0]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def add_far(start, end, at, rows, b, digits, form, sizes, room):
     """Add line or source b to F, from ``at`` on, in prepared bins start .. end - 1, to e^-digits.
 
@@ -265,7 +265,7 @@ def add_far(start, end, at, rows, b, digits, form, sizes, room):
         room[F_IM, to + i] += c * (u_im - v_im) + s * (u_re + v_re)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def field(first, count, lines, table, form, sizes, tangent, room):
     """F in bins ``first`` .., counted from the lines' origin, into rows F_RE and F_IM.
 
@@ -318,7 +318,7 @@ def field(first, count, lines, table, form, sizes, tangent, room):
         at = stop
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def gap_of(first, count, lowest, highest, fft_size):
     """Least distance of some bins from lines, around the circle of all bins; 0 between them."""
     apart = first + 0.5 * (count - 1) - 0.5 * (lowest + highest)
@@ -326,7 +326,7 @@ def gap_of(first, count, lowest, highest, fft_size):
     return max(apart - 0.5 * (count - 1) - 0.5 * (highest - lowest), 0.0)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def envelope_from(distance, form):
     """Index of what is known of envelopes from a distance on."""
     low, high = 0, form.shape[1]
@@ -339,7 +339,7 @@ def envelope_from(distance, form):
     return max(low - 1, 0)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def magnitudes(low, count, origin, lines, shifts, table, form, sizes, tangent, room):
     """|X| of bins ``low`` .. of what is seen, into row OUT; as of :func:`field`.
 
@@ -383,7 +383,7 @@ def magnitudes(low, count, origin, lines, shifts, table, form, sizes, tangent, r
         room[OUT, i] = math.sqrt(max(room[row, i], 0.0))
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def reach_of(level, weight, form):
     """Bins beyond which lines of the given summed weight stay below ``level``."""
     if not weight > 0.0:
@@ -400,13 +400,13 @@ def reach_of(level, weight, form):
     return form[0, low]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def is_turned(origin, lowest, highest, view):
     """Return true where lines appear at the bins of their negative frequencies."""
     return origin + 0.5 * (lowest + highest) < 0.0 and view != COMPLEX
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def seen(origin, lowest, highest, sizes):
     """Lowest and highest place at which lines are seen, in bins; 0 .. N/2 where they fold."""
     if is_turned(origin, lowest, highest, sizes[7]):
@@ -414,7 +414,7 @@ def seen(origin, lowest, highest, sizes):
     return origin + lowest, origin + highest
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def run_of(beyond, place, sizes):
     """First and last bin ``beyond`` the places of lines, folded back at DC and Nyquist."""
     half = sizes[0] // 2
@@ -431,7 +431,7 @@ def run_of(beyond, place, sizes):
     return min(max(low, 0), half), max(min(high, half), 0)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def stays_below(level, weight, place, form, sizes):
     """Bins beyond which lines and images of a summed weight stay below a level."""
     if sizes[7] == IMAGED:
@@ -441,7 +441,7 @@ def stays_below(level, weight, place, form, sizes):
     return reach_of(level, weight, form) + 1.0
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def detect(origin, lines, levels, shifts, table, form, sizes, tangent, room, exempt):
     """Run of bins around a segment's lines, and the detection in it.
 
