@@ -431,6 +431,121 @@ def drawn_speckle(
     return found
 
 
+RECORD_SPREAD_MAX = 1.0
+"""Deviation of a footprint's lines [bins of fs/L] up to which :class:`FootprintRecord` is used."""
+
+_CHEBYSHEV_MARGIN = 16
+"""Degree of a Chebyshev series beyond the largest phase [rad] of the exponentials that it sums."""
+
+
+class FootprintRecord(NamedTuple):
+    """Record of a footprint's speckle lines over that of a lone tone at their middle.
+
+    The sum over lines of ``a z e^(i t . (y, x)) e^(2 pi i b . (y, x) (n - middle) / N)`` as a
+    Chebyshev series in the number n of the sample.
+    """
+
+    phasor: np.ndarray
+    """(lines, k) complex: terms of the lines, for z of 1, at the nodes of the series."""
+    samples: np.ndarray
+    """(L,): samples' places in the series, -1 .. 1 over the samples that the echo has."""
+    place: float
+    """Frequency of the lone tone [bins]."""
+    taper: np.ndarray
+    """(L,): window of the record, 0 in samples before the echo."""
+    power: np.ndarray
+    """(N,): mean power of the transform of the windowed record by bin, for a tone of 1."""
+
+    @classmethod
+    def of(
+        cls, fan: LineFan, i: int, segment: int, place: float, taper: np.ndarray, fft_size: int,
+        middle: float,
+    ) -> "FootprintRecord":  # fmt: skip
+        """Prepare the record of point i in a segment.
+
+        Parameters
+        ----------
+        place
+            Frequency of the lone tone [bins].
+        taper
+            (L,): window of the record, 0 in samples before the echo.
+        middle
+            Number of the sample at which the lines have the phases ``fan.turn``.
+        """
+        offset, phase, weight = _lines_of(fan, i, segment)
+        begun, length = int(np.argmax(taper != 0)), taper.size
+        half = max(0.5 * (length - 1 - begun), 0.5)
+        turns = 2 * np.pi * offset / fft_size
+        number = _CHEBYSHEV_MARGIN + math.ceil(np.abs(turns).max() * half)
+        at = begun + half * (1 + _chebyshev_nodes(number))
+        phasor = np.sqrt(weight)[:, None] * np.exp(
+            1j * (phase[:, None] + turns[:, None] * (at - middle))
+        )
+        sample = (np.arange(length) - begun) / half - 1
+        # Mean power of all bins: the transform of the window's autocorrelation times the mean
+        # phasor of the lines, by the distance of two samples.
+        spectrum = np.fft.rfft(taper, 2 * length)
+        lagged = np.fft.irfft(np.abs(spectrum) ** 2, 2 * length)[:length]
+        number = _CHEBYSHEV_MARGIN + math.ceil(np.abs(turns).max() * length)
+        at = 0.5 * length * (1 + _chebyshev_nodes(number))
+        mean = (weight[:, None] * np.exp(1j * turns[:, None] * at)).sum(axis=0)
+        lag = np.arange(length)
+        lagged = lagged * _chebyshev_values(mean, 2 * lag / length - 1)
+        lagged = lagged * np.exp(2j * np.pi * np.mod(place * lag, fft_size) / fft_size)
+        folded = np.zeros(fft_size, complex)
+        folded[:length] = lagged
+        folded[0] *= 0.5
+        power = 2 * np.fft.fft(folded).real
+        return cls(phasor, sample, place, taper, np.maximum(power, _LEAST_POWER * power.max()))
+
+    def draw(self, key: np.ndarray, draw: int, group: int) -> np.ndarray:
+        """Draw the record (L,) of a group's speckle, by the numbers of :func:`draw_lines`."""
+        amplitude = np.empty(len(self.phasor), complex)
+        _draw_amplitudes((key[0], key[1], np.int64(draw)), FIRST_LINE * (1 + group), amplitude)
+        return _chebyshev_values((amplitude[:, None] * self.phasor).sum(axis=0), self.samples)
+
+
+_LEAST_POWER = 1e-14
+"""Mean power of a bin, over the largest, below which it is not known to float64."""
+
+
+def _lines_of(fan: LineFan, i: int, segment: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return offsets [bins], phases [rad] and weights of lines, in the order of draw_lines."""
+    along, across = fan.rule[i]
+    y, x = (fan.node[rule, : fan.number[rule]] for rule in (along, across))
+    weight = fan.weight[along, : y.size, None] * fan.weight[across, : x.size]
+    slopes = [of[i, segment, 0] * y[:, None] + of[i, segment, 1] * x for of in fan[:2]]
+    used = weight >= _LEAST_WEIGHT
+    return slopes[0][used], slopes[1][used], weight[used]
+
+
+@njit(cache=True, error_model="numpy")
+def _draw_amplitudes(address, number, out):
+    """Draw circular complex Gaussian numbers of mean power 1, of the stream of speckle."""
+    for k in range(out.size):
+        re, im = philox.normal_pair(
+            address[0], address[1], address[2], philox.STREAM_SPECKLE, number + k
+        )
+        out[k] = complex(re, im) * math.sqrt(0.5)
+
+
+@lru_cache(maxsize=64)
+def _chebyshev_nodes(number: int) -> np.ndarray:
+    """Return the zeros of the Chebyshev polynomial of degree ``number``."""
+    return np.cos(np.pi * (np.arange(number) + 0.5) / number)
+
+
+def _chebyshev_values(at_nodes: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Interpolate values at the nodes of a Chebyshev series at places -1 .. 1."""
+    number = at_nodes.size
+    angle = np.pi * (np.arange(number) + 0.5) / number
+    cosines = np.cos(np.arange(number)[:, None] * angle)
+    # Sums, not products of matrices, whose order depends on the number of threads.
+    series = (cosines * at_nodes).sum(axis=1) * (2.0 / number)
+    series[0] *= 0.5
+    return np.asarray(np.polynomial.chebyshev.chebval(place, series))
+
+
 def wander_covariance(
     lines: SpeckleLines, pair: tuple[int, int], power: np.ndarray, share: np.ndarray
 ) -> np.ndarray:
