@@ -60,10 +60,9 @@ from sweep.model.interpolation import interpolator, phasors, sub_bin
 from sweep.model.looks import BINARY
 from sweep.model.philox import STREAM_LASER_PHASE, STREAM_RECORD, normals, uniforms
 from sweep.model.preparation import Parameters, Shots
-from sweep.model.search import beamlet_lines
+from sweep.model.search import middle_lines
 from sweep.model.segments import whole_spectrum
 from sweep.model.shot import fit
-from sweep.model.speckle_correlation import middle_moved
 from sweep.model.speckle_lines import (
     NEXT_LOOK,
     RECORD_SPREAD_MAX,
@@ -117,6 +116,8 @@ class Signal(NamedTuple):
     records: tuple[FootprintRecord, ...] | None = None
     """Records of the speckle of each echo, none where lines spread over more than a bin; None where
     they are not known yet."""
+    record_factors: tuple[np.ndarray, ...] = ()
+    """(bins,) complex of each: what makes factors on ``spectrum`` of the record's transform."""
     exempt: np.ndarray | None = None
     """(bins,) bool: bins that raise no false alarm: those from ``first`` to ``last``, and those at
     or above the threshold with their neighbours, as of :func:`sweep.model.detection.mark`."""
@@ -389,55 +390,42 @@ def with_footprint_records(shots: Shots, i: int, signal: Signal, fan: LineFan) -
     if widest > RECORD_SPREAD_MAX:
         return signal._replace(records=())
     begun = 0 if shots.first_sample is None else int(shots.first_sample[segment, i])
-    shape = taper(shots.window).copy()
-    shape[:begun] = 0.0
-    if not shape.any():
+    if not taper(shots.window)[begun:].any():
         return signal._replace(records=())
-    middle = shots.window.length / 2 + float(middle_moved(shots.window)[begun])
-    places = [_middle_of_lines(shots, i, signal)]
+    strongest = np.full((1, 3), signal.strongest - zero)
+    places = [float(middle_lines(shots, np.array([i]), strongest)[0, segment])]
     if signal.others is not None:
         places = [float(place) - zero for place in signal.others[1]]
-    return signal._replace(
-        records=tuple(
-            FootprintRecord.of(fan, i, segment, place, shape, shots.fft_size, middle)
-            for place in places
-        )
+    records = tuple(
+        FootprintRecord.of(fan, i, segment, place, shots.window, begun, shots.fft_size)
+        for place in places
     )
-
-
-def _middle_of_lines(shots: Shots, i: int, signal: Signal) -> float:
-    """Return the mean place of the beamlets' lines [bins], next to the strongest bin."""
-    strongest = signal.strongest - index_of_zero(shots)
-    apart = beamlet_lines(shots, np.array([i]))[0, signal.segment] - strongest
-    if shots.complex_record:
-        apart = apart - shots.fft_size * np.rint(apart / shots.fft_size)
-    power = shots.amplitude[shots.row[i]] ** 2
-    return float(strongest + (power * apart).sum() / power.sum())
+    bins, size = np.arange(signal.spectrum.size) - zero, shots.fft_size
+    magnitude = np.abs(signal.spectrum)
+    turned = np.where(magnitude > 0, signal.spectrum, 1.0).conj()
+    turned = turned / np.where(magnitude > 0, magnitude, 1.0)
+    factors = []
+    for record in records:
+        power = record.power[bins % size]
+        if not shots.complex_record:  # half of the line and of its image
+            power = 0.25 * (power + record.power[-bins % size])
+        factors.append(turned / np.sqrt(power))
+    return signal._replace(records=records, record_factors=tuple(factors))
 
 
 def _speckle_of_records(
     shots: Shots, signal: Signal, key: np.ndarray, draws: np.ndarray
 ) -> np.ndarray:
     """Compute :func:`speckle_of` by the records of a footprint's lines, which all bins see."""
-    size, zero = signal.spectrum.size, index_of_zero(shots)
     assert signal.records is not None
-    length = shots.window.length
-    found = np.empty((draws.size, size), complex)
-    magnitude = np.abs(signal.spectrum)
-    turned = np.where(magnitude > 0, signal.spectrum, 1.0).conj()
-    turned = turned / np.where(magnitude > 0, magnitude, 1.0)
+    found = np.empty((draws.size, signal.spectrum.size), complex)
     for number, record in enumerate(signal.records):
-        bins = np.arange(size) - zero
-        power = record.power[bins % shots.fft_size]
-        if not shots.complex_record:  # half of the line and of its image
-            power = 0.25 * (power + record.power[-bins % shots.fft_size])
-        tone = record.taper * phasors(-record.place / shots.fft_size, length)
         own = slice(None) if signal.echo is None else signal.echo == number
-        factor = (turned / np.sqrt(power))[own]
         for row, draw in enumerate(draws):
-            of_draw = tone * record.draw(key, int(draw), number)
+            of_draw = record.draw(key, int(draw), number)
             of_draw = of_draw if shots.complex_record else of_draw.real
-            found[row, own] = transformed(shots, of_draw)[own] * factor
+            factor = signal.record_factors[number]
+            found[row, own] = (transformed(shots, of_draw) * factor)[own]
     return found
 
 

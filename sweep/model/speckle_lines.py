@@ -45,9 +45,15 @@ from sweep.kernels import njit
 from sweep.model import philox
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.footprint import gaussian_rule
-from sweep.model.interpolation import interpolator, lone_tone, sub_bin
-from sweep.model.speckle_correlation import OVERSAMPLING, REACH, SpeckleLines, transform_table
-from sweep.model.window import Window
+from sweep.model.interpolation import interpolator, lone_tone, phasors, sub_bin
+from sweep.model.speckle_correlation import (
+    OVERSAMPLING,
+    REACH,
+    SpeckleLines,
+    middle_moved,
+    transform_table,
+)
+from sweep.model.window import Window, samples
 
 if TYPE_CHECKING:
     from sweep.model.preparation import Shots
@@ -96,6 +102,16 @@ class LineFan(NamedTuple):
     half: int
     """N/2 of a real record whose bins near DC and Nyquist see the conjugate images of lines,
     else 0."""
+
+    @classmethod
+    def nothing(cls) -> "LineFan":
+        """Return lines of no points."""
+        none, numbers = np.zeros((0, 3, 2)), np.zeros(0, np.int64)
+        table = np.zeros((0, 0))
+        return cls(
+            none, none, np.zeros((0, 2), np.int64), numbers, table, table, numbers, np.zeros(0),
+            1.0, 0.0, 0,
+        )  # fmt: skip
 
     def of(self, part: np.ndarray) -> "LineFan":
         """Select points by their indices."""
@@ -434,32 +450,27 @@ def drawn_speckle(
 RECORD_SPREAD_MAX = 1.0
 """Deviation of a footprint's lines [bins of fs/L] up to which :class:`FootprintRecord` is used."""
 
-_CHEBYSHEV_MARGIN = 16
-"""Degree of a Chebyshev series beyond the largest phase [rad] of the exponentials that it sums."""
-
 
 class FootprintRecord(NamedTuple):
-    """Record of a footprint's speckle lines over that of a lone tone at their middle.
+    """Windowed record of a footprint's speckle lines: a lone tone at their middle times a series.
 
-    The sum over lines of ``a z e^(i t . (y, x)) e^(2 pi i b . (y, x) (n - middle) / N)`` as a
-    Chebyshev series in the number n of the sample.
+    The series is the sum over lines of ``a z e^(i t . (y, x)) e^(2 pi i b . (y, x) (n - middle) /
+    N)`` by Chebyshev polynomials in the number n of the sample.
     """
 
     phasor: np.ndarray
-    """(lines, k) complex: terms of the lines, for z of 1, at the nodes of the series."""
+    """(lines, k) complex: coefficients of the series by line, for z of 1."""
     samples: np.ndarray
     """(L,): samples' places in the series, -1 .. 1 over the samples that the echo has."""
-    place: float
-    """Frequency of the lone tone [bins]."""
-    taper: np.ndarray
-    """(L,): window of the record, 0 in samples before the echo."""
+    tone: np.ndarray
+    """(L,) complex: windowed record of the lone tone, of amplitude 1."""
     power: np.ndarray
-    """(N,): mean power of the transform of the windowed record by bin, for a tone of 1."""
+    """(N,): mean power of the transform of the record by bin."""
 
     @classmethod
     def of(
-        cls, fan: LineFan, i: int, segment: int, place: float, taper: np.ndarray, fft_size: int,
-        middle: float,
+        cls, fan: LineFan, i: int, segment: int, place: float, window: Window, begun: int,
+        fft_size: int,
     ) -> "FootprintRecord":  # fmt: skip
         """Prepare the record of point i in a segment.
 
@@ -467,42 +478,43 @@ class FootprintRecord(NamedTuple):
         ----------
         place
             Frequency of the lone tone [bins].
-        taper
-            (L,): window of the record, 0 in samples before the echo.
-        middle
-            Number of the sample at which the lines have the phases ``fan.turn``.
+        window, begun
+            Window of the record, and the number of samples before the echo.
+
+        Notes
+        -----
+        The mean power of all bins is the transform of the window's autocorrelation times the mean
+        phasor of the lines, by the distance of two samples.
         """
         offset, phase, weight = _lines_of(fan, i, segment)
-        begun, length = int(np.argmax(taper != 0)), taper.size
+        length = window.length
         half = max(0.5 * (length - 1 - begun), 0.5)
         turns = 2 * np.pi * offset / fft_size
-        number = _CHEBYSHEV_MARGIN + math.ceil(np.abs(turns).max() * half)
-        at = begun + half * (1 + _chebyshev_nodes(number))
-        phasor = np.sqrt(weight)[:, None] * np.exp(
-            1j * (phase[:, None] + turns[:, None] * (at - middle))
-        )
-        sample = (np.arange(length) - begun) / half - 1
-        # Mean power of all bins: the transform of the window's autocorrelation times the mean
-        # phasor of the lines, by the distance of two samples.
-        spectrum = np.fft.rfft(taper, 2 * length)
-        lagged = np.fft.irfft(np.abs(spectrum) ** 2, 2 * length)[:length]
-        number = _CHEBYSHEV_MARGIN + math.ceil(np.abs(turns).max() * length)
-        at = 0.5 * length * (1 + _chebyshev_nodes(number))
-        mean = (weight[:, None] * np.exp(1j * turns[:, None] * at)).sum(axis=0)
-        lag = np.arange(length)
-        lagged = lagged * _chebyshev_values(mean, 2 * lag / length - 1)
-        lagged = lagged * np.exp(2j * np.pi * np.mod(place * lag, fft_size) / fft_size)
-        folded = np.zeros(fft_size, complex)
-        folded[:length] = lagged
+        middle = 0.5 * length + float(middle_moved(window)[begun])
+        at, to_series = _chebyshev(_degree(np.abs(turns).max() * half))
+        phasor = np.exp(1j * (phase[:, None] + turns[:, None] * (begun + half * (1 + at) - middle)))
+        phasor = np.sqrt(0.5 * weight)[:, None] * phasor
+        # Sums, not products of matrices, whose order depends on the number of threads.
+        phasor = (phasor[:, None] * to_series).sum(axis=2)
+        tone = samples(window.name, length) * phasors(-place / fft_size, length)
+        tone[:begun] = 0.0
+        at, to_series = _chebyshev(_degree(np.abs(turns).max() * length))
+        mean = (weight[:, None] * np.exp(0.5j * turns[:, None] * length * (1 + at))).sum(axis=0)
+        folded, lag = np.zeros(fft_size, complex), np.arange(length)
+        folded[:length] = _autocorrelation(window, begun) * phasors(-place / fft_size, length)
+        _times_series((mean * to_series).sum(axis=1), 2 * lag / length - 1, folded)
         folded[0] *= 0.5
         power = 2 * np.fft.fft(folded).real
-        return cls(phasor, sample, place, taper, np.maximum(power, _LEAST_POWER * power.max()))
+        power = np.maximum(power, _LEAST_POWER * power.max())
+        return cls(phasor, (lag - begun) / half - 1, tone, power)
 
     def draw(self, key: np.ndarray, draw: int, group: int) -> np.ndarray:
         """Draw the record (L,) of a group's speckle, by the numbers of :func:`draw_lines`."""
         amplitude = np.empty(len(self.phasor), complex)
         _draw_amplitudes((key[0], key[1], np.int64(draw)), FIRST_LINE * (1 + group), amplitude)
-        return _chebyshev_values((amplitude[:, None] * self.phasor).sum(axis=0), self.samples)
+        record = self.tone.copy()
+        _times_series((amplitude[:, None] * self.phasor).sum(axis=0), self.samples, record)
+        return record
 
 
 _LEAST_POWER = 1e-14
@@ -521,29 +533,67 @@ def _lines_of(fan: LineFan, i: int, segment: int) -> tuple[np.ndarray, np.ndarra
 
 @njit(cache=True, error_model="numpy")
 def _draw_amplitudes(address, number, out):
-    """Draw circular complex Gaussian numbers of mean power 1, of the stream of speckle."""
+    """Draw circular complex Gaussian numbers of mean power 2, of the stream of speckle."""
     for k in range(out.size):
         re, im = philox.normal_pair(
             address[0], address[1], address[2], philox.STREAM_SPECKLE, number + k
         )
-        out[k] = complex(re, im) * math.sqrt(0.5)
+        out[k] = complex(re, im)
+
+
+def _degree(phase: float) -> int:
+    """Return the degree of a Chebyshev series that has exponentials up to a phase to 1e-7."""
+    return 9 + math.ceil(1.5 * phase)
 
 
 @lru_cache(maxsize=64)
-def _chebyshev_nodes(number: int) -> np.ndarray:
-    """Return the zeros of the Chebyshev polynomial of degree ``number``."""
-    return np.cos(np.pi * (np.arange(number) + 0.5) / number)
+def _chebyshev(number: int) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes (number,) of a Chebyshev series, and what makes its coefficients of values there.
 
-
-def _chebyshev_values(at_nodes: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Interpolate values at the nodes of a Chebyshev series at places -1 .. 1."""
-    number = at_nodes.size
+    The matrix (number, number) has a row for each coefficient.
+    """
     angle = np.pi * (np.arange(number) + 0.5) / number
-    cosines = np.cos(np.arange(number)[:, None] * angle)
-    # Sums, not products of matrices, whose order depends on the number of threads.
-    series = (cosines * at_nodes).sum(axis=1) * (2.0 / number)
-    series[0] *= 0.5
-    return np.asarray(np.polynomial.chebyshev.chebval(place, series))
+    to_series = np.cos(np.arange(number)[:, None] * angle) * (2.0 / number)
+    to_series[0] *= 0.5
+    return np.cos(angle), to_series
+
+
+_SAMPLES_AT_ONCE = 128
+"""Samples that a series is evaluated at together, in vector registers."""
+
+
+@njit(cache=True, error_model="numpy")
+def _times_series(series, place, out):
+    """Multiply numbers in place by a Chebyshev series at places -1 .. 1 (Clenshaw's algorithm)."""
+    last_re, last_im = np.empty(_SAMPLES_AT_ONCE), np.empty(_SAMPLES_AT_ONCE)
+    before_re, before_im = np.empty(_SAMPLES_AT_ONCE), np.empty(_SAMPLES_AT_ONCE)
+    x = np.empty(_SAMPLES_AT_ONCE)
+    for first in range(0, place.size, _SAMPLES_AT_ONCE):
+        number = min(_SAMPLES_AT_ONCE, place.size - first)
+        for n in range(number):
+            x[n] = 2.0 * place[first + n]
+            last_re[n] = last_im[n] = before_re[n] = before_im[n] = 0.0
+        for k in range(series.size - 1, 0, -1):
+            re, im = series[k].real, series[k].imag
+            for n in range(number):
+                value = re + x[n] * last_re[n] - before_re[n]
+                before_re[n], last_re[n] = last_re[n], value
+            for n in range(number):
+                value = im + x[n] * last_im[n] - before_im[n]
+                before_im[n], last_im[n] = last_im[n], value
+        for n in range(number):
+            re = series[0].real + 0.5 * x[n] * last_re[n] - before_re[n]
+            im = series[0].imag + 0.5 * x[n] * last_im[n] - before_im[n]
+            out[first + n] *= complex(re, im)
+
+
+@lru_cache(maxsize=16)
+def _autocorrelation(window: Window, begun: int) -> np.ndarray:
+    """Return the autocorrelation (L,) of a window without its first samples, by lag."""
+    w = samples(window.name, window.length).copy()
+    w[:begun] = 0.0
+    spectrum = np.fft.rfft(w, 2 * w.size)
+    return np.asarray(np.fft.irfft(np.abs(spectrum) ** 2, 2 * w.size)[: w.size])
 
 
 def wander_covariance(
