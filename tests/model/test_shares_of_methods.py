@@ -25,8 +25,9 @@ from sweep.spec import SpecError
 SCATTERER_DRAWS, DRAWS, SPECTRA = 16_000, 5_000, 800
 SLACK = 0.012
 """Error of draws beyond five standard deviations; that of the closed forms is their stated one."""
-NEIGHBOURS = 0.06
-"""Whole spectra detect ``peak_bin`` by a neighbour of the strongest bin as well."""
+NEIGHBOURS = 0.25
+"""Whole spectra detect ``peak_bin`` by a neighbour of the strongest bin as well, of footprints that
+spread over bins so much more often."""
 SIGMAS = 5.0
 WIDE = 0.25
 """Deviation of lines [bins of fs/L] from which speckle differs over the bins of an echo."""
@@ -48,10 +49,14 @@ def spread_of(mapping):
 def spec_at_random(number):
     """A spec of a steep enough slope, a short record and a threshold that noise does not cross."""
     rng = np.random.default_rng([50, number])
+    # Kinds take turns, so that few numbers have all of them.
+    kind = ("looks", "any_bin", "peak_bin", "wide")[number % 4]
+    steepest = 12 if kind == "wide" else 90
     while True:
         mapping = mapping_at_random(rng)
         ratio = float(np.exp(rng.uniform(np.log(0.8), np.log(4.0))))
-        instrument, degrees = mapping["instrument"], np.exp(rng.uniform(np.log(5), np.log(90)))
+        degrees = float(np.exp(rng.uniform(np.log(5), np.log(steepest))))
+        instrument = mapping["instrument"]
         mapping["target"]["grazing_angle"] = math.radians(degrees if number % 8 else 90.0)
         mapping["target"]["reflectance_law"] = "thesis"
         processing = instrument["processing"]
@@ -61,8 +66,6 @@ def spec_at_random(number):
             processing["peaks"] = "strongest"
         if processing["fft_size"] > 2048 or (several and instrument["looks"]["number"] > 4):
             continue
-        # Kinds take turns, so that few numbers have all of them.
-        kind = ("looks", "any_bin", "peak_bin", "wide")[number % 4]
         if several is not (kind == "looks"):
             continue
         if not several:
