@@ -135,15 +135,15 @@ def spec_at_random(seed: int, which: int) -> RandomSpec:
         mapping = mapping_at_random(rng)
         ratio = np.exp(rng.uniform(np.log(0.8), np.log(5.0)))
         try:
-            evaluated = _evaluated(mapping, ratio)
+            found = spec_of_ratio(mapping, ratio)
         except (SpecError, UnsupportedShot):
             continue
-        chirps = [evaluated.stored["pd_up"], evaluated.stored["pd_down"]]
+        chirps = [found.stored["pd_up"], found.stored["pd_down"]]
         if PD_RANGE[0] < min(chirps) and max(chirps) < PD_RANGE[1]:
-            return evaluated
+            return found
 
 
-def _evaluated(mapping: dict[str, Any], ratio: float) -> RandomSpec:
+def spec_of_ratio(mapping: dict[str, Any], ratio: float) -> RandomSpec:
     """The spec with the laser power for which a chirp's |X| is so many times the threshold."""
     study = GridStudy(Spec.from_mapping(with_units(mapping)))
     shots = shots_of(study.grid.parameters(0), EFFECTS)

@@ -6,7 +6,8 @@ noise to the bins of the echo, alike as window and padding make it, and looks. O
 which hold noise alone, the largest magnitude is drawn from the order statistic of as many
 independent ones as alarm as often. If effects are random, each draw has a spectrum and
 probabilities of its own, and its noise with them: see :mod:`sweep.model.sampling`, which also says
-when to stop. Echoes in developed speckle fade by factors that the segments have partly in common.
+when to stop. Echoes in developed speckle fade by factors that the segments have partly in common,
+or, where any bin detects, by the lines of their footprint (:mod:`sweep.model.speckle_lines`).
 
 Every number is addressed by point, draw, cause and index (:mod:`sweep.model.philox`).
 """
@@ -30,7 +31,17 @@ from sweep.model.philox import (
     STREAM_NOISE_MAXIMUM,
 )
 from sweep.model.preparation import Shots
+from sweep.model.search import middle_lines
 from sweep.model.segments import runs_of
+from sweep.model.speckle_lines import (
+    FACTORED_ROWS_MAX,
+    LineFan,
+    draw_factored,
+    draw_lines,
+    factor_bins,
+    line_fan,
+    line_powers,
+)
 
 BOTH = "pd_both_chirps"
 """Probability of a detection in both chirps, beside the outputs where any two segments detect."""
@@ -64,9 +75,10 @@ def count_by_chance(
     rule = np.empty((0, TAPS)), np.empty(0, np.int64), 0
     none = False, *rule, np.isfinite(outputs.get(BOTH, np.full(size, np.nan)))
     nothing = Seen.nothing(size), np.empty((0, size))
-    circular = np.zeros((3, size), np.int64), np.zeros((1, 0)), 0
+    circular = np.zeros((3, size), np.int64), np.zeros((1, 0)), 0, LineFan.nothing()
+    circular_at = *circular, np.empty((0, 3))
     levels = np.zeros((2, size)), np.zeros((7, size))
-    _count(rows, ends, *levels, chances, none, *nothing, circular, 0.0, counts)
+    _count(rows, ends, *levels, chances, none, *nothing, circular_at, 0.0, counts)
 
 
 def count_in_noise(rows: Rows, ends: np.ndarray, shots: Shots, counts: np.ndarray) -> None:
@@ -74,6 +86,7 @@ def count_in_noise(rows: Rows, ends: np.ndarray, shots: Shots, counts: np.ndarra
     levels = noise_levels(shots)
     mixing = np.empty((0, shots.size)) if shots.fading is None else shots.fading.mixing()
     one, speckle = np.exp(-0.5 * levels[0] ** 2), shots.speckle_table
+    fan = line_fan(shots)
     for part, seen in seen_spectra(shots):
         others = at_least_one(one[part], seen.others.T)
         chances = np.array([others, *np.zeros((2, *others.shape))])  # in C order
@@ -86,9 +99,12 @@ def count_in_noise(rows: Rows, ends: np.ndarray, shots: Shots, counts: np.ndarra
             (True, *rule, np.full(part.size, shots.any_two)),
             seen,
             mixing[:, part].copy(),
-            (speckle.row[:, part].copy(), speckle.quadratures, shots.fft_size // 2),
+            (
+                speckle.row[:, part].copy(), speckle.quadratures, shots.fft_size // 2,
+                fan.of(part), np.ascontiguousarray(middle_lines(shots, part, seen.low + seen.peak)),
+            ),
             shots.echo_rule.sidelobe_correlation,
-        )
+        )  # fmt: skip
         _count(some, ends, *own, counts)
 
 
@@ -290,14 +306,16 @@ def _count(
     with one in the up segment. ``mixing`` (6, m): :meth:`sweep.model.detection.Fading.mixing`, or
     nothing.
     ``quadratures``: rows (3, m) of the pseudo-variances near DC and Nyquist
-    (:class:`sweep.model.quadratures.SignalQuadratures`), these, and N/2. ``correlation``: that of
-    neighbours' noise in phase with the signal.
+    (:class:`sweep.model.quadratures.SignalQuadratures`), these, and N/2; lines of footprints in
+    developed speckle, and their middles (m, 3) [bins]. ``correlation``: that of neighbours' noise
+    in phase with the signal.
     """
     noisy, weights, start, real_ends, any_two = how
     noise_of_bins = np.empty((4, weights.shape[0] + weights.shape[1]))
     words = np.empty((4, _AT_ONCE), np.uint64)
     factors, amplitudes = np.ones((3, _AT_ONCE)), np.zeros((3, 2, _AT_ONCE))
     along, across = np.ones(_AT_ONCE), np.zeros(_AT_ONCE)
+    no_bins = np.zeros((3, 0, 0), np.complex128)
     hits, alarms = np.empty((2, 3, _AT_ONCE), np.bool_)
     for j in range(rows.point.size):
         threshold, under_lines = levels[0, j] * levels[0, j], levels[1, j]
@@ -313,6 +331,9 @@ def _count(
                     amplitudes[2, part, d] = last[part]
                 for s in range(3):
                     factors[s, d] = math.hypot(amplitudes[s, 0, d], amplitudes[s, 1, d])
+            bins = no_bins
+            if mixing.shape[0] > 0 and weights.size > 0:
+                bins = _draw_echoes(address, j, seen, quadratures, factors)
             for s in (0, 2, 1):
                 stream, ratio, peak = STREAM_NOISE[s], seen.ratio[j, s], seen.peak[j, s]
                 row = quadratures[0][s, j]
@@ -320,7 +341,7 @@ def _count(
                 if noisy and weights.size > 0:
                     _cross_any(
                         address, (j, s), seen, (weights, start, real_ends), levels_of(of_bins, j),
-                        (factors[s], amplitudes[s], shares, quadratures[2]), noise_of_bins, hits[s],
+                        bins[s], noise_of_bins, hits[s],
                     )  # fmt: skip
                 elif noisy:
                     noise = under_lines, under_lines
@@ -452,39 +473,84 @@ def _happen(address, stream, chances, given, words, found):
 
 
 @njit(cache=True, error_model="numpy")
-def _cross_any(address, at, seen, rule, levels, fading, room, found):
+def _ends_of_echo(at, seen):
+    """First and last bin of an echo, from those of the spectrum; the last is -1 of none."""
+    begin, count = seen.start[at], seen.bins[at]
+    first, last = 0, count - 1
+    while first < count and not seen.echo[begin + first]:
+        first += 1
+    while last > first and not seen.echo[begin + last]:
+        last -= 1
+    return first, (last if first < count else -1)
+
+
+@njit(cache=True, error_model="numpy")
+def _draw_echoes(address, j, seen, speckle, factors):
+    """Draw amplitudes (3, draws, bins) of an echo's bins in developed speckle, of mean power 1.
+
+    Those of the lines of its footprint; bins that no line reaches have that of the strongest bin.
+    ``factors`` (3, draws) takes the size of the strongest bin's. ``speckle`` is the ``quadratures``
+    of :func:`_count`.
+    """
+    fan, middle = speckle[3], speckle[4][j].copy()
+    first, widest = np.zeros(3, np.int64), 0
+    low = np.zeros(3, np.int64)
+    for s in range(3):
+        begin, end = _ends_of_echo((j, s), seen)
+        first[s], low[s] = seen.low[j, s] + begin, begin
+        widest = max(widest, end - begin + 1)
+        if end < begin:
+            middle[s] = np.nan
+    power, pseudo = np.zeros((3, widest)), np.zeros((3, widest))
+    imaged = line_powers(fan, j, middle, first, power, pseudo)
+    rows, rank = 3 * widest, 0
+    factor = np.empty((rows if rows <= FACTORED_ROWS_MAX else 0, 3, widest), np.complex128)
+    if factor.shape[0] > 0 and not imaged:
+        rank = factor_bins(fan, j, middle, first, power, factor)
+    out, one = (
+        np.zeros((3, address[3], widest), np.complex128),
+        np.zeros((3, widest), np.complex128),
+    )
+    for d in range(address[3]):
+        draw = address[0], address[1], address[2] + d
+        if rank > 0:
+            draw_factored(draw, 0, factor, rank, one)
+        else:
+            draw_lines(draw, 0, fan, j, middle, first, power, one)
+        for s in range(3):
+            peak = seen.peak[j, s] - low[s]
+            if not 0 <= peak < widest:
+                continue
+            factors[s, d] = abs(one[s, peak])
+            for k in range(widest):
+                out[s, d, k] = one[s, k] if power[s, k] > 0.0 else one[s, peak]
+    return out
+
+
+@njit(cache=True, error_model="numpy")
+def _cross_any(address, at, seen, rule, levels, speckle, room, found):
     """Mark the draws in which any bin of an echo, with its noise, reaches the threshold.
 
-    ``levels`` are the :class:`sweep.model.detection.BinLevels` of the point. ``fading``: factors on
-    the magnitudes (draws,), amplitudes (2, draws); pseudo-variances of bins near DC or Nyquist, or
-    nothing; N/2. A pedestal fades as the lines do.
+    ``levels`` are the :class:`sweep.model.detection.BinLevels` of the point. ``speckle`` (draws,
+    bins): amplitudes of the echo's bins, of none if it does not fade. A pedestal fades as they do.
     """
     begin, count = seen.start[at], seen.bins[at]
     ratios, echo = seen.ratios[begin : begin + count], seen.echo[begin : begin + count]
-    if not echo.any():
+    first, last = _ends_of_echo(at, seen)
+    if last < 0:
         return
-    first, last = 0, count - 1
-    while not echo[first]:
-        first += 1
-    while not echo[last]:
-        last -= 1
     threshold = levels.threshold / levels.quiet
     pedestal = np.zeros(count)
     if levels.beside > levels.quiet or levels.line > levels.quiet:
         pedestal_of_bins(ratios, echo, levels, pedestal)
-    factors, amplitudes, shares, half = fading
     for d in range(address[3]):
         draw = address[0], address[1], address[2] + d, STREAM_NOISE[at[1]]
         draw_noise(draw, ECHO, seen.low[at] + first, last - first + 1, rule, room)
         for i in range(first, last + 1):
-            deviation = math.sqrt(1.0 + pedestal[i] * factors[d] * factors[d])
-            re, im = deviation * room[0, i - first], deviation * room[1, i - first]
-            if shares.size > 0:
-                share = bin_share(seen.low[at] + i, half, shares)
-                re += ratios[i] * math.sqrt(1.0 + share) * amplitudes[0, d]
-                im += ratios[i] * math.sqrt(max(1.0 - share, 0.0)) * amplitudes[1, d]
-            else:
-                re += ratios[i] * factors[d]
+            faded = speckle[d, i - first] if speckle.shape[1] > 0 else complex(1.0, 0.0)
+            deviation = math.sqrt(1.0 + pedestal[i] * abs(faded) ** 2)
+            re = deviation * room[0, i - first] + ratios[i] * faded.real
+            im = deviation * room[1, i - first] + ratios[i] * faded.imag
             found[d] |= echo[i] and re * re + im * im >= threshold * threshold
 
 

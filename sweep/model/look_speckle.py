@@ -113,6 +113,21 @@ class LookSpeckle(NamedTuple):
         value, vector = np.linalg.eigh(matrix)
         return vector[:, ::-1] * np.sqrt(np.maximum(value[::-1], 0.0))
 
+    def roots(self) -> np.ndarray:
+        """Return the matrices of :meth:`root` of all segments and points, (3, n, N, k).
+
+        With as many columns as independent speckles have a share in the looks of any point.
+        """
+        number = self.by_lag.shape[2]
+        value, vector = np.linalg.eigh(look_matrices(self.by_lag, self.power, number))
+        value = np.maximum(value[..., ::-1], 0.0)
+        used = (value > _LEAST_STRENGTH * number).any(axis=(0, 1)).sum()
+        return (vector[..., ::-1] * np.sqrt(value)[..., None, :])[..., :used]
+
+
+_LEAST_STRENGTH = 1e-7
+"""Share of the looks' power below which an independent speckle is left out."""
+
 
 def look_matrices(
     by_lag: np.ndarray, power: np.ndarray, most: int = MATRIX_LOOKS_MAX

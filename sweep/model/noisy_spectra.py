@@ -60,10 +60,13 @@ from sweep.model.interpolation import interpolator, phasors, sub_bin
 from sweep.model.looks import BINARY
 from sweep.model.philox import STREAM_LASER_PHASE, STREAM_RECORD, normals, uniforms
 from sweep.model.preparation import Parameters, Shots
+from sweep.model.search import middle_lines
 from sweep.model.segments import whole_spectrum
 from sweep.model.shot import fit
 from sweep.model.speckle_lines import (
     NEXT_LOOK,
+    RECORD_SPREAD_MAX,
+    FootprintRecord,
     LineFan,
     Peaks,
     directions,
@@ -110,6 +113,11 @@ class Signal(NamedTuple):
     """
     reach: int = 0
     """Bins on either side of such an echo that it occupies."""
+    records: tuple[FootprintRecord, ...] | None = None
+    """Records of the speckle of each echo, none where lines spread over more than a bin; None where
+    they are not known yet."""
+    record_factors: tuple[np.ndarray, ...] = ()
+    """(bins,) complex of each: what makes factors on ``spectrum`` of the record's transform."""
     exempt: np.ndarray | None = None
     """(bins,) bool: bins that raise no false alarm: those from ``first`` to ``last``, and those at
     or above the threshold with their neighbours, as of :func:`sweep.model.detection.mark`."""
@@ -328,6 +336,10 @@ def speckle_of(
     if shots.speckle_lines is None:
         return np.ones((1, 1))
     fan = line_fan(shots) if fan is None else fan
+    if signal.records is None:
+        signal = with_footprint_records(shots, i, signal, fan)
+    if signal.records:
+        return _speckle_of_records(shots, signal, key, draws)
     size, zero = signal.spectrum.size, index_of_zero(shots)
     found = np.empty((draws.size, size), complex)
     at_ends = np.zeros(size, bool)  # one part is left, which has all of the power
@@ -369,22 +381,64 @@ def speckle_of(
     return found
 
 
+def with_footprint_records(shots: Shots, i: int, signal: Signal, fan: LineFan) -> Signal:
+    """Return a signal of point i with the records of its echoes' speckle."""
+    if shots.speckle_lines is None:
+        return signal
+    segment, zero = signal.segment, index_of_zero(shots)
+    widest = np.hypot(*fan.spread[i, segment]) * shots.window.length / shots.fft_size
+    if widest > RECORD_SPREAD_MAX:
+        return signal._replace(records=())
+    begun = 0 if shots.first_sample is None else int(shots.first_sample[segment, i])
+    if not taper(shots.window)[begun:].any():
+        return signal._replace(records=())
+    strongest = np.full((1, 3), signal.strongest - zero)
+    places = [float(middle_lines(shots, np.array([i]), strongest)[0, segment])]
+    if signal.others is not None:
+        places = [float(place) - zero for place in signal.others[1]]
+    records = tuple(
+        FootprintRecord.of(fan, i, segment, place, shots.window, begun, shots.fft_size)
+        for place in places
+    )
+    bins, size = np.arange(signal.spectrum.size) - zero, shots.fft_size
+    magnitude = np.abs(signal.spectrum)
+    turned = np.where(magnitude > 0, signal.spectrum, 1.0).conj()
+    turned = turned / np.where(magnitude > 0, magnitude, 1.0)
+    factors = []
+    for record in records:
+        power = record.power[bins % size]
+        if not shots.complex_record:  # half of the line and of its image
+            power = 0.25 * (power + record.power[-bins % size])
+        factors.append(turned / np.sqrt(power))
+    return signal._replace(records=records, record_factors=tuple(factors))
+
+
+def _speckle_of_records(
+    shots: Shots, signal: Signal, key: np.ndarray, draws: np.ndarray
+) -> np.ndarray:
+    """Compute :func:`speckle_of` by the records of a footprint's lines, which all bins see."""
+    assert signal.records is not None
+    found = np.empty((draws.size, signal.spectrum.size), complex)
+    for number, record in enumerate(signal.records):
+        own = slice(None) if signal.echo is None else signal.echo == number
+        for row, draw in enumerate(draws):
+            of_draw = record.draw(key, int(draw), number)
+            of_draw = of_draw if shots.complex_record else of_draw.real
+            factor = signal.record_factors[number]
+            found[row, own] = (transformed(shots, of_draw) * factor)[own]
+    return found
+
+
 def spectra_of(view: "View", segment: int, draws: np.ndarray) -> Iterator[np.ndarray]:
     """Spectra (m, bins) complex of a segment in some draws, with noise [V], look by look.
 
     Of looks that are added in amplitude their mean alone.
     """
     looks, total = view.shots.looks, np.zeros(1, complex)
-    known: dict[int, Signal] = {}
     for k, shots in enumerate(view.looks):
         numbers = draws + k * NEXT_LOOK
         given = {"key": view.key, "draws": numbers}
-        if id(shots) not in known:
-            signal = view.signals[segment]
-            if shots is not view.shots or signal is None:
-                signal = signal_of(shots, view.i, segment, view.echoes_of(segment), view.level)
-            known[id(shots)] = signal
-        signal = known[id(shots)]
+        signal = view.signal_in_look(segment, k)
         factors = _speckle_in_look(view, shots, segment, k, draws, signal)
         spectra = drawn_of(shots, view.i, segment, signal, **given) * factors
         spectra = spectra + noise_of(shots, view.i, segment, **given)
@@ -434,12 +488,26 @@ class View(NamedTuple):
     setting: Setting
     detect: Detector
     estimate: Estimator
+    moved_signals: dict[tuple[int, int], Signal]
+    """Signals of looks that find the target elsewhere, by segment and look, as they are asked for.
+    """
     echoes: np.ndarray | None = None
     """(3, k) int64: strongest bins of the shot's echoes in each segment, -1 for none."""
     fan: LineFan | None = None
     """Lines of all shots' footprints in developed speckle."""
     level: float = math.inf
     """Fixed threshold [V], if the detector has one."""
+
+    def signal_in_look(self, segment: int, look: int) -> Signal:
+        """Return the signal of a segment as a look finds it."""
+        shots, signal = self.looks[look], self.signals[segment]
+        if shots is self.shots and signal is not None:
+            return signal
+        if (segment, look) not in self.moved_signals:
+            signal = signal_of(shots, self.i, segment, self.echoes_of(segment), self.level)
+            fan = line_fan(shots) if self.fan is None else self.fan
+            self.moved_signals[segment, look] = with_footprint_records(shots, self.i, signal, fan)
+        return self.moved_signals[segment, look]
 
     def echoes_of(self, segment: int) -> np.ndarray:
         """Return indices of the echoes' strongest bins in a segment; none where echoes are one."""
@@ -482,16 +550,20 @@ def view_of(
         pfa=float(p[DETECTOR + "pfa"]),
         complex_record=shots.complex_record,
     )
+    fan = line_fan(shots) if fan is None else fan
     view = View(
         shots, i, key, (), looks_of(shots), setting,
         methods.detectors[str(p[DETECTOR + "kind"])],
         methods.estimators[str(p[ESTIMATOR + "kind"])],
+        {},
         echoes,
-        line_fan(shots) if fan is None else fan,
+        fan,
         setting.threshold if str(p[DETECTOR + "kind"]) == FIXED else math.inf,
     )  # fmt: skip
     signals = tuple(
-        signal_of(shots, i, s, view.echoes_of(s), view.level) if there else None
+        with_footprint_records(shots, i, signal_of(shots, i, s, view.echoes_of(s), view.level), fan)
+        if there
+        else None
         for s, there in enumerate(shots.segments)
     )
     return view._replace(signals=signals)

@@ -57,6 +57,7 @@ from sweep.model.draws import (
     draw_noise,
     draw_noise_by_root,
     echo_filter,
+    fading_amplitudes,
     largest_of,
     noise_levels,
     noise_root,
@@ -112,11 +113,20 @@ from sweep.model.speckle_lines import (
     line_fan,
     line_powers,
     place_errors,
+    transform_at,
 )
 
 WHOLE, FINE, ERROR, RATIO = range(4)
 """Fields of a peak: bin; position between bins and its standard error by noise [bins]; |X| / sigma.
 """
+
+
+FADED_BINS_MAX = 32.0
+"""Largest number of independent bins of an echo in developed speckle that are drawn."""
+
+MIXED_LOOKS_MAX = 32
+"""Number of looks up to which speckle that they share in part is drawn; of more, one amplitude is
+held against the probability of detection."""
 
 
 class Returns(NamedTuple):
@@ -260,10 +270,10 @@ class How(NamedTuple):
     looks: int
     """Records whose powers are averaged."""
     apart: bool
-    """Each has its own speckle."""
+    """Each has its own speckle, or a mixture of its own."""
     votes: int
     """Of them that have to detect, 0 where their mean power does; -1 where they are held against
-    the probability, as speckle changes from one to the next."""
+    the probability, as more than MIXED_LOOKS_MAX share their speckle in part."""
 
     @classmethod
     def of(cls, shots: Shots, first_draw: int, noisy: bool) -> "How":
@@ -273,13 +283,14 @@ class How(NamedTuple):
         if shots.complex_record:
             alone, signed = waveform.SIGNED, math.copysign(1.0, 1.0 - shots.slopes[2])
         votes = shots.looks.votes if shots.looks.combine == BINARY else 0
-        if shots.look_speckle is not None:
+        if shots.look_speckle is not None and shots.looks.number > MIXED_LOOKS_MAX:
             votes = -1
         return cls(
             int(first_draw), noisy, shots.incoherent, bool(shots.segments[1]), shots.fft_size // 2,
             signed, alone, shots.real_ends, shots.echo_rule[1], echo_filter(shots, Seen.nothing(0)),
             np.zeros((0, 0)), echo_filter(shots, Seen.nothing(0)), np.empty(0),
-            shots.looks.number if shots.looks.several else 1, shots.looks.independent, votes,
+            shots.looks.number if shots.looks.several else 1,
+            shots.looks.independent or (shots.look_speckle is not None and votes >= 0), votes,
         )  # fmt: skip
 
 
@@ -321,6 +332,13 @@ class Known(NamedTuple):
     wander: np.ndarray
     """(n, 3, most): standard deviation of its place by speckle [bins], at |X| of one sigma; 0
     without speckle."""
+    number: np.ndarray
+    """(n, 3, most): number of independent bins as which a group in developed speckle counts."""
+    mixing: np.ndarray
+    """(n, 6): of :meth:`sweep.model.detection.Fading.mixing`, 0 without speckle."""
+    look_root: np.ndarray
+    """(n, 3, looks, sets) complex: speckles of the looks by independent ones, where looks share
+    them in part; of no sets otherwise."""
 
     def of(self, part: np.ndarray) -> "Known":
         """Knowledge of some points by their numbers."""
@@ -412,28 +430,63 @@ def known_of(shots: Shots, found: Groups, motion: OwnMotion | None = None) -> Kn
         np.stack([np.broadcast_to(part, shots.size) for part in _third(shots, motion)], axis=1),
         np.ascontiguousarray(np.moveaxis(beside, 0, 1)), _searched(shots),
         line_fan(shots), np.where(found.bin < 0, np.nan, found.bin + mean),
-        *_speckle_shares(shots, found),
+        *_speckle_shares(shots, found), _speckle_mixing(shots), _look_roots(shots),
     )  # fmt: skip
 
 
-def _speckle_shares(shots: Shots, found: Groups) -> tuple[np.ndarray, np.ndarray]:
-    """Share of the echo in the power that detects a group, and its wander, as of Known."""
+def _speckle_mixing(shots: Shots) -> np.ndarray:
+    """Return what mixes the speckle of the three segments, as of Known."""
+    if shots.fading is None:
+        return np.zeros((shots.size, 6))
+    mixing = np.broadcast_to(shots.fading.mixing(), (6, shots.size))
+    return np.ascontiguousarray(mixing.T)
+
+
+def _look_roots(shots: Shots) -> np.ndarray:
+    """Return what mixes the speckle of looks, as of Known."""
+    number = shots.looks.number
+    if shots.look_speckle is None or number > MIXED_LOOKS_MAX:
+        return np.zeros((shots.size, 3, 1, 0), complex)
+    return np.ascontiguousarray(np.moveaxis(shots.look_speckle.roots(), 0, 1))
+
+
+def _independent_bins(shots: Shots, found: Groups, near_end: np.ndarray) -> np.ndarray:
+    """Return the number of independent bins as which each group counts, (n, 3, most).
+
+    That of :meth:`sweep.model.preparation.Shots.both` for the chirps; 1 near DC and Nyquist.
+    """
+    number = np.ones(found.pd.shape)
+    if shots.detection == "peak_bin":
+        return number
+    for segments in ((0, 2), (1,)):
+        chances = tuple(found.pd[:, s].T for s in segments)
+        magnitudes = tuple(found.magnitude[:, s].T for s in segments)
+        alike = np.asarray(shots.independent_bins(chances, magnitudes)).T
+        for s in segments:
+            number[:, s] = alike
+    return np.where(near_end, 1.0, np.clip(number, 1.0, FADED_BINS_MAX))
+
+
+def _speckle_shares(shots: Shots, found: Groups) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Share of the echo in the power that detects a group, its wander, and number, as of Known."""
     sigma, line, level = (
         np.broadcast_to(v, shots.size)[:, None, None]
         for v in (shots.bin_deviation, shots.line_deviation, shots.threshold)
     )
     if shots.speckle_lines is None:
-        return np.zeros(found.pd.shape), np.zeros(found.pd.shape)
+        return np.zeros(found.pd.shape), np.zeros(found.pd.shape), np.ones(found.pd.shape)
+    near_end = (shots.speckle_table.row.T > 0)[:, :, None] & (shots.real_ends > 0)
+    number = _independent_bins(shots, found, near_end)
     with np.errstate(divide="ignore", invalid="ignore"):
         # As if one bin were detected as often: fading_together has the same share.
-        share = 1 + np.log(found.pd) * 2 * (line / level) ** 2
+        single = -np.expm1(np.log1p(-found.pd) / number)
+        share = 1 + np.log(np.where(number > 1, single, found.pd)) * 2 * (line / level) ** 2
         signal = np.square(found.magnitude / line)
-        near_end = (shots.speckle_table.row.T > 0)[:, :, None] & (shots.real_ends > 0)
         share = np.where(near_end, signal / (2 + signal), share)
     widest = np.sqrt((shots.speckle_lines.spread**2).sum(axis=-1))
     looks = shots.looks.number if shots.looks.several and shots.looks.independent else 1
     wander = widest[..., None] * found.magnitude / sigma / math.sqrt(2 * looks)
-    return np.clip(np.nan_to_num(share), 0.0, 1.0), np.nan_to_num(wander)
+    return np.clip(np.nan_to_num(share), 0.0, 1.0), np.nan_to_num(wander), number
 
 
 def _third(
@@ -849,6 +902,12 @@ class Speckle(NamedTuple):
     """(most,) int64: rows of ``factor`` of a group; 0 where its lines are drawn one by one."""
     factor: np.ndarray
     """(most, rows, 3, bins): of :func:`sweep.model.speckle_lines.factor_bins`."""
+    alone: np.ndarray
+    """(sets, 3, bins): independent amplitudes, of which those of looks are mixed that share them in
+    part."""
+    detecting: np.ndarray
+    """(most, 3, bins): weights of the bins in the amplitude, of mean power 1, that is held against
+    the probability of detection."""
 
 
 @njit(cache=True, error_model="numpy")
@@ -857,7 +916,9 @@ def no_speckle(most):
     bins = np.zeros((most, 3), np.int64)
     nothing = np.zeros((most, 1, 3, 0), np.complex128)
     powers = np.zeros((most, 3, 0))
-    return Speckle(bins, bins, powers, powers, nothing, np.zeros(most, np.int64), nothing)
+    alone = np.zeros((0, 3, 0), np.complex128)
+    rank = np.zeros(most, np.int64)
+    return Speckle(bins, bins, powers, powers, nothing, rank, nothing, alone, powers)
 
 
 @njit(cache=True, error_model="numpy")
@@ -894,7 +955,38 @@ def speckled_bins(i, how, known, seen):
                 known.fan, i, known.middle[i, :, g], first[g], power[g], factor[g]
             )
     drawn = np.zeros((most, looks, 3, widest), np.complex128)
-    return Speckle(first, count, power, pseudo, drawn, rank, factor)
+    alone = np.zeros((known.look_root.shape[3], 3, widest), np.complex128)
+    detecting = np.zeros((most, 3, widest))
+    for g in range(most):
+        for s in range(3):
+            if count[g, s] > 0 and not how.noisy:
+                weigh_bins(i, (g, s), how, known, first, power, rank, factor, detecting[g, s])
+    return Speckle(first, count, power, pseudo, drawn, rank, factor, alone, detecting)
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def weigh_bins(i, at, how, known, first, power, rank, factor, out):
+    """Set the weights (bins,) of :attr:`Speckle.detecting`, of group and segment ``at``.
+
+    With ``peak_bin`` that is the amplitude of the strongest bin. If any bin detects, the amplitudes
+    of two segments have the correlation of those in the middle of the echo: the bins are weighted
+    as a lone line in the middle would fill them.
+    """
+    g, s = at
+    out[:] = 0.0
+    out[known.bins[i, s, BIN, g] - first[g, s]] = 1.0
+    if how.beside == 0 or rank[g] == 0:
+        return
+    total = 0.0
+    for k in range(out.size):
+        distance = first[g, s] + k - known.middle[i, s, g]
+        out[k] = transform_at(distance, known.fan) * math.sqrt(power[g, s, k])
+    for r in range(rank[g]):
+        one = complex(0.0, 0.0)
+        for k in range(out.size):
+            one += out[k] * factor[g, r, s, k]
+        total += 2.0 * abs(one) ** 2
+    out /= math.sqrt(total)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
@@ -904,9 +996,10 @@ def draw_speckle(address, i, known, speckle, fading):
         fading[g] = 1.0
         if speckle.number[g].max() == 0:
             continue
-        for look in range(speckle.drawn.shape[1]):
+        sets = speckle.alone.shape[0]
+        for look in range(sets if sets > 0 else speckle.drawn.shape[1]):
             own = address[0], address[1], address[2] + look * NEXT_LOOK
-            amplitudes = speckle.drawn[g, look]
+            amplitudes = speckle.alone[look] if sets > 0 else speckle.drawn[g, look]
             if speckle.rank[g] > 0:
                 draw_factored(own, g, speckle.factor[g], speckle.rank[g], amplitudes)
             else:
@@ -914,6 +1007,8 @@ def draw_speckle(address, i, known, speckle, fading):
                     own, g, known.fan, i, known.middle[i, :, g], speckle.first[g],
                     speckle.power[g], amplitudes,
                 )  # fmt: skip
+        if sets > 0:
+            mix_looks(known.look_root[i], speckle.alone, speckle.drawn[g])
         for s in range(3):
             if speckle.number[g, s] == 0:
                 continue
@@ -925,6 +1020,17 @@ def draw_speckle(address, i, known, speckle, fading):
                         own[k] = own[centre]
                 total += abs(own[centre]) ** 2
             fading[g, s] = math.sqrt(total / speckle.drawn.shape[1])
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def mix_looks(root, alone, out):
+    """Mix independent amplitudes (sets, 3, bins) to those of looks (looks, 3, bins)."""
+    out[:] = 0.0
+    for look in range(out.shape[0]):
+        for s in range(3):
+            for k in range(alone.shape[0]):
+                for bin_ in range(alone.shape[2]):
+                    out[look, s, bin_] += root[s, look, k] * alone[k, s, bin_]
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
@@ -1134,12 +1240,17 @@ def detect_faded(address, at, g, how, known, speckle, tables, work, peak):
     Its amplitude, echo and noise, is normal, of the echo's share in the mean power. It is detected
     where its power exceeds what it exceeds with the group's probability of detection. So segments
     are detected together as two correlated Rayleigh magnitudes of their own probabilities are, by
-    :func:`sweep.model.detection.fading_together`. Several looks detect by their own powers.
+    :func:`sweep.model.detection.fading_together`. An echo that counts as several independent bins
+    is detected by any of as many amplitudes, of which the drawn one is the first. Several looks
+    detect by their own powers.
     """
     (a, b, draw), (i, s) = address, at
     sigma, beta, under_lines = known.levels[i]
     centre, first = known.bins[i, s, BIN, g], speckle.first[g, s]
     middle, count, chance = centre - first, speckle.number[g, s], known.pd[i, s, g]
+    number = known.number[i, s, g]
+    if number > 1.0:
+        chance = -math.expm1(math.log1p(-chance) / number)
     share, near_end = known.share[i, s, g], is_near_end(first, count, how)
     if not chance > 0.0:
         return False
@@ -1165,8 +1276,10 @@ def detect_faded(address, at, g, how, known, speckle, tables, work, peak):
                 )
             noise = complex(room[0, k], room[1, k])
             amplitude = size * echo[k] + under_lines * noise
+            if look == 0:
+                total += math.sqrt(share) * speckle.detecting[g, s, k] * echo[k]
             if k == middle and look == 0:
-                total = math.sqrt(share) * echo[k] + math.sqrt(0.5 * (1.0 - share)) * noise
+                total += math.sqrt(0.5 * (1.0 - share)) * noise
             if k == middle:
                 votes += abs(amplitude) >= beta
             power[k] += abs(amplitude) ** 2 / how.looks
@@ -1178,6 +1291,8 @@ def detect_faded(address, at, g, how, known, speckle, tables, work, peak):
         there = hoyt_pair(1.0, pseudo, abs(total))[0] < chance
     else:
         there = math.exp(-(abs(total) ** 2)) < chance
+        if not there and number > 1.0:
+            there = is_detected_aside(address, (i, s), g, known, chance)
     if not there:
         return False
     best = middle
@@ -1196,6 +1311,30 @@ def detect_faded(address, at, g, how, known, speckle, tables, work, peak):
     ratio = max(below, strongest, above, beta)
     put(peak, first + best + shift, first + best + delta, error, ratio, 0.0, how, tables)
     return True
+
+
+_ASIDE = 1 << 22
+"""Random numbers from which those of further independent bins of groups count, group by group."""
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def is_detected_aside(address, at, g, known, chance):
+    """Return true where an independent bin of a group but its strongest one is detected.
+
+    ``chance`` is the probability of a bin. The last of them is a part of one.
+    """
+    (a, b, draw), (i, s) = address, at
+    left, share = known.number[i, s, g] - 1.0, known.share[i, s, g]
+    bin_ = _ASIDE + g * int(FADED_BINS_MAX)
+    while left > 1e-6:
+        amplitude = fading_amplitudes((a, b), draw, bin_, known.mixing[i])[s]
+        re, im = philox.normal_pair(a, b, draw, philox.STREAM_NOISE[s], bin_)
+        noise, part = math.sqrt(0.5 * (1.0 - share)), math.sqrt(share)
+        power = (part * amplitude[0] + noise * re) ** 2 + (part * amplitude[1] + noise * im) ** 2
+        if math.exp(-power) < (chance if left >= 1.0 else -math.expm1(left * math.log1p(-chance))):
+            return True
+        left, bin_ = left - 1.0, bin_ + 1
+    return False
 
 
 @njit(cache=True, error_model="numpy", borrows=True)

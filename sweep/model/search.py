@@ -69,6 +69,19 @@ def beamlet_lines(shots: Any, points: np.ndarray | slice = slice(None)) -> np.nd
     return lines
 
 
+def middle_lines(shots: Any, points: np.ndarray, strongest: np.ndarray) -> np.ndarray:
+    """Mean places of the beamlets' lines, weighted by power, (m, 3) [bins].
+
+    Next to the ``strongest`` bins (m, 3) of complex records, whose bins may be numbered from
+    anywhere on.
+    """
+    apart = beamlet_lines(shots, points) - strongest[..., None]
+    if shots.complex_record:
+        apart -= shots.fft_size * np.rint(apart / shots.fft_size)
+    power = shots.amplitude[shots.row[points]][:, None] ** 2
+    return np.asarray(strongest + (power * apart).sum(axis=-1) / power.sum(axis=-1))
+
+
 def centre_lines(shots: Any) -> np.ndarray:
     """Places of the lines on the beam's axis, as of :func:`beamlet_lines`, (segments, n)."""
     turns = [

@@ -45,9 +45,15 @@ from sweep.kernels import njit
 from sweep.model import philox
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.footprint import gaussian_rule
-from sweep.model.interpolation import interpolator, lone_tone, sub_bin
-from sweep.model.speckle_correlation import OVERSAMPLING, REACH, SpeckleLines, transform_table
-from sweep.model.window import Window
+from sweep.model.interpolation import interpolator, lone_tone, phasors, sub_bin
+from sweep.model.speckle_correlation import (
+    OVERSAMPLING,
+    REACH,
+    SpeckleLines,
+    middle_moved,
+    transform_table,
+)
+from sweep.model.window import Window, samples
 
 if TYPE_CHECKING:
     from sweep.model.preparation import Shots
@@ -96,6 +102,16 @@ class LineFan(NamedTuple):
     half: int
     """N/2 of a real record whose bins near DC and Nyquist see the conjugate images of lines,
     else 0."""
+
+    @classmethod
+    def nothing(cls) -> "LineFan":
+        """Return lines of no points."""
+        none, numbers = np.zeros((0, 3, 2)), np.zeros(0, np.int64)
+        table = np.zeros((0, 0))
+        return cls(
+            none, none, np.zeros((0, 2), np.int64), numbers, table, table, numbers, np.zeros(0),
+            1.0, 0.0, 0,
+        )  # fmt: skip
 
     def of(self, part: np.ndarray) -> "LineFan":
         """Select points by their indices."""
@@ -432,6 +448,155 @@ def drawn_speckle(
         draw_lines((key[0], key[1], draw), group, fan, i, middle, first, power, out)
         found[row] = out[segment]
     return found
+
+
+RECORD_SPREAD_MAX = 1.0
+"""Deviation of a footprint's lines [bins of fs/L] up to which :class:`FootprintRecord` is used."""
+
+
+class FootprintRecord(NamedTuple):
+    """Windowed record of a footprint's speckle lines: a lone tone at their middle times a series.
+
+    The series is the sum over lines of ``a z e^(i t . (y, x)) e^(2 pi i b . (y, x) (n - middle) /
+    N)`` by Chebyshev polynomials in the number n of the sample.
+    """
+
+    phasor: np.ndarray
+    """(lines, k) complex: coefficients of the series by line, for z of 1."""
+    samples: np.ndarray
+    """(L,): samples' places in the series, -1 .. 1 over the samples that the echo has."""
+    tone: np.ndarray
+    """(L,) complex: windowed record of the lone tone, of amplitude 1."""
+    power: np.ndarray
+    """(N,): mean power of the transform of the record by bin."""
+
+    @classmethod
+    def of(
+        cls, fan: LineFan, i: int, segment: int, place: float, window: Window, begun: int,
+        fft_size: int,
+    ) -> "FootprintRecord":  # fmt: skip
+        """Prepare the record of point i in a segment.
+
+        Parameters
+        ----------
+        place
+            Frequency of the lone tone [bins].
+        window, begun
+            Window of the record, and the number of samples before the echo.
+
+        Notes
+        -----
+        The mean power of all bins is the transform of the window's autocorrelation times the mean
+        phasor of the lines, by the distance of two samples.
+        """
+        offset, phase, weight = _lines_of(fan, i, segment)
+        length = window.length
+        half = max(0.5 * (length - 1 - begun), 0.5)
+        turns = 2 * np.pi * offset / fft_size
+        middle = 0.5 * length + float(middle_moved(window)[begun])
+        at, to_series = _chebyshev(_degree(np.abs(turns).max() * half))
+        phasor = np.exp(1j * (phase[:, None] + turns[:, None] * (begun + half * (1 + at) - middle)))
+        phasor = np.sqrt(0.5 * weight)[:, None] * phasor
+        # Sums, not products of matrices, whose order depends on the number of threads.
+        phasor = (phasor[:, None] * to_series).sum(axis=2)
+        tone = samples(window.name, length) * phasors(-place / fft_size, length)
+        tone[:begun] = 0.0
+        at, to_series = _chebyshev(_degree(np.abs(turns).max() * length))
+        mean = (weight[:, None] * np.exp(0.5j * turns[:, None] * length * (1 + at))).sum(axis=0)
+        folded, lag = np.zeros(fft_size, complex), np.arange(length)
+        folded[:length] = _autocorrelation(window, begun) * phasors(-place / fft_size, length)
+        _times_series((mean * to_series).sum(axis=1), 2 * lag / length - 1, folded)
+        folded[0] *= 0.5
+        power = 2 * np.fft.fft(folded).real
+        power = np.maximum(power, _LEAST_POWER * power.max())
+        return cls(phasor, (lag - begun) / half - 1, tone, power)
+
+    def draw(self, key: np.ndarray, draw: int, group: int) -> np.ndarray:
+        """Draw the record (L,) of a group's speckle, by the numbers of :func:`draw_lines`."""
+        amplitude = np.empty(len(self.phasor), complex)
+        _draw_amplitudes((key[0], key[1], np.int64(draw)), FIRST_LINE * (1 + group), amplitude)
+        record = self.tone.copy()
+        _times_series((amplitude[:, None] * self.phasor).sum(axis=0), self.samples, record)
+        return record
+
+
+_LEAST_POWER = 1e-14
+"""Mean power of a bin, over the largest, below which it is not known to float64."""
+
+
+def _lines_of(fan: LineFan, i: int, segment: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return offsets [bins], phases [rad] and weights of lines, in the order of draw_lines."""
+    along, across = fan.rule[i]
+    y, x = (fan.node[rule, : fan.number[rule]] for rule in (along, across))
+    weight = fan.weight[along, : y.size, None] * fan.weight[across, : x.size]
+    slopes = [of[i, segment, 0] * y[:, None] + of[i, segment, 1] * x for of in fan[:2]]
+    used = weight >= _LEAST_WEIGHT
+    return slopes[0][used], slopes[1][used], weight[used]
+
+
+@njit(cache=True, error_model="numpy")
+def _draw_amplitudes(address, number, out):
+    """Draw circular complex Gaussian numbers of mean power 2, of the stream of speckle."""
+    for k in range(out.size):
+        re, im = philox.normal_pair(
+            address[0], address[1], address[2], philox.STREAM_SPECKLE, number + k
+        )
+        out[k] = complex(re, im)
+
+
+def _degree(phase: float) -> int:
+    """Return the degree of a Chebyshev series that has exponentials up to a phase to 1e-7."""
+    return 9 + math.ceil(1.5 * phase)
+
+
+@lru_cache(maxsize=64)
+def _chebyshev(number: int) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes (number,) of a Chebyshev series, and what makes its coefficients of values there.
+
+    The matrix (number, number) has a row for each coefficient.
+    """
+    angle = np.pi * (np.arange(number) + 0.5) / number
+    to_series = np.cos(np.arange(number)[:, None] * angle) * (2.0 / number)
+    to_series[0] *= 0.5
+    return np.cos(angle), to_series
+
+
+_SAMPLES_AT_ONCE = 128
+"""Samples that a series is evaluated at together, in vector registers."""
+
+
+@njit(cache=True, error_model="numpy")
+def _times_series(series, place, out):
+    """Multiply numbers in place by a Chebyshev series at places -1 .. 1 (Clenshaw's algorithm)."""
+    last_re, last_im = np.empty(_SAMPLES_AT_ONCE), np.empty(_SAMPLES_AT_ONCE)
+    before_re, before_im = np.empty(_SAMPLES_AT_ONCE), np.empty(_SAMPLES_AT_ONCE)
+    x = np.empty(_SAMPLES_AT_ONCE)
+    for first in range(0, place.size, _SAMPLES_AT_ONCE):
+        number = min(_SAMPLES_AT_ONCE, place.size - first)
+        for n in range(number):
+            x[n] = 2.0 * place[first + n]
+            last_re[n] = last_im[n] = before_re[n] = before_im[n] = 0.0
+        for k in range(series.size - 1, 0, -1):
+            re, im = series[k].real, series[k].imag
+            for n in range(number):
+                value = re + x[n] * last_re[n] - before_re[n]
+                before_re[n], last_re[n] = last_re[n], value
+            for n in range(number):
+                value = im + x[n] * last_im[n] - before_im[n]
+                before_im[n], last_im[n] = last_im[n], value
+        for n in range(number):
+            re = series[0].real + 0.5 * x[n] * last_re[n] - before_re[n]
+            im = series[0].imag + 0.5 * x[n] * last_im[n] - before_im[n]
+            out[first + n] *= complex(re, im)
+
+
+@lru_cache(maxsize=16)
+def _autocorrelation(window: Window, begun: int) -> np.ndarray:
+    """Return the autocorrelation (L,) of a window without its first samples, by lag."""
+    w = samples(window.name, window.length).copy()
+    w[:begun] = 0.0
+    spectrum = np.fft.rfft(w, 2 * w.size)
+    return np.asarray(np.fft.irfft(np.abs(spectrum) ** 2, 2 * w.size)[: w.size])
 
 
 def wander_covariance(

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sweep.model import waveform
+from sweep.model import beam, waveform
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.catalogue import DEFAULTS
 from sweep.model.effects.points import missing_of
@@ -24,6 +24,7 @@ from sweep.model.window import canonical_name, window
 from sweep.tasks.flight_study import FlightStudy
 
 if TYPE_CHECKING:
+    from sweep.model.eyepoints import Eyepoints
     from sweep.tasks.grid_study import GridStudy
 
 LOSS_DB = 3.0
@@ -39,12 +40,19 @@ POINTS_MAX = 200_000
 FLIGHT_TILES = 16
 """Tiles of a flight's shots that are looked at, of each scanner."""
 
+ENDS_SPREAD, ENDS_REACH, ENDS_DEVIATIONS = 0.2, 4.0, 3.0
+"""Deviation of a footprint's lines [bins of fs/L] beyond which an echo that any bin detects is not
+one line. With the bins and deviations within which such an echo lies across DC or Nyquist."""
+
 PARAMETERS = (
     "target.range", "target.radial_velocity", LASER + "wavelength", CHIRP + "bandwidth",
     CHIRP + "duration", CHIRP + "start_frequency", waveform.ORDER, waveform.DOPPLER_SLOPE,
     waveform.DOWN_SLOPE, PROCESSING + "acquisition_delay", PROCESSING + "sample_rate",
     PROCESSING + "fft_size", PROCESSING + "window", waveform.TWO_BEATS, RECORD,
     RECEIVER + "architecture", LASER + "line_width", LASER + "line_shape",
+    PROCESSING + "detection", "footprint.speckle", "footprint.phases", "target.grazing_angle",
+    "target.transverse_velocity", beam.WAIST, beam.RECEIVED_WAIST, beam.DIVERGENCE, beam.QUALITY,
+    beam.FOCUS, beam.COUPLING,
 )  # fmt: skip
 """Parameters by which echoes arrive and are read."""
 
@@ -73,16 +81,59 @@ class Echoes(NamedTuple):
     be read right by the other assumption of two beats."""
     other_exchanged: np.ndarray
     """(n,): likewise by the other assumption, where this one is right."""
+    across_end: np.ndarray
+    """(n,): true where an echo in developed speckle that any bin detects spreads over bins across
+    DC or Nyquist."""
 
 
-def echoes_of(parameters: Mapping[str, Any]) -> Echoes:
-    """Find when the echoes of points arrive, and how their beats are read, without a footprint."""
+class Widths(NamedTuple):
+    """Standard deviations over the beam of n footprints."""
+
+    range: np.ndarray
+    """[m]"""
+    radial_velocity: np.ndarray
+    """[m/s]"""
+
+    @classmethod
+    def on_plane(cls, p: Mapping[str, Any], range_: np.ndarray) -> Widths:
+        """Return the widths of footprints on the plane of points of one category."""
+        with np.errstate(all="ignore"):
+            places, directions = beam.angles(p, range_)
+            along = range_ * places / 4 / np.tan(p["target.grazing_angle"])
+        across = np.abs(p["target.transverse_velocity"]) * directions / 4
+        return cls(*(np.nan_to_num(v + 0 * range_) for v in (along, across)))
+
+    @classmethod
+    def on_ground(cls, eyepoints: Eyepoints) -> Widths:
+        """Return the widths of footprints that rays have found; 0 where there are several surfaces.
+
+        Surfaces at different ranges are echoes of their own.
+        """
+        weight = eyepoints.weight / eyepoints.weight.sum()
+        found = []
+        for values in (eyepoints.offset, eyepoints.velocity_offset):
+            known = np.where(np.isfinite(values), values, 0.0)
+            mean = (weight * known).sum(axis=1)[:, None]
+            found.append(np.sqrt((weight * (known - mean) ** 2).sum(axis=1)))
+        one = (eyepoints.surface == eyepoints.surface[:, :1]).all(axis=1)
+        return cls(*(np.where(one, v, 0.0) for v in found))
+
+    def of(self, points: np.ndarray) -> Widths:
+        """Select points by their numbers."""
+        return Widths(self.range[points], self.radial_velocity[points])
+
+
+def echoes_of(parameters: Mapping[str, Any], widths: Widths | None = None) -> Echoes:
+    """Find when the echoes of points arrive, and how their beats are read, without a footprint.
+
+    ``widths`` are those of footprints on any ground; by default on a plane.
+    """
     needed = {path: v for path, v in parameters.items() if path in PARAMETERS}
     number = max((np.size(value) for value in needed.values()), default=1)
     needed["target.range"] = np.broadcast_to(needed["target.range"], (number,))
     needed |= {path: DEFAULTS[path] for path in DEFAULTS if path not in needed}
     needed |= {"footprint.beamlets": 1}
-    found = Echoes(*np.zeros((2, number)), *np.zeros((4, number), bool))
+    found = Echoes(*np.zeros((2, number)), *np.zeros((5, number), bool))
     for index, p in categories(needed):
         shape = window(canonical_name(str(p[PROCESSING + "window"])), int(p["record"]))
         range_, velocity = (p[name] for name in ("target.range", "target.radial_velocity"))
@@ -103,6 +154,9 @@ def echoes_of(parameters: Mapping[str, Any]) -> Echoes:
             pair = {name: _is_misread(p, range_, velocity, name) for name in (assumed, other)}
             found.exchanged[index] = pair[assumed] & ~pair[other]
             found.other_exchanged[index] = pair[other] & ~pair[assumed]
+        found.across_end[index] = _lies_across_end(
+            p, range_, velocity, shape.length, None if widths is None else widths.of(index)
+        )
         if str(p[LASER + "line_shape"]) == "lorentzian":
             delay, record = (
                 2 / SPEED_OF_LIGHT * range_,
@@ -110,6 +164,37 @@ def echoes_of(parameters: Mapping[str, Any]) -> Echoes:
             )
             variance = 2 * np.pi * p[LASER + "line_width"] * np.minimum(delay, record)
             found.walked[index] = (delay > WALK_DELAY * record) & (variance > WALK_PHASE)
+    return found
+
+
+def _lies_across_end(
+    p: Mapping[str, Any], range_: np.ndarray, velocity: np.ndarray, length: int,
+    widths: Widths | None,
+) -> np.ndarray:  # fmt: skip
+    """Mark echoes of the kind of :attr:`Echoes.across_end`, (n,)."""
+    rough = str(p["footprint.speckle"]) != "none" and str(p["footprint.phases"]) != "coherent"
+    rough &= str(p[RECEIVER + "architecture"]) != "direct"
+    if str(p[RECORD]) == "complex" or str(p[PROCESSING + "detection"]) != "any_bin" or not rough:
+        return np.zeros(range_.shape, bool)
+    widths = Widths.on_plane(p, range_) if widths is None else widths
+    rate, width = (
+        p[CHIRP + "bandwidth"] / p[CHIRP + "duration"],
+        p[PROCESSING + "sample_rate"] / length,
+    )
+    there = waveform.order_of(str(p[RECEIVER + "architecture"]), str(p[waveform.ORDER]))
+    found = np.zeros(range_.shape, bool)
+    segments = zip(waveform.SEGMENTS, waveform.slopes_of(p), waveform.carriers_of(p), strict=True)
+    for name, slope, carrier in segments:
+        if name not in there:
+            continue
+        beat = waveform.beat_frequency(
+            slope, carrier=carrier, chirp_rate=rate, range=range_, radial_velocity=velocity
+        )
+        turns = 2 * beat / p[PROCESSING + "sample_rate"]
+        apart = np.abs(turns - np.rint(turns)) * length / 2
+        spread = 2 / SPEED_OF_LIGHT * carrier * widths.radial_velocity
+        spread = (spread + 2 / SPEED_OF_LIGHT * np.abs(slope) * rate * widths.range) / width
+        found |= (spread > ENDS_SPREAD) & (apart < ENDS_REACH + ENDS_DEVIATIONS * spread)
     return found
 
 
@@ -211,6 +296,15 @@ def warnings_of(study: GridStudy | FlightStudy) -> Iterator[str]:
             "may be off by up to 0.1: take draws.method: spectra, which draws the walk, or lower "
             "instrument.laser.line_width"
         )
+    across = echoes.across_end & ~none & (study.spec.modes()["fading"] != "off")
+    if across.any() and (study.spec.draws is None or study.spec.draws.method == "probabilities"):
+        yield (
+            "the speckle of the footprint spreads an echo over bins on both sides of DC or half "
+            f"the sample rate at {_share(across)} of the {points}, "
+            f"{_where(across, echoes.range, none)}: its probability of detection by any_bin may "
+            "be up to 0.06 too high. Take draws.method: noise or spectra, which draw the bins, or "
+            "instrument.processing.detection: peak_bin"
+        )
 
 
 def _phase_estimators(study: GridStudy | FlightStudy) -> list[str]:
@@ -308,10 +402,11 @@ def _of_flight(study: FlightStudy) -> Echoes:
         for place in sorted(ends):
             part = study.scanners[eyepoints.scanner].first_part(place)
             parameters = DEFAULTS | dict(study.parameters_at(part))
-            shots, _ = seen_ground(seen.some(there), parameters, study.surfaces)
-            found.append(echoes_of(shots))
+            some = seen.some(there)
+            shots, _ = seen_ground(some, parameters, study.surfaces)
+            found.append(echoes_of(shots, Widths.on_ground(some)))
     return (
         Echoes(*map(np.concatenate, zip(*found, strict=True)))
         if found
-        else Echoes(*[np.empty(0)] * 6)
+        else Echoes(*[np.empty(0)] * 7)
     )

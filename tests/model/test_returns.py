@@ -293,7 +293,8 @@ def _up_in_noise(centre, magnitude, levels, tables, half, *, low=0, others=0.0, 
         np.full((1, 3, 3, 1), centre), np.ones((1, 3, 1)), np.full((1, 3, 1, 3), magnitude),
         np.zeros((1, 3, 1)), np.zeros((1, 3, 1)), np.ones((1, 1)), np.array([levels]),
         np.zeros((1, 7)), np.full((1, 3), alarm), np.ones((1, 2)), np.ones((1, 2, 1)),
-        np.tile([1, half], (1, 3, 1)), NO_LINES, *np.zeros((3, 1, 3, 1)),
+        np.tile([1, half], (1, 3, 1)), NO_LINES, *np.zeros((3, 1, 3, 1)), np.ones((1, 3, 1)),
+        np.zeros((1, 6)), np.zeros((1, 3, 1, 0), complex),
     )  # fmt: skip
     seen = Seen.nothing(1)._replace(low=np.full((1, 3), low), others=np.full((1, 3), others))
     peaks, which = np.zeros((2, 4)), np.zeros(2, np.int64)

@@ -265,3 +265,42 @@ def test_instruments_of_landers_read_two_beats_as_of_a_fast_target(name):
     spec = small_scene(instrument=name, axes={})
     assert spec.parameters()["instrument.processing.two_beats"] == "fast"
     assert not exchanged(spec)
+
+
+SLIDING = {
+    "range": "300 m", "grazing_angle": "60 deg", "radial_velocity": "0 m/s",
+    "transverse_velocity": "60 m/s", "reflectance": 0.1,
+}  # fmt: skip
+ACROSS = "both sides of DC"
+
+
+def sliding(target, draws=None, **processing):
+    """What is told of an instrument with a beam of 5 mrad that slides over the ground."""
+    instrument = record(fft_size="2^13", acquisition_delay="3 us", **processing)
+    instrument["laser"] = instrument["laser"] | {"beam_divergence": "2 mrad"}
+    given = {} if draws is None else {"draws": {"method": draws, "number": 8}}
+    footprint = {"speckle": "developed", "phases": "incoherent"}
+    spec = small(
+        target=SLIDING | target, axes={}, instrument=instrument, footprint=footprint, **given
+    )
+    return [sentence for sentence in told(spec) if ACROSS in sentence]
+
+
+def test_speckle_that_spreads_over_bins_across_dc_is_told_of():
+    """60 m/s across half a mrad are 3 cm/s, 40 kHz, and a bin has 73 kHz: the Doppler segment's."""
+    (sentence,) = sliding({}, detection="any_bin")
+    assert "at 100 % of the points" in sentence and "0.06 too high" in sentence
+
+
+@pytest.mark.parametrize(
+    ("target", "draws", "processing"),
+    [
+        ({"transverse_velocity": "0 m/s"}, None, {"detection": "any_bin"}),
+        ({"radial_velocity": "20 m/s"}, None, {"detection": "any_bin"}),
+        ({}, "noise", {"detection": "any_bin"}),
+        ({}, "spectra", {"detection": "any_bin"}),
+        ({}, None, {"detection": "peak_bin"}),
+    ],
+)
+def test_other_echoes_near_dc_are_not_told_of(target, draws, processing):
+    assert sliding(target, draws, **processing) == []

@@ -434,14 +434,52 @@ def _line_spread(
         beat = segment.carrier * segment.beta - segment.chirp_rate * delay * (1 + segment.beta)
         place = beat / bin_width * padding
         # Any bins of two echoes may detect them: of these the middles stand for all.
-        nearest = place if shots.detection == "any_bin" else np.rint(place)
-        distances.append(np.broadcast_to((nearest - place) / padding, shots.size))
         moved = segment.carrier * slopes.beta - segment.chirp_rate * delay * slopes.range
         spreads.append(np.broadcast_to(moved / bin_width, shots.size))
+        place = np.broadcast_to(place, shots.size)
+        nearest = place
+        if shots.detection == "peak_bin":
+            nearest = _strongest_bins(shots, place, spreads[-1] * padding)
+        distances.append((nearest - place) / padding)
     return LineSpread(
         (distances[0], distances[1]), (spreads[0], spreads[1]), phase.along(slopes),
         np.broadcast_to(slopes.echo, shots.size),
     )  # fmt: skip
+
+
+_END_REACH = 2.0
+"""Distance from DC or Nyquist [bins], and deviations of lines, within which the image of an echo
+may make another bin the strongest."""
+
+
+def _strongest_bins(shots: Shots, place: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    """Return the strongest bins of echoes at a place, with its sign and folds [bins], (n,).
+
+    That is the nearest one, unless a line near DC or Nyquist of a real record has its image there:
+    of bins 0 and 1 that at DC then has the light of both. ``spread`` is that of the lines [bins].
+    """
+    nearest = np.rint(place)
+    if not shots.real_ends or not shots.image:
+        return nearest
+    half = shots.fft_size // 2
+    end = np.rint(place / half) * half
+    padding = shots.fft_size / shots.window.length
+    near = np.flatnonzero(np.abs(place - end) < _END_REACH * (padding + np.abs(spread)))
+    if not near.size:
+        return nearest
+    place, end = place[near, None], end[near]
+    node = np.linspace(-_DEVIATIONS_MAX, _DEVIATIONS_MAX, _NODES)
+    weight, lines = np.exp(-0.5 * node * node), place + spread[near, None] * node
+    side = np.where(place[:, 0] < end, -1.0, 1.0)
+    first = np.maximum(side * (nearest[near] - end) - 1, 0.0)
+    power = []
+    for further in range(3):  # the nearest bin and those beside it, on this side of the end
+        bin_ = (end + side * (first + further))[:, None]
+        line = window_transform(shots.window, (bin_ - lines) / padding)
+        image = window_transform(shots.window, (bin_ - 2 * end[:, None] + lines) / padding)
+        power.append(((line**2 + image**2) * weight).sum(axis=-1))
+    nearest[near] = end + side * (first + np.argmax(power, axis=0))
+    return nearest
 
 
 class BeamletMoments(NamedTuple):
