@@ -444,6 +444,10 @@ _LEFT = re.compile(
 HIDDEN = -1
 
 
+PID_MAX = 2**31 - 1
+"""Largest number of a process that a system can give."""
+
+
 def process_start(pid: int) -> int:
     """Start of a process, which tells it from others that had its number; no clock changes it.
 
@@ -452,6 +456,8 @@ def process_start(pid: int) -> int:
     """
     import psutil
 
+    if not 0 < pid <= PID_MAX:  # a lock may name any number
+        return 0
     if sys.platform == "linux":
         try:
             content = Path(f"/proc/{pid}/stat").read_bytes()
