@@ -676,6 +676,13 @@ def reason(error: OSError, place: object) -> str:
     return words
 
 
+def write_remedy(error: OSError, place: object, otherwise: str) -> str:
+    """Return what to do where a place can't be written: by the error, or else as is proposed."""
+    if NO_INODES in (error.strerror, reason(error, place)):
+        return "remove files from its disk, or have one with more inodes"
+    return REMEDIES.get(error.errno or 0, otherwise)
+
+
 def _lacks_inodes(place: Path) -> bool:
     """Tell whether the disk of a place, which need not exist, has no inodes left."""
     while not place.exists() and place != place.parent:
