@@ -13,9 +13,9 @@ from sweep.scenes.rasters import _opened as opened_raster
 def projection_in_metres(path: str | Path, metres_per_unit: Sequence[float] | None = None) -> str:
     """WKT of a raster's map projection if a scene's coordinates are those of the map, else ''.
 
-    A scene is in metres: coordinates of a raster in feet or degrees, or of one whose units were
-    stated to have another size on the ground, are multiplied by it and belong to no projection.
-    Heights in feet are turned into metres too: then the projection is that of the map alone.
+    A scene is in metres. Coordinates in feet or degrees, or in units of another size that is
+    stated, are multiplied by that size and belong to no projection. Heights in feet are turned into
+    metres too: then the projection is that of the map alone.
     """
     with opened_raster(existing(path)) as data:
         crs = data.crs
