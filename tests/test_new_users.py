@@ -78,6 +78,8 @@ SPECS = [
     ("[1 W, 2 W]", "1 W, 2 W", "must be a list or a generator (you", "write e.g. [1 W, 2 W]"),
     ("[1 W, 2 W]", "[1, 2]", "axes.instrument.laser.power[0]: needs a unit (you wrote 1)", "'1 W'"),
     ("[1 W, 2 W]", "{linspace: [1 W, 2 W, 5]}", "exactly one of linear, log and step", "'linear'?"),
+    ("[1 W, 2 W]", "{values: [1 W, 2 W]}", "exactly one of linear, log and step",
+     "without 'values:'"),
     ("[1 W, 2 W]", "{linear: [1 W, 2 W], number: 0}", ".number: must be at least 2 (you wrote 0)",
      "write e.g. '10'"),
     ("instrument.laser.power:", "power:", "axes.power: is no parameter",
@@ -140,6 +142,9 @@ def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("good.yaml").write_text(GOOD)
     Path("empty").mkdir()
+    Path("plots").mkdir()
+    for name in ("a.png", "b.png"):
+        Path("plots", name).touch()
     Path("file.txt").write_text("hello")
     Path("foreign.zarr").mkdir()
     group = '{"zarr_format": 3, "node_type": "group", "attributes": {}}'
@@ -171,6 +176,8 @@ COMMANDS = [
     ("run good.yaml --overwrit", "Did you mean '--overwrite'?"),
     ("status good.yaml", "is a file, and no Zarr store of sweep's: `sweep run SPEC --store STORE`"),
     ("status empty", "is not a Zarr store of sweep's: `sweep run SPEC --store STORE` computes"),
+    ("run good.yaml --store plots", "has files in it (a.png, b.png): name another place, as"),
+    ("status plots", "is not a Zarr store of sweep's, and has files in it (a.png, b.png)"),
     ("status foreign.zarr", "is a Zarr store, but not one that sweep made"),
     ("status nothing.zarr", "there is no store at nothing.zarr; stores near it: foreign.zarr"),
     ("shot good.yaml --at range", "'range' is not NAME=VALUE, as in range=2km"),

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from sweep.scenes.files import existing
+from sweep.scenes.maps import projection_of_metres
 from sweep.scenes.rasters import _opened as opened_raster
 
-_WEB_MERCATOR = 3857
-"""EPSG code of a projection whose metres are none but at the equator."""
 
+def projection_in_metres(path: str | Path, metres_per_unit: Sequence[float] | None = None) -> str:
+    """WKT of a raster's map projection if a scene's coordinates are those of the map, else ''.
 
-def projection_in_metres(path: str | Path) -> str:
-    """WKT of a raster's map projection if its coordinates are metres on the ground, else ''.
-
-    A scene is in metres: of a raster in feet or degrees its coordinates are those of no projection.
+    A scene is in metres. Coordinates in feet or degrees, or in units of another size that is
+    stated, are multiplied by that size and belong to no projection. Heights in feet are turned into
+    metres too: then the projection is that of the map alone.
     """
     with opened_raster(existing(path)) as data:
         crs = data.crs
-        if crs is None or not crs.is_projected or crs.to_epsg() == _WEB_MERCATOR:
+        if crs is None or (metres_per_unit is not None and tuple(metres_per_unit) != (1.0, 1.0)):
             return ""
-        return str(crs.to_wkt()) if float(crs.linear_units_factor[1]) == 1.0 else ""
+        return projection_of_metres(str(crs.to_wkt()))

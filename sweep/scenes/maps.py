@@ -69,13 +69,34 @@ class MapFrame:
         """Return true if two maps have one coordinate reference system, or one has none."""
         if not (self.wkt and other.wkt) or self.wkt == other.wkt:
             return True
-        one, another = (_horizontal(_crs(wkt)) for wkt in (self.wkt, other.wkt))
+        one, another = (_horizontal(_crs(wkt)).to_2d() for wkt in (self.wkt, other.wkt))
         return bool(one.equals(another, ignore_axis_order=True))
+
+    def same_heights_as(self, other: MapFrame) -> bool:
+        """Return true if heights on two maps are above one surface, or one map tells none."""
+        return not (self.wkt and other.wkt) or _same_heights(_crs(self.wkt), _crs(other.wkt))
+
+    @property
+    def height_reference(self) -> str:
+        """Name of the surface that its heights are above; '' for none."""
+        return _height_reference(_crs(self.wkt)) if self.wkt else ""
 
     @property
     def name(self) -> str:
         """Name of the coordinate reference system."""
         return str(_crs(self.wkt).name) if self.wkt else "none"
+
+
+def projection_of_metres(wkt: str) -> str:
+    """WKT of a map projection in metres, without its vertical part if that is not; else ''."""
+    crs = _crs(wkt)
+    horizontal = _horizontal(crs)
+    if not horizontal.is_projected or _linear_unit(horizontal)[1] != 1.0:
+        return ""
+    axis = _height_axis(crs)
+    if axis is None or float(axis.unit_conversion_factor) == 1.0:
+        return wkt
+    return str(horizontal.to_2d().to_wkt("WKT1_GDAL"))
 
 
 def height_metres(unit: str) -> float:
@@ -116,18 +137,28 @@ def height_factor(path: Path, wkt: str, band_unit: str, stated: str | None, scal
 
 def _declared_unit(path: Path, wkt: str, band_unit: str) -> tuple[str, float] | None:
     """Return the unit of heights that a raster declares itself, and metres to it."""
-    vertical = _vertical(_crs(wkt)) if wkt else None
-    axes = vertical.axis_info if vertical is not None else []
-    if vertical is not None and axes and axes[0].direction.lower() == "down":
-        rule = f"holds depths, by its vertical reference system '{vertical.name}'"
+    crs = _crs(wkt) if wkt else None
+    axis = _height_axis(crs) if crs is not None else None
+    if axis is not None and axis.direction.lower() == "down":
+        rule = f"holds depths, by its vertical reference system '{_height_reference(crs)}'"
         raise SceneError(path, rule, "turn them into heights with gdal_calc")
-    if band_unit.strip():
-        try:
-            return band_unit, height_metres(band_unit)
-        except QuantityError:
-            remedy = "convert them to metres with gdal_calc"
-            raise SceneError(path, f"has heights in '{band_unit}'", remedy) from None
-    return (str(axes[0].unit_name), float(axes[0].unit_conversion_factor)) if axes else None
+    of_map = None if axis is None else (str(axis.unit_name), float(axis.unit_conversion_factor))
+    if not band_unit.strip():
+        return of_map
+    try:
+        of_band = band_unit, height_metres(band_unit)
+    except QuantityError:
+        remedy = "convert them to metres with gdal_calc"
+        raise SceneError(path, f"has heights in '{band_unit}'", remedy) from None
+    # 'ft' is written for either foot: they differ by 2e-6, 2 cm in 10 km.
+    if of_map is not None and not math.isclose(of_map[1], of_band[1], rel_tol=1e-5):
+        rule = (
+            f"contradicts itself: its band has heights in '{band_unit}', and its vertical "
+            f"reference system '{_height_reference(crs)}' in units of a {of_map[0]}"
+        )
+        remedy = "correct one of them: gdal_edit -units, or -a_srs"
+        raise SceneError(path, rule, remedy)
+    return of_band if of_map is None else of_map
 
 
 def _short(unit: str) -> str:
@@ -285,6 +316,11 @@ def _reprojected(crs: Any, bounds: Box) -> str:
         return (
             f"{command}, e.g. -t_srs '+proj=stere {place} +R={crs.ellipsoid.semi_major_metre:.0f}'"
         )
+    if abs(latitude) > UTM_LATITUDE_MAX:
+        return (
+            f"{command}, e.g. -t_srs '+proj=stere +lon_0={longitude:.4f} +lat_0={latitude:.4f} "
+            "+datum=WGS84'"
+        )
     zone = min(max(math.floor((longitude + 180) / 6) + 1, 1), 60)
     return f"{command}, e.g. -t_srs EPSG:{326 if latitude >= 0 else 327}{zone:02d}"
 
@@ -316,16 +352,47 @@ def _horizontal(crs: Any) -> Any:
 
 
 def _vertical(crs: Any) -> Any:
-    """Part of a reference system that is heights; None if there is none."""
+    """Part of a reference system that heights refer to: a vertical one, or one of three axes.
+
+    None if there is none.
+    """
     while crs.is_bound:
         crs = crs.source_crs
     parts = crs.sub_crs_list if crs.is_compound else [crs]
     for part in parts:
         while part.is_bound:
             part = part.source_crs
-        if part.is_vertical:
+        if part.is_vertical or (len(part.axis_info) == 3 and not part.is_geocentric):
             return part
     return None
+
+
+def _height_axis(crs: Any) -> Any:
+    """Axis of the heights of a reference system; None if there is none."""
+    vertical = _vertical(crs)
+    axes = vertical.axis_info if vertical is not None else []
+    return axes[-1] if axes else None
+
+
+def _height_reference(crs: Any) -> str:
+    """Name of the surface that heights of a reference system are above; '' for none."""
+    vertical = _vertical(crs)
+    if vertical is None:
+        return ""
+    return str(vertical.name) if vertical.is_vertical else f"ellipsoid {vertical.ellipsoid.name}"
+
+
+def _same_heights(one: Any, other: Any) -> bool:
+    """Return true if heights of two reference systems are above one surface, or one tells none.
+
+    Their units may differ, as all heights are turned into metres.
+    """
+    first, second = _vertical(one), _vertical(other)
+    if first is None or second is None:
+        return True
+    if first.is_vertical and second.is_vertical:
+        return bool(first.datum == second.datum)
+    return _height_reference(one) == _height_reference(other)
 
 
 def _linear_unit(crs: Any) -> tuple[str, float]:
@@ -335,6 +402,9 @@ def _linear_unit(crs: Any) -> tuple[str, float]:
         return "metre", 1.0
     return str(axes[0].unit_name), float(axes[0].unit_conversion_factor)
 
+
+UTM_LATITUDE_MAX = 80.0
+"""Latitude up to which zones of UTM are defined on both hemispheres [deg]."""
 
 WGS84_RADIUS, WGS84_FLATTENING = 6_378_137.0, 1 / 298.257223563
 
@@ -363,6 +433,13 @@ def require_one_map(map_frames: Sequence[tuple[str, MapFrame]]) -> None:
             if not map_frame.same_as(other):
                 rule = f"lies on the map '{map_frame.name}', and {other_name} on '{other.name}'"
                 raise SceneError(place, rule, "reproject one of them with gdalwarp")
+            if not map_frame.same_heights_as(other):
+                rule = (
+                    f"has heights above '{map_frame.height_reference}', and {other_name} above "
+                    f"'{other.height_reference}'"
+                )
+                remedy = "bring both to one vertical reference system with gdalwarp -t_srs"
+                raise SceneError(place, rule, remedy)
             if map_frame.factors != other.factors:
                 sizes, other_sizes = tuple(map_frame.factors), tuple(other.factors)
                 rule = (

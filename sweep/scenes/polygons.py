@@ -1,9 +1,9 @@
 """Polygons of mesh files cut into triangles that cover just them.
 
 A polygon is looked at in its mean plane (Newell's normal). A convex one becomes a fan about its
-first corner. Any other is cut by Mapbox's earcut, and the result is checked: triangles that are all
-on one side, and whose areas sum to the polygon's, cover it once. A polygon that crosses itself
-passes no such check and is refused with its number.
+first corner. Any other is cut by Mapbox's earcut, and the result is checked: the triangles' areas
+sum to the polygon's, and the polygon winds about each of them once. One that crosses itself, or
+goes round a hole in the sense of its outline, does not pass and is refused with its number.
 """
 
 from __future__ import annotations
@@ -191,7 +191,33 @@ def _cut(flat: np.ndarray, points: np.ndarray, number: int) -> np.ndarray:
     whole = 0.5 * float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum())
     if not (len(part) and abs(np.abs(area).sum() - whole) <= _AREA_TOLERANCE * whole):
         raise PolygonError(number, f"of {len(flat)} corners crosses itself, seen along its normal")
+    if not _winds_once(corners, part[np.abs(area) > _ROUNDING * whole]):
+        rule = f"of {len(flat)} corners covers a part of its plane twice"
+        raise PolygonError(number, f"{rule}: a hole has to be gone round against its outline")
     return kept[_with_corners_in_line(part, corners)]
+
+
+_PAIRS = 1 << 22
+"""Edges times points that windings are counted of at a time."""
+
+
+def _winds_once(corners: np.ndarray, triangles: np.ndarray) -> bool:
+    """Return true if a polygon (n, 2) winds once, counter-clockwise, about each triangle in it."""
+    ends = np.roll(corners, -1, axis=0)
+    centres = corners[triangles].mean(axis=1)
+    rows = max(_PAIRS // len(corners), 1)
+    for begin in range(0, len(centres), rows):
+        x, y = centres[begin : begin + rows, None].transpose(2, 0, 1)
+        # An edge that passes to the right of a point, upwards, is a turn about it.
+        is_up = (corners[:, 1] <= y) & (ends[:, 1] > y)
+        is_down = (corners[:, 1] > y) & (ends[:, 1] <= y)
+        side = (ends[:, 0] - corners[:, 0]) * (y - corners[:, 1]) - (x - corners[:, 0]) * (
+            ends[:, 1] - corners[:, 1]
+        )
+        turns = (is_up & (side > 0)).sum(axis=1) - (is_down & (side < 0)).sum(axis=1)
+        if (turns != 1).any():
+            return False
+    return True
 
 
 def _areas(corners: np.ndarray, triangles: np.ndarray) -> np.ndarray:

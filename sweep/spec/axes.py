@@ -503,7 +503,10 @@ def _read_generator(written: dict[Any, Any], rule: Rule, location: Location) -> 
     """Values of ``{linear: ...}``, ``{log: ...}`` or ``{step: ...}``, within the field's bounds."""
     kinds = [key for key in written if key in _FORMS]
     if len(kinds) != 1:
-        remedy = near_miss(_ALIASES.get(name := str(next(iter(written), "")), name), _FORMS)
+        name, value = next(iter(written.items()), ("", None))
+        remedy = near_miss(_ALIASES.get(str(name), str(name)), _FORMS)
+        if isinstance(value, list) and name not in _ALIASES and len(written) == 1:
+            remedy = remedy or f"write the list alone, without '{name}:'"
         remedy = remedy or f"write e.g. {_FORMS['linear']}"
         raise rejected(location, "must have exactly one of linear, log and step", remedy)
     if not isinstance(rule, Numeric):

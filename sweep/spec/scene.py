@@ -451,8 +451,11 @@ def projection_of(scene: Scene, files: Files) -> str:
     from sweep.scenes.rasters import raster_digest
 
     rasters = [thing for thing in scene.objects.values() if isinstance(thing, RasterGround)]
-    found = {projection_in_metres(files.path(thing.file, raster_digest)) for thing in rasters}
-    return found.pop() if len(found) == 1 else ""
+    projections = {
+        projection_in_metres(files.path(thing.file, raster_digest), thing.metres_per_unit)
+        for thing in rasters
+    }
+    return projections.pop() if len(projections) == 1 else ""
 
 
 def build(scene: Scene, files: Files, span: Span) -> World:

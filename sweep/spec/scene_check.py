@@ -31,6 +31,9 @@ from sweep.spec.rules import Finding, Location, near_miss
 from sweep.spec.sections import default_of
 from sweep.units import QuantityError, read_unit
 
+SHOTS_MAX = 10**9
+"""Shots of a scanner at most, as arrays of them are made."""
+
 RESERVED = ("scene_map",)
 """Names that a store has for other groups than its scanners."""
 _PLACED = (scenes.Sphere, scenes.Box)
@@ -280,16 +283,21 @@ def _motion_findings(
 def _pattern_findings(
     scanner: Any, location: Location, span: flights.Span | None
 ) -> Iterator[Finding]:
-    """Report a scan pattern that can not be made, or that makes no whole cycle in the flight."""
+    """Report a scan pattern that can not be made, or makes no whole cycle or too many shots."""
     unfit = _refused(scanner.pattern, location)
     yield from unfit
     if unfit or span is None:
         return
     pattern = scanner.pattern()
     each = flights.shots_a_cycle(pattern)
-    if pattern.number(span[1] - span[0]) < each:
-        rule = f"makes no whole cycle of {each} shots in a flight of {span[1] - span[0]:.6g} s"
+    shots, flight = pattern.number(span[1] - span[0]), f"in a flight of {span[1] - span[0]:.6g} s"
+    if shots < each:
+        rule = f"makes no whole cycle of {each} shots {flight}"
         yield Finding((*location, "rate"), rule, "raise it, or lengthen the flight")
+    elif shots > SHOTS_MAX:
+        rule = f"makes {shots:.3g} shots {flight}, and a scanner has at most {SHOTS_MAX:.0e}"
+        remedy = "lower the rate, or shorten the flight: mind times and speeds in platform.path"
+        yield Finding((*location, "rate"), rule, remedy)
 
 
 # Axes: what may vary while the light falls where it fell

@@ -444,6 +444,10 @@ _LEFT = re.compile(
 HIDDEN = -1
 
 
+PID_MAX = 2**31 - 1
+"""Largest number of a process that a system can give."""
+
+
 def process_start(pid: int) -> int:
     """Start of a process, which tells it from others that had its number; no clock changes it.
 
@@ -452,6 +456,8 @@ def process_start(pid: int) -> int:
     """
     import psutil
 
+    if not 0 < pid <= PID_MAX:  # a lock may name any number
+        return 0
     if sys.platform == "linux":
         try:
             content = Path(f"/proc/{pid}/stat").read_bytes()
@@ -668,6 +674,13 @@ def reason(error: OSError, place: object) -> str:
     if error.errno == errno.ENOSPC and isinstance(place, Path) and _lacks_inodes(place):
         return NO_INODES
     return words
+
+
+def write_remedy(error: OSError, place: object, otherwise: str) -> str:
+    """Return what to do where a place can't be written: by the error, or else as is proposed."""
+    if NO_INODES in (error.strerror, reason(error, place)):
+        return "remove files from its disk, or have one with more inodes"
+    return REMEDIES.get(error.errno or 0, otherwise)
 
 
 def _lacks_inodes(place: Path) -> bool:

@@ -22,6 +22,7 @@ import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -29,7 +30,7 @@ import numpy as np
 from zarr.storage import StorePath
 
 from sweep.documents import parse_json
-from sweep.messages import SPEC, STORE, PrintableError, suggestion
+from sweep.messages import SPEC, STORE, PrintableError, one_line, suggestion
 from sweep.plain_files import UnfitFileError, kind_of, open_plain, pieces_below
 from sweep.storage.chunks import (
     DOCUMENT_BYTES_MAX,
@@ -75,6 +76,8 @@ _KINDS = {
 """Attributes of each kind of store, besides those of all."""
 
 _REQUIRED = ("study_id", "model_version", "software")
+
+_STUDY_ID = re.compile(r"[0-9a-f]{32}")
 
 _NOT_TEXT = {"shots_a_cycle": int, "scanners": list, "surfaces": list}
 
@@ -153,6 +156,9 @@ def recognised(path: Location, attributes: Any) -> dict[str, Any]:
     text = ours | {"software": versions_text(ours.get("software"))}
     if any(type(text.get(name)) is not _NOT_TEXT.get(name, str) for name in needed):
         raise NotAStoreError(f"{path} is a Zarr store, but not one that sweep made")
+    if not _STUDY_ID.fullmatch(ours["study_id"]):
+        why = f"its study_id is {ours['study_id'][:40]!r}, and no digest"
+        raise NotAStoreError(f"{path} is not as sweep writes stores: {why}{remedy(path)}")
     return ours
 
 
@@ -209,9 +215,27 @@ def _document(path: Location) -> dict[str, Any]:
         what = f"a file, and no Zarr store of sweep's: {run} computes a spec into one"
         raise NotAStoreError(f"{path} is {what}{_near(path)}")
     run = suggestion("run", SPEC, store=STORE)
-    raise NotAStoreError(
-        f"{path} is not a Zarr store of sweep's: {run} computes a spec into one{_near(path)}"
-    )
+    what = "is not a Zarr store of sweep's"
+    if names := _first_names(path):
+        raise NotAStoreError(
+            f"{path} {what}, and has files in it ({names}): name another place, as {run} computes "
+            f"a spec into a new or an empty folder{_near(path)}"
+        )
+    raise NotAStoreError(f"{path} {what}: {run} computes a spec into one{_near(path)}")
+
+
+_NAMES_SHOWN = 3
+
+
+def _first_names(path: Location) -> str:
+    """Names of the first files and folders in a folder; '' for none."""
+    if not isinstance(path, Path) or not path.is_dir():
+        return ""
+    with suppress(OSError), os.scandir(path) as entries:
+        names = sorted(entry.name for entry in islice(entries, _NAMES_SHOWN + 1))
+        shown = ", ".join(one_line(name) for name in names[:_NAMES_SHOWN])
+        return f"{shown}, ..." if len(names) > _NAMES_SHOWN else shown
+    return ""
 
 
 def _parsed(path: Location, name: str) -> Any:

@@ -441,9 +441,9 @@ WATCH = 35.0
 LOCK_BYTES_MAX = 1 << 16
 
 #: Errors of file systems that have no flock (Lustre without it, some NFS), or no hard links (FUSE,
-#: SMB, exFAT).
+#: SMB, exFAT; a file system of several disks may say that the link leads to another one).
 NO_FLOCK = {errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP}
-NO_LINK = {errno.EPERM, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP}
+NO_LINK = {errno.EPERM, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EXDEV, errno.EMLINK}
 
 _left: set[str] = set()
 """Tokens of locks that this process has given up, which a store out of reach may not know."""

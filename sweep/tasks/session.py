@@ -38,7 +38,7 @@ from sweep.spec.clusters import (
 )
 from sweep.spec.rules import near_miss
 from sweep.spec.sections import Execution
-from sweep.storage.locations import NO_INODES, REMEDIES, Location, ObjectStoreError, reason
+from sweep.storage.locations import Location, ObjectStoreError, reason, write_remedy
 from sweep.storage.opening import read_receipts
 from sweep.tasks import journal, store
 from sweep.tasks.interrupts import Interrupts
@@ -603,10 +603,8 @@ def unwritable(path: Location, error: OSError) -> str:
         return f"the store can't be written: {error.strerror}"
     if not _is_there(path):
         return f"{path} is no longer there: have its disk back, or its folder"
-    words, remedy = reason(error, path), REMEDIES.get(error.errno or 0, "see to its disk")
-    if words == NO_INODES:
-        remedy = "remove files from its disk, or have one with more inodes"
-    return f"the store can't be written ({words}): {remedy}"
+    remedy = write_remedy(error, path, "see to its disk")
+    return f"the store can't be written ({reason(error, path)}): {remedy}"
 
 
 def _is_there(path: Location) -> bool:

@@ -36,7 +36,6 @@ from sweep.storage.chunks import DraftFiles, packed_bytes_max
 from sweep.storage.foreign import foreign_names, is_litter
 from sweep.storage.locations import (
     JOURNAL,
-    REMEDIES,
     Location,
     ObjectPath,
     discard,
@@ -51,6 +50,7 @@ from sweep.storage.locations import (
     reason,
     settle,
     successor,
+    write_remedy,
 )
 from sweep.storage.opening import (
     LAYOUT,
@@ -119,7 +119,7 @@ def create(
     except OSError as error:
         if error.errno in (errno.ENOTEMPTY, errno.EEXIST) and path.exists():
             raise BusyError(f"{path} is there already: another process has made it") from error
-        remedy = REMEDIES.get(error.errno or 0, f"name another place, {option_name('store')}")
+        remedy = write_remedy(error, path, f"name another place, {option_name('store')}")
         raise StoreError(f"{path} can't be made: {error.strerror or error}; {remedy}") from error
     return path
 

@@ -245,12 +245,26 @@ def test_times_and_projections_of_a_scenes_files(tmp_path):
     assert not las.header.global_encoding.wkt and not las.header.vlrs.get("WktCoordinateSystemVlr")
 
 
-@pytest.mark.parametrize(("crs", "stated"), [
-    ("EPSG:32633", True), ("EPSG:2232", False), ("EPSG:3857", False), ("EPSG:4326", False),
+@pytest.mark.parametrize(("crs", "metres_per_unit", "stated"), [
+    ("EPSG:32633", None, True), ("EPSG:2232", None, False), ("EPSG:4326", None, False),
+    ("EPSG:3857", (0.5, 0.5), False), ("EPSG:3413", (1.03, 1.03), False),
 ])  # fmt: skip
-def test_only_projections_in_metres_are_those_of_a_scene(tmp_path, crs, stated):
+def test_only_projections_in_metres_are_those_of_a_scene(tmp_path, crs, metres_per_unit, stated):
     shape = {"height": 3, "width": 3, "count": 1, "dtype": "float64"}
     corner = rasterio.Affine(1, 0, 5, 0, -1, 5)
     with rasterio.open(tmp_path / "a.tif", "w", driver="GTiff", crs=crs, transform=corner, **shape):
         pass
-    assert bool(projection_in_metres(tmp_path / "a.tif")) == stated
+    assert bool(projection_in_metres(tmp_path / "a.tif", metres_per_unit)) == stated
+
+
+def test_a_projection_is_that_of_coordinates_as_they_are_exported(tmp_path):
+    """Stated sizes scale a scene's coordinates, and feet of height are turned into metres."""
+    shape = {"height": 3, "width": 3, "count": 1, "dtype": "float64"}
+    corner = rasterio.Affine(1, 0, 5e5, 0, -1, 4e6)
+    path = tmp_path / "a.tif"
+    with rasterio.open(path, "w", driver="GTiff", crs="EPSG:32613+6360", transform=corner, **shape):
+        pass
+    assert projection_in_metres(path, (1.001, 1.0)) == ""
+    stated = projection_in_metres(path, (1.0, 1.0))
+    assert rasterio.crs.CRS.from_wkt(stated) == rasterio.crs.CRS.from_epsg(32613)
+    assert "foot" not in stated and projection_in_metres(path) == stated

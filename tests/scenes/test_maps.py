@@ -139,6 +139,46 @@ def test_a_vertical_reference_system_tells_the_unit_of_heights(survey):
         read_raster(path, height_unit="ft")
 
 
+def test_a_band_that_contradicts_its_vertical_reference_system_is_refused(survey):
+    feet = pyproj.CRS("EPSG:32613+6360").to_wkt("WKT1_GDAL")  # NAVD88 height, US survey feet
+    place = (500_000.0, 4_300_000.0), 10.0
+    with pytest.raises(SceneError, match=r"contradicts itself.*'m'.*NAVD88.*US survey foot"):
+        read_raster(survey(feet, *place, 1.0, unit="m"))
+    # Either foot is written as 'ft'; the reference system tells which.
+    ground = read_raster(survey(feet, *place, 1.0, name="ft.tif", unit="ft"))
+    assert slope(ground) == pytest.approx(SLOPE * 1200 / 3937, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "said"),
+    [
+        ("EPSG:32613+5703", "EPSG:32613+5773", "'EGM96 height', and a above 'NAVD88 height'"),
+        ("EPSG:32613+5703", "3d", "'ellipsoid WGS 84', and a above 'NAVD88 height'"),
+        ("EPSG:32613+5703", "EPSG:32613+6360", ""),  # NAVD88 in feet
+        ("EPSG:32613+5703", "EPSG:32613", ""),
+        ("3d", "3d", ""),
+    ],
+)
+def test_heights_above_two_surfaces_are_refused(survey, one, other, said):
+    def map_frame(text, name):
+        crs = pyproj.CRS("EPSG:32613").to_3d() if text == "3d" else pyproj.CRS(text)
+        path = survey(crs.to_wkt(), (500_000.0, 4_300_000.0), 10.0, 1.0, name=f"{name}.tif")
+        return name, read_raster(path).map_frame
+
+    pair = [map_frame(one, "a"), map_frame(other, "b")]
+    if not said:
+        require_one_map(pair)
+        return
+    with pytest.raises(SceneError, match=said):
+        require_one_map(pair)
+
+
+def test_a_remedy_near_a_pole_names_no_zone_of_utm(survey):
+    path = survey("EPSG:3413", (0.0, 0.0), 100.0, 1.03)
+    with pytest.raises(SceneError, match=r"-t_srs '\+proj=stere \+lon_0=\S+ \+lat_0=(90|89\.99)"):
+        read_raster(path)
+
+
 def test_depths_are_no_heights(survey):
     depth = pyproj.CRS("EPSG:32633+5715").to_wkt("WKT1_GDAL")  # mean sea level depth
     with pytest.raises(SceneError, match=r"holds depths.*'MSL depth'"):

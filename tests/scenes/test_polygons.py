@@ -126,6 +126,20 @@ def test_stars_and_bow_ties_are_refused(outline, said):
         cut(flat(outline))
 
 
+def test_a_hole_has_to_be_gone_round_against_its_outline():
+    """A square of 4 x 4 with a hole of 2 x 2, reached by a bridge."""
+    outline = [[0, 0], [4, 0], [4, 4], [0, 4], [0, 0]]
+    hole = [[1, 1], [1, 3], [3, 3], [3, 1], [1, 1]]
+    points = flat(outline + hole)
+    assert areas(points, cut(points).faces).sum() == pytest.approx(12.0, rel=1e-12)
+    with pytest.raises(PolygonError, match="face 1 of 10 corners covers a part of its plane twice"):
+        cut(flat(outline + hole[::-1]))
+    turn = np.arange(40) * np.pi / 10
+    spiral = np.column_stack([np.cos(turn), np.sin(turn)]) * (1 + turn / 100)[:, None]
+    with pytest.raises(PolygonError, match="covers a part of its plane twice"):
+        cut(flat(spiral))
+
+
 def test_a_face_that_names_a_vertex_that_does_not_exist_is_refused_with_its_number(tmp_path):
     write_obj(tmp_path / "a.obj", flat(U), [[0, 1, 2], [0, 1, 2, 98]])
     with pytest.raises(SceneError, match="face 2 names the vertex 99 of 8"):

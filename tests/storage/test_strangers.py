@@ -131,6 +131,19 @@ def test_every_command_refuses_a_hostile_store_in_one_line(theirs, tmp_path, mon
     assert sorted(os.listdir(tmp_path)) == ["theirs.zarr"]
 
 
+@pytest.mark.parametrize("study_id", ["\x1b[31mred", "", "a study", "0" * 33])
+def test_an_id_that_is_no_digest_is_told_by_every_command_that_reads(theirs, study_id):
+    path = theirs / "zarr.json"
+    document = json.loads(path.read_text())
+    document["attributes"]["study_id"] = study_id
+    path.write_text(json.dumps(document))
+    with pytest.raises(NotAStoreError, match=r"its study_id is .*, and no digest"):
+        sweep.open(theirs)
+    for command in ("status", "report", "figures"):
+        told = CliRunner().invoke(main, [command, str(theirs)], catch_exceptions=False)
+        assert told.exit_code == 2 and "no digest" in told.output and "\x1b" not in told.output
+
+
 def test_metadata_of_single_arrays_are_not_read(theirs):
     """Those of the root's document are, which are checked."""
     (theirs / ".sweep" / "template.jsonl").unlink()  # has digests of them, which they can forge

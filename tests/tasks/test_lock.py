@@ -67,6 +67,13 @@ def test_a_pid_used_again_by_another_process_does_not_keep_a_lock_alive(tmp_path
     mine.release()
 
 
+@pytest.mark.parametrize("pid", [-1, 0, 2**31, 10**30])
+def test_a_lock_of_a_number_that_no_process_can_have_is_taken_over(tmp_path, pid):
+    put(tmp_path, replace(Holder.myself(), pid=pid))
+    assert not is_live(tmp_path, holder(tmp_path))
+    Lock(tmp_path).release()
+
+
 @pytest.mark.parametrize(("age", "live"), [(0.0, True), (60.0, True), (600.0, False)])
 def test_on_another_host_the_heartbeat_decides(tmp_path, monkeypatch, age, live):
     monkeypatch.setattr(journal, "WATCH", 0.1)
@@ -337,7 +344,9 @@ def test_a_file_system_without_flock_is_warned_of_once_and_used(tmp_path, monkey
     assert len(said) == 1
 
 
-@pytest.mark.parametrize("number", [errno.EPERM, errno.ENOSYS, errno.ENOTSUP])
+@pytest.mark.parametrize(
+    "number", [errno.EPERM, errno.ENOSYS, errno.ENOTSUP, errno.EXDEV, errno.EMLINK]
+)
 def test_a_file_system_without_links_is_warned_of_once_and_used(tmp_path, monkeypatch, number):
     """As FUSE and SMB have none, and exFAT."""
     monkeypatch.setattr(os, "link", fails(number))

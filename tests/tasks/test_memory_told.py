@@ -177,12 +177,17 @@ def test_the_memory_of_a_plan_counts_a_point():
         ({"platform": {"path": {
             "kind": "straight", "from": ["0 m", "0 m", "100 m"], "to": ["10 m", "0 m", "100 m"],
             "initial_speed": "1e-12 m/s"}}}, r"scanners\.\w+\.rate: makes .* shots"),
+        ({"platform": {"path": {
+            "kind": "waypoints", "file": "path.csv"}}}, r"scanners\.\w+\.rate: makes .* shots"),
         ({"draws": {"number": 10**9}}, r"draws\.number: makes .* shots in all draws"),
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("use", [runs, study_of])
-def test_a_flight_of_too_many_shots_is_refused(changes, told, use, tmp_path):
-    spec = small_scene(**changes)
+def test_a_flight_of_too_many_shots_is_refused(changes, told, use, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "path.csv").write_text(
+        "time [s],x [m],y [m],z [m]\n1e300,0,0,100\n2e300,10,0,100\n"
+    )
     with pytest.raises(SpecError, match=told):
-        use(spec, tmp_path / "huge.zarr")
+        use(small_scene(**changes), tmp_path / "huge.zarr")
     assert not (tmp_path / "huge.zarr").exists()

@@ -71,6 +71,24 @@ def test_errors_of_navigation_that_are_not_stated_are_named(changes, notes):
     assert all(words in sentence for words, sentence in zip(notes, sentences, strict=True))
 
 
+@pytest.mark.parametrize(("speed", "speckle", "bins"), [
+    ("90 m/s", "developed", "4.9"), ("60 m/s", "developed", "2.5"),
+    ("60 m/s", "none", ""), ("45 m/s", "developed", ""),
+])  # fmt: skip
+def test_braking_that_drifts_speckled_lines_over_bins_is_named(speed, speckle, bins):
+    """From a height of 1,100 to 1,000 m at 20, 10 and 2 m/s^2: 2 a T^2 / lambda."""
+    final = {"90 m/s": "64 m/s", "60 m/s": "40 m/s", "45 m/s": "40 m/s"}[speed]
+    path = {"kind": "straight", "from": ["0 m", "0 m", "1100 m"], "to": ["0 m", "0 m", "1000 m"],
+            "initial_speed": speed, "final_speed": final}  # fmt: skip
+    sentences = spec_of(
+        instrument="lander_ndl", platform={"path": path},
+        error_floor=STATED | {"range_noise": "1 m"},
+        footprint={"beamlets": 19, "speckle": speckle},
+    ).unstated_errors()  # fmt: skip
+    assert len(sentences) == bool(bins)
+    assert not bins or f"drifts lines by up to {bins} bins" in sentences[0]
+
+
 def test_plan_run_and_report_say_that_a_flight_has_no_floor(tmp_path):
     sections = {"draws": {"number": 2}}
     for name, floor, number in (("without", {}, 1), ("with", {"error_floor": STATED}, 0)):
