@@ -33,6 +33,7 @@ PICTURES = (
     Picture("detection.png", "quickstart", "detection"),
     Picture("reach.png", "quickstart", "reach"),
     Picture("descent.png", "descent", "descent"),
+    Picture("scan_patterns.png", "scan_pattern_comparison", "velocity_dim"),
 )
 
 

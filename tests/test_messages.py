@@ -86,12 +86,18 @@ def test_versions_and_ids_in_a_store_are_told_in_printable_text(tmp_path):
     store = tmp_path / "a.zarr"
     assert quiet(small(), store).complete
     document = json.loads((store / "zarr.json").read_text())
-    document["attributes"] |= {"study_id": HOSTILE, "title": HOSTILE}
     software = document["attributes"]["software"]
-    document["attributes"]["software"] = f"{software}, {HOSTILE} {HOSTILE}"
+    document["attributes"] |= {
+        "title": HOSTILE, "software": f"{software}, {HOSTILE} {HOSTILE}",
+    }  # fmt: skip
     (store / "zarr.json").write_text(json.dumps(document))
     told("status", store)
     told("resume", store, exit_code=2)
+    told("verify", store, exit_code=1)
+    document["attributes"]["study_id"] = HOSTILE
+    (store / "zarr.json").write_text(json.dumps(document))
+    for command in ("status", "resume", "report"):
+        told(command, store, exit_code=2)
     told("verify", store, exit_code=1)
     with pytest.raises(StoreError) as caught:
         sweep.resume(store)

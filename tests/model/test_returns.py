@@ -19,6 +19,7 @@ from sweep.model.returns import (
     WHOLE,
     How,
     Known,
+    Workspace,
     beamlet_lines,
     draw_peaks,
     draw_returns,
@@ -304,7 +305,7 @@ def _up_in_noise(centre, magnitude, levels, tables, half, *, low=0, others=0.0, 
         address = key[0], key[1], number
         count = draw_peaks(
             address, (0, 0), how, known, seen, LeakedPeaks.nothing(1), np.ones((1, 3)),
-            no_speckle(1), tables, peaks, which, np.zeros(1, bool),
+            no_speckle(1), tables, Workspace.of(3, 1), peaks, which, np.zeros(1, bool),
         )  # fmt: skip
         return peaks[0].copy() if count else None
 
