@@ -108,7 +108,8 @@ def bin_correlation(window: Window, lines: LineSpread) -> np.ndarray:
     correlation = _gaussian_correlation(window, lines).astype(complex)
     integrate_correlation(
         np.flatnonzero(is_resolved), end, np.stack(lines.distance), np.stack(lines.spread),
-        lines.turn, lines.lean, transform_table(window)[1], _NODE, _WEIGHT, correlation,
+        lines.turn, lines.lean, transform_table(window)[1], OVERSAMPLING, _NODE, _WEIGHT,
+        correlation,
     )  # fmt: skip
     return correlation
 

@@ -8,12 +8,11 @@ import math
 import numpy as np
 
 from sweep.kernels import njit
-from sweep.model.speckle_correlation import OVERSAMPLING
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def integrate_correlation(
-    points, end, distance, spread, turn, lean, transform, nodes, weights, correlation
+    points, end, distance, spread, turn, lean, transform, oversampling, nodes, weights, correlation
 ):
     """Integrate equation (3) at some points, into ``correlation`` (n,) complex.
 
@@ -24,9 +23,9 @@ def integrate_correlation(
     end
         (n,): half-width of the interval of y [standard deviations of the beam].
     distance, spread, turn, lean
-        Of :class:`LineSpread`, the first two (2, n).
-    transform
-        G of :func:`transform_table`.
+        Of :class:`sweep.model.speckle_correlation.LineSpread`, the first two (2, n).
+    transform, oversampling
+        G of :func:`sweep.model.speckle_correlation.transform_table`, and its values per bin.
     nodes, weights
         Of a rule of quadrature on -1 .. 1.
     """
@@ -40,8 +39,8 @@ def integrate_correlation(
         for j in range(nodes.size):
             y = last * nodes[j]
             share = power[j] * max(1.0 + lean[i] * y, 0.0)
-            first = _transform_at(distance[0, i] - spread[0, i] * y, transform)
-            second = _transform_at(distance[1, i] - spread[1, i] * y, transform)
+            first = _transform_at(distance[0, i] - spread[0, i] * y, transform, oversampling)
+            second = _transform_at(distance[1, i] - spread[1, i] * y, transform, oversampling)
             both = share * first * second
             re += both * math.cos(turn[i] * y)
             im += both * math.sin(turn[i] * y)
@@ -52,9 +51,9 @@ def integrate_correlation(
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _transform_at(distance, transform):
+def _transform_at(distance, transform, oversampling):
     """Interpolate G, tabulated from 0 on, at a distance [bins of fs/L]; 0 beyond the table."""
-    place = abs(distance) * OVERSAMPLING
+    place = abs(distance) * oversampling
     if place >= transform.size - 1:
         return transform[transform.size - 1] if place == transform.size - 1 else 0.0
     k = int(place)

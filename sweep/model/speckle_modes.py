@@ -79,15 +79,15 @@ def mode_table(shape: Window, fft_size: int) -> ModeTable:
             lines = offset + deviation * node
             of_bins = window_transform(shape, bins[:, None] - lines)
             # Sums, not products of matrices, whose order depends on the number of threads.
-            covariance = np.zeros((bins.size, bins.size))
+            power, beside = np.zeros(bins.size), np.zeros(bins.size - 1)
             for b in range(node.size):
-                covariance += weight[b] * of_bins[:, b, None] * of_bins[None, :, b]
-            power = np.maximum(np.diag(covariance), 1e-300)
-            mode = _strongest_mode(covariance)
+                power += weight[b] * of_bins[:, b] ** 2
+                beside += weight[b] * of_bins[1:, b] * of_bins[:-1, b]
+            power = np.maximum(power, 1e-300)
+            mode = _strongest_mode(of_bins, weight, np.sqrt(power))
             share[s, d] = np.minimum(mode**2 / power, 1.0)
             lean[s, d] = lean_of(*np.sqrt(power[half - 1 : half + 2]))
-            scale = np.sqrt(power[1:]) * np.sqrt(power[:-1])
-            coherence[s, d, 1:] = np.diag(covariance, 1) / scale
+            coherence[s, d, 1:] = beside / (np.sqrt(power[1:]) * np.sqrt(power[:-1]))
     # Of a lone line, in bins where its transform is 0 as well.
     share[0], coherence[0] = 1.0, np.where(coherence[0] < 0, -1.0, 1.0)
     coherence[:, :, 0] = coherence[:, :, 1]
@@ -102,12 +102,24 @@ def _gaussian_nodes(spread: float) -> tuple[np.ndarray, np.ndarray]:
     return node, weight / weight.sum()
 
 
-def _strongest_mode(covariance: np.ndarray) -> np.ndarray:
-    """Return the leading eigenvector scaled by the root of its eigenvalue, by power iteration."""
-    mode = np.sqrt(np.diag(covariance))
-    value = 1.0
+def _strongest_mode(of_bins: np.ndarray, weight: np.ndarray, mode: np.ndarray) -> np.ndarray:
+    """Return the leading eigenvector of a covariance, times the root of its eigenvalue.
+
+    Power iteration from ``mode`` (bins,). The covariance is the sum of the amplitudes (bins, lines)
+    of each line's bins with themselves, by the weights (lines,) of the lines' powers. It is not
+    formed if there are more bins than lines: of padded spectra it has millions of elements.
+    """
+    covariance, value = None, 1.0
+    if len(of_bins) <= weight.size:
+        covariance = np.zeros((len(of_bins), len(of_bins)))
+        for b in range(weight.size):
+            covariance += weight[b] * of_bins[:, b, None] * of_bins[None, :, b]
     for _ in range(_ITERATIONS):
-        after = (covariance * mode).sum(axis=1)
+        if covariance is None:
+            of_lines = weight * (of_bins * mode[:, None]).sum(axis=0)
+            after = (of_bins * of_lines).sum(axis=1)
+        else:
+            after = (covariance * mode).sum(axis=1)
         value = math.sqrt((after**2).sum())
         mode = after / max(value, 1e-300)
     return mode * math.sqrt(value)
