@@ -12,7 +12,7 @@ from pathlib import Path
 import numba
 import numpy as np
 import pytest
-from numba.core.errors import TypingError
+from numba.core.errors import NumbaError, TypingError
 
 import sweep
 import sweep.kernels
@@ -373,7 +373,8 @@ def test_a_kernel_that_borrows_returns_no_array(returns_array):
 
 def test_a_kernel_that_borrows_makes_no_array():
     kernel = sweep.kernels.njit(cache=True, borrows=True)(_doubled)
-    with pytest.raises(TypingError, match="NRT required"):
+    # The kind of error depends on what has been compiled before.
+    with pytest.raises(NumbaError, match="NRT required"):
         kernel(np.ones((2, 3)))
 
 
