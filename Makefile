@@ -56,20 +56,20 @@ lint: $(READY)
 	$(BIN)/mypy --disable-error-code arg-type --disable-error-code index benchmarks
 
 # Once for all processes of tests, which would each compile the same.
-$(KERNELS): $(READY) sweep/kernels.py $(shell grep -rl --include='*.py' njit sweep)
+$(KERNELS): $(READY) sweep/kernel_cache.py $(shell grep -rl --include='*.py' njit sweep)
 	$(MAKE) compile-grids compile-flights
 	touch $@
 
 compile-%: $(READY)
-	$(BIN)/python tests/compiling.py $*
+	$(BIN)/python tests/compile_kernels.py $*
 
 # Lines, modules and compiled functions, and the modules that a run of a grid and of a flight enters.
 size: $(READY)
-	$(BIN)/python tests/house_size.py
-	$(BIN)/python tests/modules_entered.py experiments/quickstart.yaml experiments/square_low_descent.yaml
+	$(BIN)/python tests/code_size.py
+	$(BIN)/python tests/list_entered_modules.py experiments/quickstart.yaml experiments/square_low_descent.yaml
 
 stability: $(READY)
-	PYTHONPATH=tests $(BIN)/python tests/stability/stability_table.py
+	PYTHONPATH=tests $(BIN)/python tests/stability/write_stability_page.py
 
 # 200 random specs in developed speckle, compared with drawn scatterers; some six minutes. SEED has others.
 validate-speckle: $(READY)
@@ -88,33 +88,33 @@ chaos: $(READY)
 # What the engine costs beside others', and what a second worker brings; on a quiet machine.
 peers: $(READY)
 	$(BIN)/pip install --quiet joblib xyzpy
-	$(BIN)/python benchmarks/peers.py
+	$(BIN)/python benchmarks/engine_comparison.py
 
 scaling: $(READY)
-	$(BIN)/python benchmarks/scaling.py
+	$(BIN)/python benchmarks/worker_scaling.py
 
 effects: $(READY)
-	$(BIN)/python benchmarks/effects.py
+	$(BIN)/python benchmarks/effects_page.py
 
 # Time a point against model 19, ratios of one run on one machine.
 side-by-side: $(READY)
 	$(BIN)/pip install --quiet embreex  # which model 19 casts rays with
-	$(BIN)/python benchmarks/side_by_side.py
+	$(BIN)/python benchmarks/version_timing.py
 
 # Smooth points and flights against a commit, and points in developed speckle against smooth ones;
 # a quarter of an hour.
 EARLIER ?= 7881fb1
 speckle-time: $(READY)
-	$(BIN)/python benchmarks/side_by_side.py --group speckle --earlier $(EARLIER) --rounds 3
+	$(BIN)/python benchmarks/version_timing.py --group speckle --earlier $(EARLIER) --rounds 3
 
 scale: $(READY)
-	$(BIN)/python benchmarks/scale.py
+	$(BIN)/python benchmarks/engine_limits.py
 
 million: $(READY)
-	$(BIN)/python benchmarks/million.py
+	$(BIN)/python benchmarks/million_blocks.py
 
 stopping: $(READY)
-	$(BIN)/python benchmarks/stopping.py
+	$(BIN)/python benchmarks/stopping_rule.py
 
 # Answers of this version against those of model 19, some 40,000 points, first computed where they
 # are missing. A quarter of an hour each.
@@ -128,23 +128,23 @@ frozen: $(READY)
 	$(BIN)/python benchmarks/frozen_answers.py compare $(FROZEN).npz --points $(POINTS)
 
 promise: $(READY)
-	$(BIN)/python benchmarks/promise.py
+	$(BIN)/python benchmarks/tolerance_page.py
 
 detectors: $(READY)
-	$(BIN)/python benchmarks/detectors.py
+	$(BIN)/python benchmarks/detectors_page.py
 
 accuracy: $(READY)
-	$(BIN)/python benchmarks/accuracy.py
+	$(BIN)/python benchmarks/accuracy_page.py
 
 # docs/validation.md from the stores in results/; those that are missing are computed first.
 validation: $(READY)
-	for name in $$($(BIN)/python benchmarks/validation.py --missing); do \
+	for name in $$($(BIN)/python benchmarks/validation_page.py --missing); do \
 	  $(BIN)/sweep run experiments/$$name.yaml || exit 1; done
-	$(BIN)/python benchmarks/validation.py
+	$(BIN)/python benchmarks/validation_page.py
 
 # docs/instruments.md: each instrument of the library, published against simulated; a minute or two.
 instruments: $(READY)
-	$(BIN)/python benchmarks/instruments.py
+	$(BIN)/python benchmarks/instruments_page.py
 
 # The site, from the pages in docs/, in build/site; what is amiss in a page is an error.
 docs: $(READY)

@@ -15,89 +15,97 @@ import time
 from pathlib import Path
 
 import numpy as np
+from benchmark_helpers import experiment_spec
 from scipy.special import ndtr
-from shared import experiment
 
-ANGLES, CHUNK = 90, 65_536
-BYTES_A_POINT = 8 * 27 + 4
+N_ANGLES, BLOCK_POINTS = 90, 65_536
+BYTES_PER_POINT = 8 * 27 + 4
 """27 arrays of floats and one of flags."""
 
 
-def spec_of(gigabytes, block_points=CHUNK, powers=100, figures=()):
+def spec_of_size(gigabytes, block_points=BLOCK_POINTS, powers=100, figures=()):
     """A study of about so many GB of results."""
-    ranges = max(2, round(gigabytes * 1e9 / BYTES_A_POINT / ANGLES / powers))
-    return experiment(
+    ranges = max(2, round(gigabytes * 1e9 / BYTES_PER_POINT / N_ANGLES / powers))
+    return experiment_spec(
         "range_angle_coarse",
         title="Made up",
         axes={
             "instrument.laser.power": {"log": ["1 W", "10 W"], "number": powers},
             "target.range": {"linear": ["100 m", "20 km"], "number": ranges},
-            "target.grazing_angle": {"linear": ["20 deg", "90 deg"], "number": ANGLES},
+            "target.grazing_angle": {"linear": ["20 deg", "90 deg"], "number": N_ANGLES},
         },
         storage={"block_points": block_points},
         figures=list(figures),
     )
 
 
-def make(path, spec):
+def make_store(path, spec):
     """The store, every block written with the closed form of `deviate`; its size [B]."""
-    from sweep.tasks import store
-    from sweep.tasks.grid_study import GridStudy
+    from sweep.tasks.engine import study_store
+    from sweep.tasks.studies.grid_study import GridStudy
 
     study = GridStudy(spec)
-    store.create(path, study)
-    arrays, receipts = store.Arrays(path, study), []
+    study_store.create_store(path, study)
+    arrays, receipts = study_store.BlockWriter(path, study), []
     for block in range(study.n_blocks):
-        extent, p = study.grid.extent(block), study.grid.parameters(block)
-        z = deviate(p["target.range"], p["target.grazing_angle"], p["instrument.laser.power"])
-        z = z.reshape(extent)
+        extent, parameters = study.grid.block_extent(block), study.grid.parameters(block)
+        deviates = pd_deviate(
+            parameters["target.range"],
+            parameters["target.grazing_angle"],
+            parameters["instrument.laser.power"],
+        )
+        deviates = deviates.reshape(extent)
         # What is only summarised packs well, to spare the disk.
-        results = dict.fromkeys(study.chunks(block), np.round(z))
-        results |= {"pd_shot": ndtr(z), "miss_shot": ndtr(-z), "effects": np.zeros(extent, "u4")}
+        results = dict.fromkeys(study.chunk_positions(block), np.round(deviates))
+        results |= {
+            "pd_shot": ndtr(deviates),
+            "miss_shot": ndtr(-deviates),
+            "effects": np.zeros(extent, "u4"),
+        }
         arrays.write(block, results)
         receipt = {"block": block, "points": study.block_size(block), "time": 0.0}
         receipts.append(json.dumps(receipt) + "\n")
     (Path(path) / ".sweep" / "receipts.jsonl").write_text("".join(receipts))
-    return study.points * BYTES_A_POINT
+    return study.n_points * BYTES_PER_POINT
 
 
-def deviate(distance, grazing_angle, power):
-    """Normal deviate of the made-up pd: z(0.9) at :func:`farthest`."""
-    return 1.2815515655446004 + 8 * (1 - distance / farthest(grazing_angle, power))
+def pd_deviate(distance, grazing_angle, power):
+    """Normal deviate of the made-up pd: z(0.9) at :func:`range_at_pd_90`."""
+    return 1.2815515655446004 + 8 * (1 - distance / range_at_pd_90(grazing_angle, power))
 
 
-def farthest(grazing_angle, power):
+def range_at_pd_90(grazing_angle, power):
     """Range [m] at which the made-up pd is 0.9."""
     return 6000 * np.sqrt(power) * np.sin(grazing_angle) ** 0.5
 
 
-def peak_mb():
+def peak_memory_mb():
     """Largest resident size of this process."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def reduce(path):
+def reduce_store(path):
     """Summary and maximum range of a store; seconds, and the largest error of the range [m]."""
     import dask.array  # noqa: F401
     import zarr  # noqa: F401
 
     import sweep
-    import sweep.analysis.opening
+    import sweep.analysis.datasets
 
-    idle, begun = peak_mb(), time.perf_counter()
+    idle_memory_mb, start = peak_memory_mb(), time.perf_counter()
     dataset = sweep.open(path)
-    whole = dataset.sweep.summary().compute()
-    limit = dataset.sweep.maximum_range().unbroken.compute()
-    taken = time.perf_counter() - begun
-    exact = farthest(np.deg2rad(limit.grazing_angle), limit.power)
-    inside = limit.notnull()
-    assert inside.any()
+    summary = dataset.sweep.summary().compute()
+    maximum_range = dataset.sweep.maximum_range().unbroken.compute()
+    seconds = time.perf_counter() - start
+    exact_range = range_at_pd_90(np.deg2rad(maximum_range.grazing_angle), maximum_range.power)
+    has_range = maximum_range.notnull()
+    assert has_range.any()
     return {
-        "seconds": taken,
-        "points": int(whole.pd_shot.sel(statistic="number")),
-        "error": float(abs(limit - exact).where(inside).max()),
-        "idle_mb": idle,
-        "peak_mb": peak_mb(),
+        "seconds": seconds,
+        "points": int(summary.pd_shot.sel(statistic="number")),
+        "error": float(abs(maximum_range - exact_range).where(has_range).max()),
+        "idle_mb": idle_memory_mb,
+        "peak_mb": peak_memory_mb(),
     }
 
 
@@ -108,21 +116,24 @@ def main():
     parser.add_argument("--read", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.read:
-        print(json.dumps(reduce(options.read)))
+        print(json.dumps(reduce_store(options.read)))
         return
     with tempfile.TemporaryDirectory(dir=options.directory) as directory:
         path = Path(directory) / "big.zarr"
-        begun = time.perf_counter()
-        size = make(path, spec_of(options.gigabytes))
+        start = time.perf_counter()
+        uncompressed_bytes = make_store(path, spec_of_size(options.gigabytes))
         on_disk = sum(f.stat().st_size for f in path.rglob("*") if f.is_file())
-        print(f"{size / 1e9:.2f} GB of results made in {time.perf_counter() - begun:.0f} s, "
-              f"{on_disk / 1e9:.2f} GB on disk")  # fmt: skip
+        print(
+            f"{uncompressed_bytes / 1e9:.2f} GB of results made in "
+            f"{time.perf_counter() - start:.0f} s, "
+            f"{on_disk / 1e9:.2f} GB on disk"
+        )
         command = [sys.executable, __file__, "--read", str(path)]
-        found = json.loads(subprocess.run(command, check=True, capture_output=True).stdout)
-    print(f"{found['points']:,} points: summary, maximum range: {found['seconds']:.0f} s")
-    print(f"largest resident size {found['peak_mb']:.0f} MB "
-          f"({found['idle_mb']:.0f} MB of it with nothing read)")  # fmt: skip
-    print(f"largest error of the maximum range {found['error']:.2g} m")
+        reduction = json.loads(subprocess.run(command, check=True, capture_output=True).stdout)
+    print(f"{reduction['points']:,} points: summary, maximum range: {reduction['seconds']:.0f} s")
+    print(f"largest resident size {reduction['peak_mb']:.0f} MB "
+          f"({reduction['idle_mb']:.0f} MB of it with nothing read)")  # fmt: skip
+    print(f"largest error of the maximum range {reduction['error']:.2g} m")
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from shared import loaded, plain
+from benchmark_helpers import experiment_mapping, load_mapping
 
 import sweep
 
@@ -28,64 +28,66 @@ EXPERIMENTS = Path(sweep.__file__).parents[1] / "experiments"
 """Those of the version that runs: each names the laws of the thesis as that version does."""
 TOLERANCE = 1e-9
 SEED = 2029
-OTHER = ("effects", "effects_error", "pfa_shot", "log10_pfa_shot", "beamlets_error")
+REDEFINED_VARIABLES = ("effects", "effects_error", "pfa_shot", "log10_pfa_shot", "beamlets_error")
 """Variables with another meaning since: more effects, alarms of all segments of a shot, and a
 number of beamlets given by hand, whose error was 0 and is nan (not checked)."""
-ALLOWED = 1e-6
+DIFFERENCE_ALLOWED = 1e-6
 """Difference beyond which a point is counted."""
-CHANGED = ("doppler_spread", "segment_motion", "lag", "fading", "overlap")
+CHANGED_EFFECTS = ("doppler_spread", "segment_motion", "lag", "fading", "overlap")
 """Effects whose laws are others since, or that are new: left out."""
 WINDOWS = ("rectangular", "hann", "hamming", "blackman", "kaiser(8)")
-NEAR = 40.0
+BINS_FROM_END_MAX = 40.0
 """Bins from DC or Nyquist within which random echoes lie."""
-C = 299792458.0
+SPEED_OF_LIGHT = 299792458.0
 
 
-def grid(written: dict[str, Any], points: int, rng: np.random.Generator) -> dict[str, Any]:
+def sampled_mapping(
+    mapping: dict[str, Any], points: int, rng: np.random.Generator
+) -> dict[str, Any]:
     """A study of so many points of a grid, drawn with replacement: one axis that varies all."""
-    axes = written.get("axes", {})
+    axes = mapping.get("axes", {})
     if not axes:
-        return written
-    spec = loaded(written)
-    drawn = [
+        return mapping
+    spec = load_mapping(mapping)
+    zip_pieces = [
         {
-            member.path: spelled(member, int(place))
+            member.path: value_text(member, int(index))
             for axis in spec.axes
-            for place in [rng.integers(axis.size)]
+            for index in [rng.integers(axis.size)]
             for member in axis.members
         }
         for _ in range(points)
     ]
-    return written | {"axes": {"sample": {"zip": drawn}}}
+    return mapping | {"axes": {"sample": {"zip": zip_pieces}}}
 
 
-def spelled(member: Any, place: int) -> str:
+def value_text(member: Any, index: int) -> str:
     """A value of an axis as a spec has it."""
-    value = member.display[place]
+    value = member.display_values[index]
     return str(value) if isinstance(value, str) else f"{float(value)!r} {member.units}".strip()
 
 
-def experiments(points: int) -> Iterator[tuple[str, dict[str, Any]]]:
+def iter_experiments(points: int) -> Iterator[tuple[str, dict[str, Any]]]:
     """Every shipped study of a grid without draws, exact and thinned."""
     for file in sorted(EXPERIMENTS.glob("*.yaml")):
-        written = plain(EXPERIMENTS, file.stem)
-        if "draws" in written or "scene" in written:  # other random numbers and footprints since
+        mapping = experiment_mapping(EXPERIMENTS, file.stem)
+        if "draws" in mapping or "scene" in mapping:  # other random numbers and footprints since
             continue
-        if "file" not in written["instrument"]:  # an instrument that the earlier version lacks
+        if "file" not in mapping["instrument"]:  # an instrument that the earlier version lacks
             continue
-        written["accuracy"] = {"tolerance": TOLERANCE}
-        written["effects"] = written.get("effects", {}) | left_out()
-        written.pop("storage", None)
-        yield file.stem, grid(written, points, np.random.default_rng(SEED))
+        mapping["accuracy"] = {"tolerance": TOLERANCE}
+        mapping["effects"] = mapping.get("effects", {}) | changed_effects_off()
+        mapping.pop("storage", None)
+        yield file.stem, sampled_mapping(mapping, points, np.random.default_rng(SEED))
 
 
-def random_instruments(points: int) -> Iterator[tuple[str, dict[str, Any]]]:
+def iter_random_instruments(points: int) -> Iterator[tuple[str, dict[str, Any]]]:
     """Instruments whose up-chirp echo lies near DC or Nyquist, by window and phases."""
     rng = np.random.default_rng(SEED)
     for window in WINDOWS:
         for phases, beamlets in (("coherent", 1), ("coherent", 37), ("incoherent", 37)):
             name = f"random_{window}_{phases}_{beamlets}"
-            drawn = [instrument(rng) for _ in range(points // (3 * len(WINDOWS)))]
+            zip_pieces = [random_instrument(rng) for _ in range(points // (3 * len(WINDOWS)))]
             yield (
                 name,
                 {
@@ -101,18 +103,21 @@ def random_instruments(points: int) -> Iterator[tuple[str, dict[str, Any]]]:
                     "target": {"reflectance": 0.1},
                     "footprint": {"phases": phases, "beamlets": beamlets},
                     "accuracy": {"tolerance": TOLERANCE},
-                    "effects": {"image": "on", "leakage": "on", "footprint": "on"} | left_out(),
-                    "axes": {"sample": {"zip": drawn}},
+                    "effects": {"image": "on", "leakage": "on", "footprint": "on"}
+                    | changed_effects_off(),
+                    "axes": {"sample": {"zip": zip_pieces}},
                 },
             )
 
 
-def instrument(rng: np.random.Generator) -> dict[str, str]:
+def random_instrument(rng: np.random.Generator) -> dict[str, str]:
     """One instrument and target."""
     duration, bandwidth, wavelength = 2**12 / 100e6, rng.uniform(0.2e9, 1e9), 1.55e-6
-    bins = rng.uniform(-NEAR, NEAR) + (2**11 if rng.random() < 0.5 else 0)
-    velocity, beat = rng.uniform(2, 30), abs(bins) / duration
-    distance = (beat + 2 * velocity / wavelength) * C * duration / (2 * bandwidth)
+    bins = rng.uniform(-BINS_FROM_END_MAX, BINS_FROM_END_MAX) + (2**11 if rng.random() < 0.5 else 0)
+    velocity, beat_frequency = rng.uniform(2, 30), abs(bins) / duration
+    target_range = (
+        (beat_frequency + 2 * velocity / wavelength) * SPEED_OF_LIGHT * duration / (2 * bandwidth)
+    )
     return {
         "instrument.chirp.bandwidth": f"{bandwidth!r} Hz",
         "instrument.chirp.duration": f"{duration!r} s",
@@ -120,59 +125,69 @@ def instrument(rng: np.random.Generator) -> dict[str, str]:
         "instrument.laser.line_width": f"{10 ** rng.uniform(1, 4)!r} Hz",
         "instrument.chirp.quadratic_error": f"{rng.uniform(-2e5, 2e5)!r} Hz",
         "instrument.processing.tnr": f"{rng.uniform(2, 10)!r}",
-        "target.range": f"{distance!r} m",
+        "target.range": f"{target_range!r} m",
         "target.grazing_angle": f"{rng.uniform(30, 90)!r} deg",
         "target.radial_velocity": f"{velocity!r} m/s",
         "target.acceleration": f"{rng.uniform(-100, 100)!r} m/s^2",
     }
 
 
-def left_out() -> dict[str, str]:
+def changed_effects_off() -> dict[str, str]:
     """Return the changed effects that the version knows, off."""
     from sweep.model.effects.catalogue import NAMES
 
-    return {name: "off" for name in CHANGED if name in NAMES}
+    return {name: "off" for name in CHANGED_EFFECTS if name in NAMES}
 
 
-def answers(name: str, written: dict[str, Any]) -> dict[str, np.ndarray]:
+def study_answers(name: str, mapping: dict[str, Any]) -> dict[str, np.ndarray]:
     """Every number that a study's store has, and that means the same in both versions."""
     with tempfile.TemporaryDirectory() as folder:
-        store = Path(folder) / "frozen.zarr"
+        store_path = Path(folder) / "frozen.zarr"
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # effects are off, and random instruments fold
-            outcome = sweep.run(loaded(written), store=str(store), scheduler="none", progress=False)
+            outcome = sweep.run(
+                load_mapping(mapping), store=str(store_path), scheduler="none", progress=False
+            )
         if not outcome.complete:
             sys.exit(f"{name}: {outcome.stopped or outcome.failures}")
         return {
             f"{name}/{key}": values
-            for key, variable in sweep.open(store).data_vars.items()
-            if (values := variable.values).dtype.kind in "fiu" and key not in OTHER
+            for key, variable in sweep.open(store_path).data_vars.items()
+            if (values := variable.values).dtype.kind in "fiu" and key not in REDEFINED_VARIABLES
         }
 
 
-def differences(frozen: np.ndarray, now: np.ndarray) -> np.ndarray:
+def relative_differences(frozen: np.ndarray, current: np.ndarray) -> np.ndarray:
     """Absolute differences of values within 1, relative ones beyond; inf where one is nan."""
     with np.errstate(invalid="ignore"):
-        apart = np.abs(now - frozen) / np.maximum(1.0, np.abs(frozen))
-    apart = np.where(frozen == now, 0.0, apart)  # infinities
-    odd = np.isnan(frozen) != np.isnan(now)
-    return np.where(odd, np.inf, np.nan_to_num(apart, nan=0.0, posinf=np.inf))
+        difference = np.abs(current - frozen) / np.maximum(1.0, np.abs(frozen))
+    difference = np.where(frozen == current, 0.0, difference)  # infinities
+    nan_in_one = np.isnan(frozen) != np.isnan(current)
+    return np.where(nan_in_one, np.inf, np.nan_to_num(difference, nan=0.0, posinf=np.inf))
 
 
-def compare(frozen: dict[str, np.ndarray], now: dict[str, np.ndarray]) -> int:
+def print_differences(frozen: dict[str, np.ndarray], current: dict[str, np.ndarray]) -> int:
     """Print what differs; the number of variables that do by more than is allowed."""
     count = 0
     for key in sorted(frozen):
-        if key not in now or frozen[key].shape != now[key].shape:
-            print(f"{key}: {'is of another shape' if key in now else 'is gone'}")
+        if key not in current or frozen[key].shape != current[key].shape:
+            print(f"{key}: {'is of another shape' if key in current else 'is gone'}")
             count += 1
             continue
-        apart = differences(frozen[key].astype(float), now[key].astype(float)).ravel()
-        if apart.size and apart.max() > ALLOWED:
-            beyond, place = int(np.count_nonzero(apart > ALLOWED)), int(apart.argmax())
-            old, new = frozen[key].ravel()[place], now[key].ravel()[place]
-            print(f"{key}: {beyond} of {apart.size} beyond {ALLOWED:g}, most {apart.max():.1e} "
-                  f"at {place}: {old:.9g} -> {new:.9g}")  # fmt: skip
+        difference = relative_differences(
+            frozen[key].astype(float), current[key].astype(float)
+        ).ravel()
+        if difference.size and difference.max() > DIFFERENCE_ALLOWED:
+            n_beyond, worst_index = (
+                int(np.count_nonzero(difference > DIFFERENCE_ALLOWED)),
+                int(difference.argmax()),
+            )
+            old, new = frozen[key].ravel()[worst_index], current[key].ravel()[worst_index]
+            print(
+                f"{key}: {n_beyond} of {difference.size} beyond {DIFFERENCE_ALLOWED:g}, most "
+                f"{difference.max():.1e} "
+                f"at {worst_index}: {old:.9g} -> {new:.9g}"
+            )
             count += 1
     return count
 
@@ -184,32 +199,38 @@ def main() -> int:
     parser.add_argument("file", type=Path)
     parser.add_argument("studies", nargs="*", help="names of studies, default all")
     parser.add_argument("--points", type=int, default=1000)
-    asked = parser.parse_args()
-    found: dict[str, np.ndarray] = {}
-    for name, written in (*experiments(asked.points), *random_instruments(2 * asked.points)):
-        if asked.studies and name not in asked.studies:
+    arguments = parser.parse_args()
+    answers_now: dict[str, np.ndarray] = {}
+    for name, mapping in (
+        *iter_experiments(arguments.points),
+        *iter_random_instruments(2 * arguments.points),
+    ):
+        if arguments.studies and name not in arguments.studies:
             continue
         with contextlib.suppress(BrokenPipeError):
             print(f"{name} ...", file=sys.stderr, flush=True)
-        found |= answers(name, written)
-    if asked.what == "write":
-        np.savez_compressed(asked.file, **found)
-        print(f"{len(found)} arrays, {sum(values.size for values in found.values())} numbers")
+        answers_now |= study_answers(name, mapping)
+    if arguments.what == "write":
+        np.savez_compressed(arguments.file, **answers_now)
+        print(
+            f"{len(answers_now)} arrays, {sum(values.size for values in answers_now.values())} "
+            "numbers"
+        )
         return 0
     frozen = {
         key: values
-        for key, values in np.load(asked.file).items()
-        if key.rpartition("/")[2] not in OTHER
+        for key, values in np.load(arguments.file).items()
+        if key.rpartition("/")[2] not in REDEFINED_VARIABLES
     }
-    if asked.studies:
-        frozen = {key: v for key, v in frozen.items() if key.partition("/")[0] in asked.studies}
+    if arguments.studies:
+        frozen = {key: v for key, v in frozen.items() if key.partition("/")[0] in arguments.studies}
     frozen_studies = {key.partition("/")[0] for key in frozen}
-    for study in sorted(frozen_studies - {key.partition("/")[0] for key in found}):
+    for study in sorted(frozen_studies - {key.partition("/")[0] for key in answers_now}):
         print(f"{study}: not compared, as it is another study since")
         frozen = {key: v for key, v in frozen.items() if key.partition("/")[0] != study}
-    differing = compare(frozen, found)
-    print(f"{len(frozen)} arrays held against {asked.file.name}: {differing} differ")
-    return int(differing > 0)
+    n_differing = print_differences(frozen, answers_now)
+    print(f"{len(frozen)} arrays held against {arguments.file.name}: {n_differing} differ")
+    return int(n_differing > 0)
 
 
 if __name__ == "__main__":

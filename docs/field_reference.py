@@ -10,7 +10,7 @@ from sweep.spec import json_schema
 
 PAGE = Path(__file__).with_name("fields.md")
 
-FIRST = {"Spec": "A study of a flat target", "SceneSpec": "A study of a scene"}
+FIRST = {"GridSpec": "A study of a flat target", "SceneSpec": "A study of a scene"}
 """The two kinds of spec, which hold all others."""
 
 HEAD = """\

@@ -14,8 +14,8 @@ from typing import NamedTuple
 from PIL import Image
 
 import sweep
-from sweep.analysis import figures
-from sweep.analysis.canvas import SOURCE
+from sweep.analysis import study_figures
+from sweep.analysis.canvas import PNG_SOURCE_FIELD
 
 DOCS = Path(__file__).parent
 EXPERIMENTS = DOCS.parent / "experiments"
@@ -40,8 +40,8 @@ PICTURES = (
 def source(picture: Picture) -> str:
     """Return what a picture says of its source if it is drawn now."""
     spec = sweep.load(EXPERIMENTS / f"{picture.experiment}.yaml")
-    (figure,) = (figure for figure in spec.figures if figure.stem == picture.figure)
-    return figures.source(spec.id, figure)
+    (figure,) = (figure for figure in spec.figures if figure.file_stem == picture.figure)
+    return study_figures.picture_source(spec.id, figure)
 
 
 def is_current(picture: Picture) -> bool:
@@ -49,7 +49,7 @@ def is_current(picture: Picture) -> bool:
     if not (DOCS / picture.file).exists():
         return False
     with Image.open(DOCS / picture.file) as image:
-        return image.info.get(SOURCE) == source(picture)
+        return image.info.get(PNG_SOURCE_FIELD) == source(picture)
 
 
 def draw(experiment: str) -> None:
@@ -60,7 +60,9 @@ def draw(experiment: str) -> None:
         outcome = sweep.run(spec, store=store, scheduler="none")
         if not outcome.complete:
             sys.exit(f"{experiment} is not complete: {outcome.stopped}")
-        drawn = {path.name: path for path in figures.draw(store, Path(folder) / "figures")}
+        drawn = {
+            path.name: path for path in study_figures.draw_figures(store, Path(folder) / "figures")
+        }
         for picture in PICTURES:
             if picture.experiment == experiment:
                 content = drawn[f"{picture.figure}.png"].read_bytes()

@@ -12,30 +12,30 @@ from importlib.metadata import version as _version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # as checkers of programs that use it see the names below
-    from sweep.analysis.export import export
-    from sweep.analysis.opening import open, open_scene
-    from sweep.analysis.reports import reports
+    from sweep.analysis.datasets import open, open_scene
+    from sweep.analysis.scene_results.interface_reports import reports
+    from sweep.analysis.scene_results.point_export import export
     from sweep.spec import load
-    from sweep.tasks.doubts import StudyWarning
     from sweep.tasks.driver import extend, resume, run
-    from sweep.tasks.summary import status
-    from sweep.tasks.verify import verify
+    from sweep.tasks.studies.store_summary import status
+    from sweep.tasks.studies.store_verification import verify
+    from sweep.tasks.studies.study_warnings import StudyWarning
 
 __version__ = _version("sweep")
 
 #: Where each public name comes from; imported on first use, so that `import sweep` stays cheap.
-_HOMES = {
+_MODULE_BY_NAME = {
     "load": "sweep.spec",
     "run": "sweep.tasks.driver",
     "resume": "sweep.tasks.driver",
     "extend": "sweep.tasks.driver",
-    "open": "sweep.analysis.opening",
-    "open_scene": "sweep.analysis.opening",
-    "export": "sweep.analysis.export",
-    "reports": "sweep.analysis.reports",
-    "status": "sweep.tasks.summary",
-    "verify": "sweep.tasks.verify",
-    "StudyWarning": "sweep.tasks.doubts",
+    "open": "sweep.analysis.datasets",
+    "open_scene": "sweep.analysis.datasets",
+    "export": "sweep.analysis.scene_results.point_export",
+    "reports": "sweep.analysis.scene_results.interface_reports",
+    "status": "sweep.tasks.studies.store_summary",
+    "verify": "sweep.tasks.studies.store_verification",
+    "StudyWarning": "sweep.tasks.studies.study_warnings",
 }
 
 __all__ = [
@@ -46,11 +46,11 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     """Public names, from where they live."""
-    if name in _HOMES:
-        return getattr(import_module(_HOMES[name]), name)
+    if name in _MODULE_BY_NAME:
+        return getattr(import_module(_MODULE_BY_NAME[name]), name)
     raise AttributeError(f"module 'sweep' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
     """Public names."""
-    return sorted([*globals(), *_HOMES])
+    return sorted([*globals(), *_MODULE_BY_NAME])

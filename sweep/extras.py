@@ -1,6 +1,6 @@
 """Packages that only some studies need: `pip install 'sweep[scenes]'` and the like bring them."""
 
-EXTRAS = {
+EXTRA_BY_MODULE = {
     "laspy": "scenes", "mapbox_earcut": "scenes", "plyfile": "scenes", "pyproj": "scenes",
     "rasterio": "scenes", "trimesh": "scenes",
     "itables": "report", "jinja2": "report", "plotly": "report",
@@ -11,7 +11,7 @@ EXTRAS = {
 """Extra of `pyproject.toml` that installs a module."""
 
 
-def remedy(error: BaseException) -> str:
+def install_hint(error: BaseException) -> str:
     """Command that installs the module that an import lacked; empty for any other error.
 
     Examples
@@ -20,6 +20,6 @@ def remedy(error: BaseException) -> str:
     "trimesh is not installed: pip install 'sweep[scenes]'"
     """
     module = (getattr(error, "name", None) or "").split(".")[0]
-    if not isinstance(error, ImportError) or module not in EXTRAS:
+    if not isinstance(error, ImportError) or module not in EXTRA_BY_MODULE:
         return ""
-    return f"{module} is not installed: pip install 'sweep[{EXTRAS[module]}]'"
+    return f"{module} is not installed: pip install 'sweep[{EXTRA_BY_MODULE[module]}]'"

@@ -21,7 +21,7 @@ _UNPRINTABLE = re.compile(
 )
 
 
-def printable(text: str) -> str:
+def escape_unprintable(text: str) -> str:
     r"""Text with every character that a terminal would obey, or not show, as an escape sequence.
 
     Tabs and line feeds stay. Marks that turn the direction of text count too: with them a file
@@ -32,17 +32,17 @@ def printable(text: str) -> str:
     >>> print(printable("lidar\x1b[2J\u202egnp.exe"))
     lidar\x1b[2J\u202egnp.exe
     """
-    return _UNPRINTABLE.sub(_escape, text.replace("\r\n", "\n"))
+    return _UNPRINTABLE.sub(_escape_character, text.replace("\r\n", "\n"))
 
 
-def _escape(match: re.Match[str]) -> str:
+def _escape_character(match: re.Match[str]) -> str:
     code = ord(match[0])
     if code < 0x100:
         return f"\\x{code:02x}"
     return f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"
 
 
-def one_line(text: object) -> str:
+def escape_to_one_line(text: object) -> str:
     r"""Printable text of one line, in which line feeds and tabs are escape sequences too.
 
     Examples
@@ -50,14 +50,14 @@ def one_line(text: object) -> str:
     >>> print(one_line("node1\ncomplete"))
     node1\ncomplete
     """
-    return printable(str(text).replace("\n", "\\n").replace("\t", "\\t"))
+    return escape_unprintable(str(text).replace("\n", "\\n").replace("\t", "\\t"))
 
 
 class PrintableError(Exception):
     """Base of errors whose text quotes stores, specs and file names."""
 
     def __str__(self) -> str:
-        return printable(super().__str__())
+        return escape_unprintable(super().__str__())
 
 
 class PrintableStream:
@@ -65,7 +65,7 @@ class PrintableStream:
 
     It has no `buffer`, so that nothing is written past it. Rich, which makes escape sequences of
     its own, finds the stream itself as `rich_proxied_file`; what it is given to print goes through
-    :func:`printable` before.
+    :func:`escape_unprintable` before.
     """
 
     def __init__(self, stream: TextIO) -> None:
@@ -75,7 +75,7 @@ class PrintableStream:
         """Write text."""
         if not isinstance(text, str):
             raise TypeError(f"a text stream takes str, not {type(text).__name__}")
-        self.rich_proxied_file.write(printable(text))
+        self.rich_proxied_file.write(escape_unprintable(text))
         return len(text)
 
     def writelines(self, lines: Any) -> None:
@@ -91,9 +91,9 @@ class PrintableStream:
 
 # Suggestions
 
-_AS_COMMAND = False
+_runs_as_command = False
 
-MISTAKE, INCOMPLETE = 2, 3
+EXIT_MISTAKE, EXIT_INCOMPLETE = 2, 3
 """Exit codes of the command for a mistake of the user's, and a run that ended before its blocks."""
 
 
@@ -101,27 +101,27 @@ class Placeholder(str):
     """Word that stands for what the user has to fill in."""
 
 
-SPEC, STORE = Placeholder("SPEC"), Placeholder("STORE")
-NEW = Placeholder("NEW")
+SPEC_PLACEHOLDER, STORE_PLACEHOLDER = Placeholder("SPEC"), Placeholder("STORE")
+NEW_PLACEHOLDER = Placeholder("NEW")
 
 
 @contextmanager
-def as_command() -> Iterator[None]:
+def suggest_shell_commands() -> Iterator[None]:
     """Context in which suggestions are shell commands: the `sweep` command runs."""
-    global _AS_COMMAND
-    before, _AS_COMMAND = _AS_COMMAND, True
+    global _runs_as_command
+    previous, _runs_as_command = _runs_as_command, True
     try:
         yield
     finally:
-        _AS_COMMAND = before
+        _runs_as_command = previous
 
 
-def is_command() -> bool:
+def is_run_as_command() -> bool:
     """Tell whether the `sweep` command runs, whose process ends with it."""
-    return _AS_COMMAND
+    return _runs_as_command
 
 
-def command_line(name: str, *arguments: object, **options: object) -> str:
+def shell_command(name: str, *arguments: object, **options: object) -> str:
     r"""Command of `sweep` as one types it into a shell, each word quoted where need be.
 
     Examples
@@ -131,7 +131,9 @@ def command_line(name: str, *arguments: object, **options: object) -> str:
     """
     words = ["sweep", name, *map(_shell_word, arguments)]
     for option, value in options.items():
-        words += [_flag(option)] if value is True else [_flag(option), _shell_word(value)]
+        words += (
+            [_option_flag(option)] if value is True else [_option_flag(option), _shell_word(value)]
+        )
     return " ".join(words)
 
 
@@ -159,14 +161,14 @@ def suggestion(name: str, *arguments: object, **options: object) -> str:
     ...     suggestion("resume", "a b.zarr", retry_failed=True)
     "`sweep resume 'a b.zarr' --retry-failed`"
     """
-    if _AS_COMMAND:
-        return f"`{command_line(name, *arguments, **options)}`"
-    parts = [_literal(argument) for argument in arguments]
-    parts += [f"{option}={_literal(value)}" for option, value in options.items()]
+    if _runs_as_command:
+        return f"`{shell_command(name, *arguments, **options)}`"
+    parts = [_python_literal(argument) for argument in arguments]
+    parts += [f"{option}={_python_literal(value)}" for option, value in options.items()]
     return f"`sweep.{name}({', '.join(parts)})`"
 
 
-def option(name: str, value: object = True) -> str:
+def option_text(name: str, value: object = True) -> str:
     """Option of the command, or argument of the call, that the user has just made.
 
     Examples
@@ -177,12 +179,12 @@ def option(name: str, value: object = True) -> str:
     ...     option("overwrite"), option("allow_code", ["mine"])
     ('--overwrite', '--allow-code mine')
     """
-    if not _AS_COMMAND:
-        return f"{name}={_literal(value)}"
+    if not _runs_as_command:
+        return f"{name}={_python_literal(value)}"
     if value is True:
-        return _flag(name)
+        return _option_flag(name)
     values = value if isinstance(value, list) else [value]
-    return " ".join(f"{_flag(name)} {_shell_word(item)}" for item in values)
+    return " ".join(f"{_option_flag(name)} {_shell_word(item)}" for item in values)
 
 
 def option_name(name: str) -> str:
@@ -193,14 +195,14 @@ def option_name(name: str) -> str:
     >>> option_name("store")
     'store='
     """
-    return _flag(name) if _AS_COMMAND else f"{name}="
+    return _option_flag(name) if _runs_as_command else f"{name}="
 
 
-def _flag(option: str) -> str:
+def _option_flag(option: str) -> str:
     return f"--{option.replace('_', '-')}"
 
 
-def _literal(value: object) -> str:
+def _python_literal(value: object) -> str:
     """Value as Python has it; of what the user has to fill in, its name."""
     if isinstance(value, Placeholder):
         return value.lower()

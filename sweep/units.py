@@ -17,10 +17,10 @@ from fractions import Fraction
 from functools import cache, lru_cache
 from typing import Any
 
-LONGEST_TEXT = 100
+QUANTITY_TEXT_LENGTH_MAX = 100
 DECIBEL = "dB"
 PER_HERTZ = "1/Hz"
-LOGARITHMIC = {
+LOGARITHMIC_UNITS = {
     "dB": ("dB", Fraction(1)),
     "dB/Hz": (PER_HERTZ, Fraction(1)),
     "dBc/Hz": (PER_HERTZ, Fraction(1)),
@@ -30,26 +30,28 @@ LOGARITHMIC = {
 """Units of power that are logarithms: the SI unit, and its value at 0 dB. 30 dBm is 1 W, and
 -155 dB/Hz is 10^-15.5 /Hz; of a laser's noise it is also written as dBc/Hz."""
 
-NONE = "none"
+NO_VALUE_TEXT = "none"
 """Text of a share or number of nothing, which has no value."""
 
-_NUMBER = r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d{1,4})?"
-_POWER = r"(?P<base>\d{1,6})(?:\^|\*\*)(?P<exponent>[+-]?\d+(?:\.\d*)?)"
-_LARGEST_EXPONENT = 999
-_UNIT = r"(?:(?<=\s)1\s*/|[^\d\s.+\-]).*"
-_VALUE = re.compile(rf"\s*(?:{_POWER}|(?P<number>{_NUMBER}))\s*(?P<unit>{_UNIT})?", re.ASCII)
-_EXPONENT = r"(?:\^|\*\*)?(?:(?P<exponent>[+-]?\d(?:\.5)?)|\((?P<ratio>[+-]?\d/[1-9])\))"
-_GROUPED = re.compile(
+_NUMBER_PATTERN = r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d{1,4})?"
+_POWER_PATTERN = r"(?P<base>\d{1,6})(?:\^|\*\*)(?P<exponent>[+-]?\d+(?:\.\d*)?)"
+_EXPONENT_MAX = 999
+_UNIT_PATTERN = r"(?:(?<=\s)1\s*/|[^\d\s.+\-]).*"
+_QUANTITY_PATTERN = re.compile(
+    rf"\s*(?:{_POWER_PATTERN}|(?P<number>{_NUMBER_PATTERN}))\s*(?P<unit>{_UNIT_PATTERN})?", re.ASCII
+)
+_EXPONENT_PATTERN = r"(?:\^|\*\*)?(?:(?P<exponent>[+-]?\d(?:\.5)?)|\((?P<ratio>[+-]?\d/[1-9])\))"
+_GROUPED_NUMBER_PATTERN = re.compile(
     r"\s*[+-]?\d+(?:[.]\d+)*(?:,\d+|(?:[_' ]\d{3}(?!\d|\s*/))+(?:[.,]\d+)?)+", re.ASCII
 )
-_FACTOR = re.compile(rf"(?P<name>[A-Za-z]+|%)(?:{_EXPONENT})?")
-_OPERATOR = re.compile(r"(\*(?!\*)|/(?![^(]*\))|(?<=[A-Za-z0-9)]) +(?=[A-Za-z]))")
-_NOT_FINITE = re.compile(r"\s*[+-]?\.?(nan|inf|infinity)\b", re.IGNORECASE)
-_ROOT_OF = re.compile(r"(?:√\s*|rt|sqrt\s*)(?:\(\s*([A-Za-z]+)\s*\)|([A-Za-z]+))")
-_SPELLINGS = {"μ": "u", "Ω": "ohm", "°": "deg", "−": "-", "·": "*", "⋅": "*", "×": "*"}
+_UNIT_FACTOR_PATTERN = re.compile(rf"(?P<name>[A-Za-z]+|%)(?:{_EXPONENT_PATTERN})?")
+_UNIT_OPERATOR_PATTERN = re.compile(r"(\*(?!\*)|/(?![^(]*\))|(?<=[A-Za-z0-9)]) +(?=[A-Za-z]))")
+_NOT_FINITE_PATTERN = re.compile(r"\s*[+-]?\.?(nan|inf|infinity)\b", re.IGNORECASE)
+_SQUARE_ROOT_PATTERN = re.compile(r"(?:√\s*|rt|sqrt\s*)(?:\(\s*([A-Za-z]+)\s*\)|([A-Za-z]+))")
+_ASCII_SPELLINGS = {"μ": "u", "Ω": "ohm", "°": "deg", "−": "-", "·": "*", "⋅": "*", "×": "*"}
 
 # Units that a near miss is looked for in, by the SI unit they measure.
-_PREFIXED = {
+_USUAL_UNITS_BY_SI_UNIT = {
     "m": "nm um mm cm m km au",
     "s": "ns us ms s",
     "Hz": "Hz kHz MHz GHz THz",
@@ -72,24 +74,26 @@ _PREFIXED = {
 
 _PI = Fraction("3.1415926535897932384626433832795028841971693993751")
 _LN_10 = Fraction("2.3025850929940456840179914546843642076011014886288")
-_ATTENUATION = {"dB/m": _LN_10 / 10, "dB/km": _LN_10 / 10_000, "dB/cm": 10 * _LN_10}
+_ATTENUATION_UNITS = {"dB/m": _LN_10 / 10, "dB/km": _LN_10 / 10_000, "dB/cm": 10 * _LN_10}
 """Attenuation of power with distance: [1/m] of a decibel in each metre, kilometre or centimetre."""
-_WATT = {"gram": 1, "meter": 2, "second": -3}
-_BASES: dict[str, tuple[Fraction, dict[str, int]]] = {
+_WATT_DIMENSION = {"gram": 1, "meter": 2, "second": -3}
+_BASE_UNITS: dict[str, tuple[Fraction, dict[str, int]]] = {
     "m": (Fraction(1), {"meter": 1}),
     "s": (Fraction(1), {"second": 1}),
     "Hz": (Fraction(1), {"second": -1}),
-    "W": (Fraction(1000), _WATT),
+    "W": (Fraction(1000), _WATT_DIMENSION),
     "A": (Fraction(1), {"ampere": 1}),
-    "V": (Fraction(1000), _WATT | {"ampere": -1}),
-    "ohm": (Fraction(1000), _WATT | {"ampere": -2}),
+    "V": (Fraction(1000), _WATT_DIMENSION | {"ampere": -1}),
+    "ohm": (Fraction(1000), _WATT_DIMENSION | {"ampere": -2}),
     "K": (Fraction(1), {"kelvin": 1}),
     "rad": (Fraction(1), {"radian": 1}),
     "sr": (Fraction(1), {"radian": 2}),
     "deg": (_PI / 180, {"radian": 1}),
 }
-_PREFIXES = {"p": -12, "n": -9, "u": -6, "m": -3, "c": -2, "k": 3, "M": 6, "G": 9, "T": 12}
-USUAL = frozenset(_BASES) | {prefix + base for prefix in _PREFIXES for base in _BASES}
+_PREFIX_EXPONENTS = {"p": -12, "n": -9, "u": -6, "m": -3, "c": -2, "k": 3, "M": 6, "G": 9, "T": 12}
+UNITS_KNOWN_WITHOUT_PINT = frozenset(_BASE_UNITS) | {
+    prefix + base for prefix in _PREFIX_EXPONENTS for base in _BASE_UNITS
+}
 """Units that are known without pint; its factors and root units."""
 
 
@@ -117,163 +121,179 @@ class Unit:
     Decibels are ratios of powers: ``si = factor * 10 ** (value / 10)``.
     """
 
-    text: str
+    symbol: str
     factor: Fraction = Fraction(1)
     offset: Fraction = Fraction(0)
 
     @property
-    def decibel(self) -> bool:
+    def is_logarithmic(self) -> bool:
         """True if values of this unit are logarithms of power ratios."""
-        return self.text in LOGARITHMIC
+        return self.symbol in LOGARITHMIC_UNITS
 
     def to_si(self, value: Fraction) -> float:
         """SI value of `value` in this unit, correctly rounded."""
         try:
-            scaled = self.factor * (_ratio(value) if self.decibel else value)
+            scaled = self.factor * (_power_ratio(value) if self.is_logarithmic else value)
             return float(scaled + self.offset)
         except OverflowError:
             raise QuantityError("must be a number that a float holds (below 1.8e308)") from None
 
 
 def read_number(
-    written: object, about: str = "", *, is_power_ratio: bool = False
+    raw_value: object, description: str = "", *, is_power_ratio: bool = False
 ) -> tuple[Fraction, Unit]:
     """Exact value and unit of a pure number: ``0.1``, ``"1e9"``, ``"2^17"`` or ``"10 %"``.
 
     A ratio of powers may be in decibels, ``"-3 dB"``. A `QuantityError` for any other unit says
     what the number is `about`.
     """
-    value, unit = _split(written, "must be a number")
+    value, unit = _split_quantity(raw_value, "must be a number")
     if unit in ("%", "percent"):
         return value, Unit("%", Fraction(1, 100))
     if unit == DECIBEL and is_power_ratio:
         return value, Unit(DECIBEL)
     if unit:
-        what = f": {about}" if about else ""
-        raise QuantityError(f"is a pure number and takes no unit{what}", _without_unit(value, unit))
+        description_text = f": {description}" if description else ""
+        raise QuantityError(
+            f"is a pure number and takes no unit{description_text}",
+            _pure_number_suggestion(value, unit),
+        )
     return value, Unit("")
 
 
-def _without_unit(value: Fraction, unit: str) -> str:
+def _pure_number_suggestion(value: Fraction, unit: str) -> str:
     """Suggestion of the pure number that a number with a unit may mean, if that is clear."""
     if unit == DECIBEL:
-        powers, amplitudes = _show(_ratio(value)), _show(_ratio(value / 2))
-        if powers == amplitudes:
-            return f"write {powers}"
-        return f"write {powers} for a ratio of powers, {amplitudes} for one of amplitudes"
-    if unit in _PREFIXED["rad"].split():
+        power_ratio_text, amplitude_ratio_text = (
+            _format_number(_power_ratio(value)),
+            _format_number(_power_ratio(value / 2)),
+        )
+        if power_ratio_text == amplitude_ratio_text:
+            return f"write {power_ratio_text}"
+        return (
+            f"write {power_ratio_text} for a ratio of powers, {amplitude_ratio_text} for one of "
+            "amplitudes"
+        )
+    if unit in _USUAL_UNITS_BY_SI_UNIT["rad"].split():
         angle = read_unit(unit, si_unit="rad", example="1 deg").to_si(value)
         return f"write {math.tan(angle):.4g}, the tangent of that angle, if a slope is meant"
     if quotient := re.fullmatch(r"/\s*(\d+)", unit):
         divisor = int(quotient[1])
-        return f"write {_show(value / divisor)}" if divisor else ""
-    return f"write {_show(value)}" if unit.isalpha() else ""
+        return f"write {_format_number(value / divisor)}" if divisor else ""
+    return f"write {_format_number(value)}" if unit.isalpha() else ""
 
 
-def read_quantity(written: object, *, si_unit: str, example: str) -> tuple[Fraction, Unit]:
+def read_quantity(raw_value: object, *, si_unit: str, example: str) -> tuple[Fraction, Unit]:
     """Exact value and unit of a written quantity, such as ``"25 mm"``.
 
     The SI unit fixes its dimension: ``"dB"`` for a power ratio written in decibels. The example
     is shown where the unit is missing, unknown or unfit: a `QuantityError`.
     """
-    value, text = _split(written, "must be a number with a unit")
-    if not text:
+    value, unit_text = _split_quantity(raw_value, "must be a number with a unit")
+    if not unit_text:
         remedy = f"write e.g. '{example}'"
         if si_unit == DECIBEL and 1e-300 < value < 1e300:  # others are no floats, or no ratios
-            remedy += f"; a ratio of {_show(value)} is {10 * math.log10(value):.4g} dB"
+            remedy += f"; a ratio of {_format_number(value)} is {10 * math.log10(value):.4g} dB"
         raise QuantityError("needs a unit", remedy)
-    return value, read_unit(text, si_unit=si_unit, example=example)
+    return value, read_unit(unit_text, si_unit=si_unit, example=example)
 
 
 @lru_cache(maxsize=4096)
-def read_unit(text: str, *, si_unit: str, example: str) -> Unit:
+def read_unit(unit_text: str, *, si_unit: str, example: str) -> Unit:
     """Parse a unit that must measure what `si_unit` measures."""
-    logarithmic = "".join(text.split())
-    if logarithmic in LOGARITHMIC:
-        measured, factor = LOGARITHMIC[logarithmic]
-        if measured == si_unit:
-            return Unit(logarithmic, factor)
-        raise QuantityError(*_unfit(text, si_unit, example))
-    if logarithmic in _ATTENUATION and si_unit == "1/m":
-        return Unit(logarithmic, _ATTENUATION[logarithmic])
+    compact_text = "".join(unit_text.split())
+    if compact_text in LOGARITHMIC_UNITS:
+        measured_si_unit, factor = LOGARITHMIC_UNITS[compact_text]
+        if measured_si_unit == si_unit:
+            return Unit(compact_text, factor)
+        raise QuantityError(*_wrong_dimension_error(unit_text, si_unit, example))
+    if compact_text in _ATTENUATION_UNITS and si_unit == "1/m":
+        return Unit(compact_text, _ATTENUATION_UNITS[compact_text])
     if si_unit == DECIBEL:
-        raise QuantityError(*_unfit(text, si_unit, example))
-    factors = _factors(text)
+        raise QuantityError(*_wrong_dimension_error(unit_text, si_unit, example))
+    factors = _parse_unit_factors(unit_text)
     if factors is None:
         raise QuantityError(
-            f"has the unit '{text}', which cannot be read", f"write e.g. '{example}'"
+            f"has the unit '{unit_text}', which cannot be read", f"write e.g. '{example}'"
         )
     for name, _ in factors:
-        if _root(name) is None:
-            raise QuantityError(f"has an unknown unit '{name}'", _near_miss(name, si_unit, example))
-    scale, offset, dimension = _combined(factors)
-    if_si, _, wanted = _combined(_factors(si_unit) or [])
-    if dimension != wanted:
-        raise QuantityError(*_unfit(text, si_unit, example))
-    return Unit(_plain(factors), scale / if_si, offset / if_si)
+        if _in_root_units(name) is None:
+            raise QuantityError(
+                f"has an unknown unit '{name}'", _unit_suggestion(name, si_unit, example)
+            )
+    scale, offset, dimension = _combine_factors(factors)
+    si_scale, _, si_dimension = _combine_factors(_parse_unit_factors(si_unit) or [])
+    if dimension != si_dimension:
+        raise QuantityError(*_wrong_dimension_error(unit_text, si_unit, example))
+    return Unit(_format_unit(factors), scale / si_scale, offset / si_scale)
 
 
-def _unfit(text: str, si_unit: str, example: str) -> tuple[str, str]:
+def _wrong_dimension_error(unit_text: str, si_unit: str, example: str) -> tuple[str, str]:
     """Rule and suggestion for a unit of the wrong dimension."""
-    power = " or '30 dBm'" if (si_unit, text) == ("W", DECIBEL) else ""
-    return f"needs a unit like {si_unit}, and '{text}' is none", f"write e.g. '{example}'{power}"
+    dbm_example = " or '30 dBm'" if (si_unit, unit_text) == ("W", DECIBEL) else ""
+    return (
+        f"needs a unit like {si_unit}, and '{unit_text}' is none",
+        f"write e.g. '{example}'{dbm_example}",
+    )
 
 
-def _split(written: object, rule: str) -> tuple[Fraction, str]:
+def _split_quantity(raw_value: object, rule: str) -> tuple[Fraction, str]:
     """Exact number and unit text (empty where none) of what was written; the rule if unreadable."""
-    if isinstance(written, bool) or not isinstance(written, int | float | str):
+    if isinstance(raw_value, bool) or not isinstance(raw_value, int | float | str):
         raise QuantityError(rule)
-    text = _spelled(str(written))
-    if len(text) > LONGEST_TEXT:
-        raise QuantityError(f"must be at most {LONGEST_TEXT} characters long")
-    if _NOT_FINITE.match(text):
+    text = _to_ascii_spelling(str(raw_value))
+    if len(text) > QUANTITY_TEXT_LENGTH_MAX:
+        raise QuantityError(f"must be at most {QUANTITY_TEXT_LENGTH_MAX} characters long")
+    if _NOT_FINITE_PATTERN.match(text):
         raise QuantityError("must be a finite number")
-    if grouped := _GROUPED.match(text):
-        raise QuantityError(*_ungrouped(text, grouped[0]))
-    match = _VALUE.fullmatch(text)
+    if grouped := _GROUPED_NUMBER_PATTERN.match(text):
+        raise QuantityError(*_grouping_error(text, grouped[0]))
+    match = _QUANTITY_PATTERN.fullmatch(text)
     if match is None:
         raise QuantityError(rule)
     unit = (match["unit"] or "").strip()
     if match["base"]:
-        return _written_power(int(match["base"]), match["exponent"]), unit
+        return _parse_power(int(match["base"]), match["exponent"]), unit
     return Fraction(match["number"]), unit
 
 
-def _written_power(base: int, exponent: str) -> Fraction:
+def _parse_power(base: int, exponent: str) -> Fraction:
     """Exact power, such as ``2^17`` or ``10^-3``; its exponent is a whole number of few digits."""
     if "." in exponent:
         raise QuantityError("has an exponent that is no whole number")
-    if abs(int(exponent)) > _LARGEST_EXPONENT:
-        raise QuantityError(f"has an exponent beyond {_LARGEST_EXPONENT} to either side")
+    if abs(int(exponent)) > _EXPONENT_MAX:
+        raise QuantityError(f"has an exponent beyond {_EXPONENT_MAX} to either side")
     if base == 0 and int(exponent) < 0:
         raise QuantityError("divides by zero")
     return Fraction(base) ** int(exponent)
 
 
-def _ungrouped(text: str, number: str) -> tuple[str, str]:
+def _grouping_error(text: str, number: str) -> tuple[str, str]:
     """Rule and suggestion for a number whose digits are grouped, or with a decimal comma."""
-    *groups, last = re.split(r"[,_'\s]", number)
+    *groups, last_group = re.split(r"[,_'\s]", number)
     remedies = []
-    if "," not in number or (len(last) == 3 and "." not in number):
-        remedies.append(f"'{''.join([*groups, last])}{text[len(number) :]}'")
+    if "," not in number or (len(last_group) == 3 and "." not in number):
+        remedies.append(f"'{''.join([*groups, last_group])}{text[len(number) :]}'")
     if number.count(",") == 1:
-        whole, _, decimals = number.partition(",")
-        remedies.append(f"'{re.sub(r'[^-+0-9]', '', whole)}.{decimals}{text[len(number) :]}'")
+        integer_part, _, decimals = number.partition(",")
+        remedies.append(
+            f"'{re.sub(r'[^-+0-9]', '', integer_part)}.{decimals}{text[len(number) :]}'"
+        )
     return (
         "has a number that is grouped, or has a comma; numbers are written like 1234.5",
         f"write {' or '.join(remedies)}" if remedies else "",
     )
 
 
-def _spelled(text: str) -> str:
+def _to_ascii_spelling(text: str) -> str:
     """Text in plain letters: ``25 µm`` as ``25 um``, ``pW/√Hz`` as ``pW/Hz^0.5``."""
-    text = unicodedata.normalize("NFKC", text[: 2 * LONGEST_TEXT])
-    for symbol, letters in _SPELLINGS.items():
-        text = text.replace(symbol, letters)
-    return _ROOT_OF.sub(lambda match: f"{match[1] or match[2]}^0.5", text)
+    text = unicodedata.normalize("NFKC", text[: 2 * QUANTITY_TEXT_LENGTH_MAX])
+    for character, letters in _ASCII_SPELLINGS.items():
+        text = text.replace(character, letters)
+    return _SQUARE_ROOT_PATTERN.sub(lambda match: f"{match[1] or match[2]}^0.5", text)
 
 
-def _show(value: Fraction) -> str:
+def _format_number(value: Fraction) -> str:
     """Format a number as a user would write it."""
     try:
         return f"{float(value):.4g}"
@@ -281,40 +301,42 @@ def _show(value: Fraction) -> str:
         return "1e300"
 
 
-def _factors(text: str) -> list[tuple[str, Fraction]] | None:
+def _parse_unit_factors(unit_text: str) -> list[tuple[str, Fraction]] | None:
     """Names and exponents of a unit's factors; None where the text is no unit."""
     factors = []
     sign = 1
-    text = re.sub(r"^1\s*/", "/", text.replace("**", "^"))
-    for place, piece in enumerate(_OPERATOR.split(text)):
+    unit_text = re.sub(r"^1\s*/", "/", unit_text.replace("**", "^"))
+    for index, piece in enumerate(_UNIT_OPERATOR_PATTERN.split(unit_text)):
         factor = piece.strip()
-        if place % 2:
+        if index % 2:
             sign = -1 if factor == "/" else 1
             continue
-        if place == 0 and text.lstrip().startswith("/"):
+        if index == 0 and unit_text.lstrip().startswith("/"):
             continue  # 1/m
-        match = _FACTOR.fullmatch(factor)
+        match = _UNIT_FACTOR_PATTERN.fullmatch(factor)
         if match is None:
             return None
         factors.append((match["name"], sign * Fraction(match["exponent"] or match["ratio"] or 1)))
     return factors
 
 
-def _plain(factors: list[tuple[str, Fraction]]) -> str:
+def _format_unit(factors: list[tuple[str, Fraction]]) -> str:
     """One spelling of a unit: ``W/m^2/nm``, ``pW/Hz^0.5``, ``1/km``, ``m^(-2/3)``."""
     if [exponent for _, exponent in factors] == [-1]:
         return f"1/{factors[0][0]}"
-    text = ""
+    unit_text = ""
     for name, exponent in factors:
-        operator = "/" if exponent < 0 and text else "*" if text else ""
-        size = abs(exponent) if operator == "/" else exponent
-        power = f"{float(size):g}" if 2 % size.denominator == 0 else f"({size})"
-        text += operator + name + ("" if size == 1 else f"^{power}")
-    return text
+        operator = "/" if exponent < 0 and unit_text else "*" if unit_text else ""
+        abs_exponent = abs(exponent) if operator == "/" else exponent
+        power = (
+            f"{float(abs_exponent):g}" if 2 % abs_exponent.denominator == 0 else f"({abs_exponent})"
+        )
+        unit_text += operator + name + ("" if abs_exponent == 1 else f"^{power}")
+    return unit_text
 
 
 @cache
-def _registry() -> Any:
+def _pint_registry() -> Any:
     """Pint's registry, in exact fractions."""
     import pint
 
@@ -322,19 +344,21 @@ def _registry() -> Any:
 
 
 @cache
-def _root(name: str) -> tuple[Fraction, Fraction, tuple[tuple[str, Fraction], ...]] | None:
+def _in_root_units(name: str) -> tuple[Fraction, Fraction, tuple[tuple[str, Fraction], ...]] | None:
     """Factor, offset and dimension of one unit in pint's root units; None where unknown."""
-    if name in USUAL:
-        base = name if name in _BASES else name[1:]
-        factor, powers = _BASES[base]
-        factor *= Fraction(10) ** (0 if name in _BASES else _PREFIXES[name[0]])
+    if name in UNITS_KNOWN_WITHOUT_PINT:
+        base = name if name in _BASE_UNITS else name[1:]
+        factor, powers = _BASE_UNITS[base]
+        factor *= Fraction(10) ** (0 if name in _BASE_UNITS else _PREFIX_EXPONENTS[name[0]])
         return factor, Fraction(0), tuple(sorted((k, Fraction(v)) for k, v in powers.items()))
-    return by_pint(name)
+    return in_root_units_by_pint(name)
 
 
-def by_pint(name: str) -> tuple[Fraction, Fraction, tuple[tuple[str, Fraction], ...]] | None:
+def in_root_units_by_pint(
+    name: str,
+) -> tuple[Fraction, Fraction, tuple[tuple[str, Fraction], ...]] | None:
     """Return the unit as pint has it."""
-    registry = _registry()
+    registry = _pint_registry()
     try:
         unit = registry.parse_units("percent" if name == "%" else name)
         zero, one = (registry.Quantity(Fraction(i), unit).to_root_units() for i in (0, 1))
@@ -345,17 +369,17 @@ def by_pint(name: str) -> tuple[Fraction, Fraction, tuple[tuple[str, Fraction], 
     return Fraction(one.magnitude) - offset, offset, tuple(sorted(dimension.items()))
 
 
-def _combined(
+def _combine_factors(
     factors: list[tuple[str, Fraction]],
 ) -> tuple[Fraction, Fraction, dict[str, Fraction]]:
     """Factor, offset and dimension of a product of units, all of them known."""
     scale, offset = Fraction(1), Fraction(0)
     dimension: dict[str, Fraction] = {}
     for name, exponent in factors:
-        root = _root(name)
-        assert root is not None
-        factor, offset, powers = root
-        scale *= _power(factor, exponent)
+        root_unit = _in_root_units(name)
+        assert root_unit is not None
+        factor, offset, powers = root_unit
+        scale *= _exact_power(factor, exponent)
         for key, power in powers:
             dimension[key] = dimension.get(key, Fraction(0)) + power * exponent
     # A temperature's zero matters to a temperature, not to a unit that it is a factor of.
@@ -366,7 +390,7 @@ def _combined(
     )
 
 
-def _power(factor: Fraction, exponent: Fraction) -> Fraction:
+def _exact_power(factor: Fraction, exponent: Fraction) -> Fraction:
     """Power of a positive fraction, to 50 digits where the exponent is no whole number."""
     if exponent.denominator == 1:
         return factor ** int(exponent)
@@ -380,7 +404,7 @@ def _power(factor: Fraction, exponent: Fraction) -> Fraction:
     return Fraction(root) ** exponent.numerator
 
 
-def _ratio(decibels: Fraction) -> Fraction:
+def _power_ratio(decibels: Fraction) -> Fraction:
     """Power ratio of so many decibels, to 50 digits; of more than a float can hold, 1e400."""
     with localcontext() as context:
         context.prec = 50
@@ -388,29 +412,29 @@ def _ratio(decibels: Fraction) -> Fraction:
         return Fraction(Decimal(10) ** max(min(exponent, Decimal(400)), Decimal(-400)))
 
 
-def _near_miss(name: str, si_unit: str, example: str) -> str:
+def _unit_suggestion(name: str, si_unit: str, example: str) -> str:
     """Suggestion for an unknown unit: the usual one that it resembles, or an example."""
-    usual = _spelled(_PREFIXED.get(si_unit, si_unit))
-    names = sorted(set(re.findall(r"[A-Za-z%]+", usual)))
-    same = [known for known in names if known.lower() == name.lower()]
-    close = same or get_close_matches(name, names, n=10, cutoff=0.5)
-    close.sort(key=lambda known: (len(known) != len(name), known[0] != name[0]))
-    return f"did you mean '{close[0]}'?" if close else f"write e.g. '{example}'"
+    usual_units = _to_ascii_spelling(_USUAL_UNITS_BY_SI_UNIT.get(si_unit, si_unit))
+    names = sorted(set(re.findall(r"[A-Za-z%]+", usual_units)))
+    case_variants = [usual_name for usual_name in names if usual_name.lower() == name.lower()]
+    candidates = case_variants or get_close_matches(name, names, n=10, cutoff=0.5)
+    candidates.sort(key=lambda usual_name: (len(usual_name) != len(name), usual_name[0] != name[0]))
+    return f"did you mean '{candidates[0]}'?" if candidates else f"write e.g. '{example}'"
 
 
-def number_text(value: float, form: str = ".4g") -> str:
+def number_text(value: float, format_spec: str = ".4g") -> str:
     """Return a number as text; ``none`` for nan.
 
     >>> number_text(0.25), number_text(float("nan"))
     ('0.25', 'none')
     """
-    return f"{value:{form}}" if value == value else NONE
+    return f"{value:{format_spec}}" if value == value else NO_VALUE_TEXT
 
 
-def percent(share: float, form: str = ".3g") -> str:
+def percent(share: float, format_spec: str = ".3g") -> str:
     """Return a share in percent; ``none`` for nan, the share of nothing.
 
     >>> percent(0.25), percent(float("nan"))
     ('25 %', 'none')
     """
-    return f"{100 * share:{form}} %" if share == share else NONE
+    return f"{100 * share:{format_spec}} %" if share == share else NO_VALUE_TEXT

@@ -14,9 +14,13 @@ from hypothesis import settings
 sys.path.insert(0, str(Path(__file__).parent / "tasks"))  # small studies, for other tests too
 
 # Stores are many small files, which memory makes and removes several times as fast as disks.
-MEMORY, ROOM = Path("/dev/shm"), 8 << 30
-if MEMORY.is_dir() and os.access(MEMORY, os.W_OK) and shutil.disk_usage(MEMORY).free > ROOM:
-    os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(MEMORY))
+SHARED_MEMORY_DIR, SHARED_MEMORY_BYTES_MIN = Path("/dev/shm"), 8 << 30
+if (
+    SHARED_MEMORY_DIR.is_dir()
+    and os.access(SHARED_MEMORY_DIR, os.W_OK)
+    and shutil.disk_usage(SHARED_MEMORY_DIR).free > SHARED_MEMORY_BYTES_MIN
+):
+    os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(SHARED_MEMORY_DIR))
 
 # What starts tests in the background may have Ctrl-C ignored, which all processes would take over.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -98,7 +102,7 @@ TABLE_4_1 = {
 }
 """The instrument of [T] Table 4.1 with the target that PHYSICS section 3 reads into its figures."""
 
-_PATHS = {path.rsplit(".", 1)[1]: path for path in TABLE_4_1}
+_PATH_BY_NAME = {path.rsplit(".", 1)[1]: path for path in TABLE_4_1}
 
 
 @pytest.fixture(scope="session")
@@ -106,7 +110,7 @@ def table_4_1():
     """Parameters of Table 4.1, any of them replaced: ``table_4_1(range=3500.0, power=3.0)``."""
 
     def parameters(**changes):
-        return TABLE_4_1 | {_PATHS[name]: value for name, value in changes.items()}
+        return TABLE_4_1 | {_PATH_BY_NAME[name]: value for name, value in changes.items()}
 
     return parameters
 
@@ -114,8 +118,8 @@ def table_4_1():
 @pytest.fixture(scope="session")
 def undisturbed(tmp_path_factory):
     """The store of the small study, run as a plain loop; not to be changed."""
-    from small import quiet, small
+    from small_studies import run_serially, small_spec
 
-    outcome = quiet(small(), tmp_path_factory.mktemp("undisturbed") / "small.zarr")
+    outcome = run_serially(small_spec(), tmp_path_factory.mktemp("undisturbed") / "small.zarr")
     assert outcome.complete
     return outcome.store

@@ -9,7 +9,7 @@ from sweep.model.realisations import Means, realise
 from sweep.model.shot import statistics
 
 
-def evaluate(
+def mean_statistics(
     parameters: Parameters,
     effects: Collection[str],
     *,
@@ -19,6 +19,6 @@ def evaluate(
 ) -> dict[str, np.ndarray]:
     """Statistics of n shots, (n,) by name, means over draws of random effects as realised."""
     means = Means(len(keys))
-    for stretch in realise(parameters, effects, keys=keys, first_draw=first_draw, draws=draws):
-        means.add(stretch.point, statistics(stretch.shots))
+    for batch in realise(parameters, effects, keys=keys, first_draw=first_draw, draws=draws):
+        means.add(batch.point, statistics(batch.shots))
     return means.results()

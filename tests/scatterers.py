@@ -17,8 +17,8 @@ from scipy.special import ndtri
 
 SPEED_OF_LIGHT = 299_792_458.0
 SEGMENTS = ("up", "doppler", "down")
-SLOPES = {"up": 1.0, "doppler": 0.0, "down": -1.0}
-FFT_BINS_MIN = 5
+CHIRP_SLOPE_SIGNS = {"up": 1.0, "doppler": 0.0, "down": -1.0}
+FFT_FROM_BINS = 5
 """Bins from which an FFT is faster than a sum for every bin."""
 
 
@@ -52,7 +52,7 @@ class Facet:
     complex_record: bool = False
     looks: int = 1
     """Waveforms that follow one another."""
-    slide: float = 0.0
+    footprint_slide_speed: float = 0.0
     """Speed at which the range falls beyond the scatterers' radial velocity [m/s].
 
     The beam slides over the ground, and other scatterers of the same mean power take the places of
@@ -60,20 +60,24 @@ class Facet:
 
 
 def scatterer_delays(
-    facet: Facet, number: int, rng: np.random.Generator
+    facet: Facet, n_scatterers: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """Delay at the shot's start [s] and Doppler ratio 2 v / c of scatterers, (number,) each.
 
     Along the slope there is one scatterer in each of as many strata of equal echo power; across it
     they are random. All have the same mean power.
     """
-    along = facet.beam_deviation * ndtri((np.arange(number) + rng.random(number)) / number)
-    across = facet.beam_deviation * rng.normal(size=number)
+    along_slope = facet.beam_deviation * ndtri(
+        (np.arange(n_scatterers) + rng.random(n_scatterers)) / n_scatterers
+    )
+    across_slope = facet.beam_deviation * rng.normal(size=n_scatterers)
     # The facet contains the point R on the axis; positive `along` is towards the far side.
-    depth = facet.range + along / np.tan(facet.grazing_angle)
-    distance = np.hypot(depth, np.hypot(along, across))
-    closing = facet.radial_velocity * depth - facet.transverse_velocity * along
-    return 2 * distance / SPEED_OF_LIGHT, 2 * closing / distance / SPEED_OF_LIGHT
+    range_on_axis = facet.range + along_slope / np.tan(facet.grazing_angle)
+    distance = np.hypot(range_on_axis, np.hypot(along_slope, across_slope))
+    closing_speed_times_range = (
+        facet.radial_velocity * range_on_axis - facet.transverse_velocity * along_slope
+    )
+    return 2 * distance / SPEED_OF_LIGHT, 2 * closing_speed_times_range / distance / SPEED_OF_LIGHT
 
 
 def scatterer_spectra(
@@ -93,23 +97,25 @@ def scatterer_spectra(
     time = facet.acquisition_delay + samples / facet.sample_rate
     start = facet.segments.index(segment) + look * len(facet.segments)
     start *= facet.duration + facet.gap
-    slope = SLOPES[segment] * facet.bandwidth / facet.duration
+    chirp_rate = CHIRP_SLOPE_SIGNS[segment] * facet.bandwidth / facet.duration
     carrier = carrier_frequency(facet, segment)
     tau_0, beta = delay[:, None], doppler[:, None]
-    tau = tau_0 - (beta + 2 * facet.slide / SPEED_OF_LIGHT) * (start + time)
+    tau = tau_0 - (beta + 2 * facet.footprint_slide_speed / SPEED_OF_LIGHT) * (start + time)
     # Whole cycles go first: float64 cannot hold them together with their fraction.
     cycles = -np.mod(carrier * tau_0, 1.0) + carrier * beta * (start + time)
-    cycles += slope * tau * (tau / 2 - time)
-    exists = (time >= tau) & (time <= facet.duration)
-    record = facet.window * exists * np.exp(2j * np.pi * np.mod(cycles, 1.0))
-    if bins.size < FFT_BINS_MIN:
-        turned = np.exp(-2j * np.pi * (np.outer(samples, bins) % facet.fft_size) / facet.fft_size)
-        return record @ turned, record @ turned.conj()
+    cycles += chirp_rate * tau * (tau / 2 - time)
+    echo_exists = (time >= tau) & (time <= facet.duration)
+    record = facet.window * echo_exists * np.exp(2j * np.pi * np.mod(cycles, 1.0))
+    if bins.size < FFT_FROM_BINS:
+        transform = np.exp(
+            -2j * np.pi * (np.outer(samples, bins) % facet.fft_size) / facet.fft_size
+        )
+        return record @ transform, record @ transform.conj()
     spectrum = np.fft.fft(record, facet.fft_size)
     return spectrum[:, bins % facet.fft_size], spectrum[:, -bins % facet.fft_size]
 
 
-def noise_factor(facet: Facet, bins: np.ndarray) -> np.ndarray:
+def noise_covariance_root(facet: Facet, bins: np.ndarray) -> np.ndarray:
     """Matrix (2 k, r) that makes real and imaginary parts of bins from unit normal numbers.
 
     Of white noise of unit variance in each sample, real, or in I and Q each half.
@@ -124,7 +130,7 @@ def noise_factor(facet: Facet, bins: np.ndarray) -> np.ndarray:
     return vectors * np.sqrt(np.maximum(values, 0.0))
 
 
-class Records(NamedTuple):
+class SpectrumDraws(NamedTuple):
     """Draws of the spectra of several looks of a shot, by segment."""
 
     values: dict[str, np.ndarray]
@@ -133,25 +139,25 @@ class Records(NamedTuple):
     """(k,): mean of |X|^2 over speckle and looks, without noise."""
 
 
-def draw_records(
+def draw_spectra(
     facet: Facet,
     *,
     bins: Mapping[str, np.ndarray],
-    amplitude: Mapping[str, float],
+    amplitude_by_segment: Mapping[str, float],
     noise_deviation: float,
     draws: int,
     seed: int,
     speckle: str = "motion",
     scatterers: int = 96,
-    renewals: int = 8,
-) -> Iterator[Records]:
+    n_scatterer_sets: int = 8,
+) -> Iterator[SpectrumDraws]:
     """Yield batches of drawn shots.
 
     Parameters
     ----------
     bins
         By segment, (k,); of complex records signed.
-    amplitude
+    amplitude_by_segment
         By segment, root of the mean square amplitude of the beat [V]: the record is ``amplitude
         cos(psi)`` of a single line whose power is that of the whole echo.
     noise_deviation
@@ -163,16 +169,16 @@ def draw_records(
         ``independent``.
     """
     rng = np.random.default_rng(seed)
-    number = draws // renewals
-    for _ in range(renewals):
+    draws_per_set = draws // n_scatterer_sets
+    for _ in range(n_scatterer_sets):
         delay, doppler = scatterer_delays(facet, scatterers, rng)
-        shape = (facet.looks if speckle == "independent" else 1, number, scatterers)
-        waves = rng.normal(size=shape) + 1j * rng.normal(size=shape)
-        waves /= np.sqrt(2 * scatterers)
+        shape = (facet.looks if speckle == "independent" else 1, draws_per_set, scatterers)
+        scatterer_amplitudes = rng.normal(size=shape) + 1j * rng.normal(size=shape)
+        scatterer_amplitudes /= np.sqrt(2 * scatterers)
         values, mean_power = {}, {}
         for segment in facet.segments:
-            factor = noise_deviation * noise_factor(facet, bins[segment])
-            records, power = [], np.zeros(bins[segment].size)
+            noise_root = noise_deviation * noise_covariance_root(facet, bins[segment])
+            spectra_by_look, power = [], np.zeros(bins[segment].size)
             for look in range(facet.looks):
                 if look == 0 or speckle == "motion":
                     at_bins, at_negatives = scatterer_spectra(
@@ -181,40 +187,44 @@ def draw_records(
                 power += (np.abs(at_bins) ** 2).mean(axis=0)
                 if not facet.complex_record:
                     power += (np.abs(at_negatives) ** 2).mean(axis=0)
-                wave = waves[look if speckle == "independent" else 0]
-                echo = wave @ at_bins
+                look_amplitudes = scatterer_amplitudes[look if speckle == "independent" else 0]
+                echo = look_amplitudes @ at_bins
                 if not facet.complex_record:
-                    echo += np.conj(wave @ at_negatives)
-                parts = rng.normal(size=(number, factor.shape[1])) @ factor.T
-                noise = parts[:, : bins[segment].size] + 1j * parts[:, bins[segment].size :]
-                records.append(amplitude[segment] / 2 * echo + noise)
-            mean_power[segment] = amplitude[segment] ** 2 / 4 * power / facet.looks
-            values[segment] = np.stack(records, axis=1)
-        yield Records(values, mean_power)
+                    echo += np.conj(look_amplitudes @ at_negatives)
+                noise_parts = rng.normal(size=(draws_per_set, noise_root.shape[1])) @ noise_root.T
+                noise = (
+                    noise_parts[:, : bins[segment].size] + 1j * noise_parts[:, bins[segment].size :]
+                )
+                spectra_by_look.append(amplitude_by_segment[segment] / 2 * echo + noise)
+            mean_power[segment] = amplitude_by_segment[segment] ** 2 / 4 * power / facet.looks
+            values[segment] = np.stack(spectra_by_look, axis=1)
+        yield SpectrumDraws(values, mean_power)
 
 
 def carrier_frequency(facet: Facet, segment: str) -> float:
     """Optical frequency at the start of a segment [Hz]."""
-    return SPEED_OF_LIGHT / facet.wavelength + (facet.bandwidth if SLOPES[segment] < 0 else 0.0)
+    return SPEED_OF_LIGHT / facet.wavelength + (
+        facet.bandwidth if CHIRP_SLOPE_SIGNS[segment] < 0 else 0.0
+    )
 
 
 def echo_beat(facet: Facet, segment: str) -> float:
     """Beat frequency of a scatterer on the beam's axis in the middle of the record [Hz]."""
     tau = 2 * facet.range / SPEED_OF_LIGHT
     beta = 2 * facet.radial_velocity / SPEED_OF_LIGHT
-    slope = SLOPES[segment] * facet.bandwidth / facet.duration
+    chirp_rate = CHIRP_SLOPE_SIGNS[segment] * facet.bandwidth / facet.duration
     start = facet.segments.index(segment) * (facet.duration + facet.gap)
     middle = facet.acquisition_delay + facet.window.size / facet.sample_rate / 2
-    beat = carrier_frequency(facet, segment) * beta - slope * (tau - beta * start) * (1 + beta)
-    return beat + slope * 2 * beta * middle
+    beat = carrier_frequency(facet, segment) * beta - chirp_rate * (tau - beta * start) * (1 + beta)
+    return beat + chirp_rate * 2 * beta * middle
 
 
-def echo_bins(facet: Facet, segment: str, reach: int) -> np.ndarray:
-    """Bins within ``reach`` of the middle of the echo, as far as the spectrum has them, (k,)."""
-    cycles = echo_beat(facet, segment) / facet.sample_rate
+def echo_bins(facet: Facet, segment: str, half_width_bins: int) -> np.ndarray:
+    """Bins within ``half_width_bins`` of the middle of the echo, if the spectrum has them, (k,)."""
+    cycles_per_sample = echo_beat(facet, segment) / facet.sample_rate
     size = facet.fft_size
     if facet.complex_record:
-        centre = round((cycles - np.rint(cycles)) * size)
-        return np.arange(centre - reach, centre + reach + 1)
-    centre = round(abs(cycles - np.rint(cycles)) * size)
-    return np.arange(max(centre - reach, 0), min(centre + reach, size // 2) + 1)
+        centre = round((cycles_per_sample - np.rint(cycles_per_sample)) * size)
+        return np.arange(centre - half_width_bins, centre + half_width_bins + 1)
+    centre = round(abs(cycles_per_sample - np.rint(cycles_per_sample)) * size)
+    return np.arange(max(centre - half_width_bins, 0), min(centre + half_width_bins, size // 2) + 1)

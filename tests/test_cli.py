@@ -13,13 +13,14 @@ from pathlib import Path
 import pytest
 import yaml
 from click.testing import CliRunner
-from drawn_files import shows
+from figure_files import has_content
 
 from sweep.cli import main
-from sweep.spec import Spec, load
-from sweep.tasks import driver, progress
-from sweep.tasks.journal import Lock
-from sweep.tasks.session import LITTLE, RunOptions, about_seconds
+from sweep.spec import GridSpec, load
+from sweep.tasks import driver
+from sweep.tasks.engine import progress
+from sweep.tasks.engine.journal import StoreLock
+from sweep.tasks.engine.session import SERIAL_CPU_SECONDS_MAX, RunOptions, estimate_cpu_seconds
 
 STUDY = """\
 title: A small study
@@ -58,7 +59,7 @@ def here(tmp_path, monkeypatch):
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """The small study's store; not to be changed."""
-    spec = Spec.from_mapping(yaml.safe_load(STUDY))
+    spec = GridSpec.from_mapping(yaml.safe_load(STUDY))
     store = tmp_path_factory.mktemp("made") / "small.zarr"
     return driver.run(spec, store=store, scheduler="none", progress=False).store
 
@@ -100,29 +101,29 @@ def test_the_summary_counts_what_the_store_holds(ran):
     import numpy as np
     import xarray as xr
 
-    from sweep.tasks.summary import summary
+    from sweep.tasks.studies.store_summary import detection_summary
 
-    heading, rows, share = summary(ran / "results" / "small.zarr")
+    heading, rows, share = detection_summary(ran / "results" / "small.zarr")
     assert heading == "range [m]" and share == 1
     shot = xr.open_zarr(ran / "results" / "small.zarr").pd_shot
-    assert [row.points for row in rows] == [8] * 10 + [80]
+    assert [row.n_points for row in rows] == [8] * 10 + [80]
     first = shot.isel(range=slice(0, 4)).values
-    assert rows[0].detected == np.count_nonzero(first > 0.9) / 8
-    assert rows[-1].pd_shot == np.median(shot.values)
-    assert 0 < rows[-1].detected < 1
+    assert rows[0].detected_fraction == np.count_nonzero(first > 0.9) / 8
+    assert rows[-1].median_pd_shot == np.median(shot.values)
+    assert 0 < rows[-1].detected_fraction < 1
 
 
 def test_the_table_of_a_large_study_is_by_some_of_its_blocks_and_says_so(ran, monkeypatch):
-    from sweep.tasks import summary
+    from sweep.tasks.studies import store_summary
 
-    _, whole, _ = summary.summary(ran / "results" / "small.zarr")
-    monkeypatch.setattr(summary, "MOST_BLOCKS", 4)
-    _, rows, share = summary.summary(ran / "results" / "small.zarr")
+    _, whole, _ = store_summary.detection_summary(ran / "results" / "small.zarr")
+    monkeypatch.setattr(store_summary, "SAMPLED_BLOCKS_MAX", 4)
+    _, rows, share = store_summary.detection_summary(ran / "results" / "small.zarr")
     assert share == 4 / 10
-    assert rows[-1].points == 4 * 8 and whole[-1].points == 10 * 8
-    kept = {row.part: row for row in whole}
-    assert sum(row.points > 0 for row in rows[:-1]) == 4  # a block is a part of this study
-    assert all(row == kept[row.part] for row in rows[:-1] if row.points)
+    assert rows[-1].n_points == 4 * 8 and whole[-1].n_points == 10 * 8
+    kept = {row.label: row for row in whole}
+    assert sum(row.n_points > 0 for row in rows[:-1]) == 4  # a block is a part of this study
+    assert all(row == kept[row.label] for row in rows[:-1] if row.n_points)
     assert "by 40 % of the blocks" in sweep("resume", "results/small.zarr").stdout
 
 
@@ -194,7 +195,7 @@ def test_a_mistake_ends_in_plain_words_and_exit_code_2(here, arguments, shown):
 def test_a_folder_that_can_not_be_written_is_told_in_a_line(here, monkeypatch, arguments):
     one = STUDY[: STUDY.index("axes:")].replace("target: {", "target: {range: 2 km, ")
     (here / "small.yaml").write_text(one)
-    driver.run(Spec.from_mapping(yaml.safe_load(one)), store="a.zarr", scheduler="none",
+    driver.run(GridSpec.from_mapping(yaml.safe_load(one)), store="a.zarr", scheduler="none",
                progress=False)  # fmt: skip
     (here / "no").write_text("a file in the folder's place")
     refused(sweep(*arguments), "no", ": mend that, or name another place\n")
@@ -248,7 +249,7 @@ def test_a_path_after_an_equals_sign_may_begin_at_home(here, monkeypatch):
 def test_status_tells_who_is_at_work(ran):
     log = ran / "results" / "small.zarr" / ".sweep" / "receipts.jsonl"
     log.write_bytes(b"".join(log.read_bytes().splitlines(keepends=True)[:-1]))
-    held = Lock(ran / "results" / "small.zarr")
+    held = StoreLock(ran / "results" / "small.zarr")
     shown = sweep("status", "results/small.zarr").stdout
     held.release()
     assert "72 of 80 points, 9 of 10 blocks" in shown
@@ -347,14 +348,14 @@ def test_no_number_is_cut_however_narrow_the_terminal_and_nothing_is_folded_with
 
 @pytest.mark.parametrize("columns", [40, 60, 80])
 def test_sentences_are_folded_to_a_terminal_and_commands_in_them_stay_whole(monkeypatch, columns):
-    from sweep.cli.terminal import folded
+    from sweep.cli.terminal import wrap_text
 
     command = "`sweep resume results/a_study.zarr`"
     text = f"  one.yaml:7: is no field, and {command} goes on with what there is by now"
-    assert folded(text) == text
+    assert wrap_text(text) == text
     monkeypatch.setenv("COLUMNS", str(columns))
     monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
-    lines = folded(f"2 mistakes:\n{text}").splitlines()
+    lines = wrap_text(f"2 mistakes:\n{text}").splitlines()
     assert max(map(len, lines)) <= columns and len(lines) > 2
     assert sum(command in line for line in lines) == 1
     assert " ".join(" ".join(lines).split()) == " ".join(f"2 mistakes:\n{text}".split())
@@ -388,25 +389,25 @@ def test_a_plan_and_a_run_tell_how_often_noise_raises_an_alarm(here, processing,
     ],
 )
 def test_the_remedy_for_many_false_alarms_names_a_field_that_the_study_has(processing, remedy):
-    from sweep.spec.noise_alarms import fewer_alarms
+    from sweep.spec.noise_alarms import fewer_alarms_remedy
 
     drawn = "draws: {method: spectra, number: 2}" if "detector" in processing else ""
-    spec = Spec.from_mapping(yaml.safe_load(STUDY.replace("tnr: 8", processing) + drawn))
-    assert fewer_alarms(spec) == remedy
+    spec = GridSpec.from_mapping(yaml.safe_load(STUDY.replace("tnr: 8", processing) + drawn))
+    assert fewer_alarms_remedy(spec) == remedy
 
 
 def test_alarms_of_an_axis_of_thresholds_and_of_cfar_are_by_design(here):
-    from sweep.spec.noise_alarms import alarms_of_study
+    from sweep.spec.noise_alarms import alarm_probabilities
 
     text = STUDY.replace("instrument.laser.power: [1 W, 3 W]", "instrument.processing.tnr: [7, 9]")
     text = text.replace("tnr: 8", "tnr: 7")
-    (any_, both), last = alarms_of_study(Spec.from_mapping(yaml.safe_load(text)))
+    (any_, both), last = alarm_probabilities(GridSpec.from_mapping(yaml.safe_load(text)))
     p = 2.7183 ** (-(4 - 3.14159) / 4 * 49)
     assert any_ == pytest.approx(1 - (1 - p) ** 2**14, rel=1e-3)
     assert both == pytest.approx((1 - (1 - p) ** 2**13) ** 2, rel=1e-3) and last < (any_, both)
     cfar = STUDY.replace("tnr: 8", "tnr: 8, detector: {kind: ca_cfar, pfa: 1e-9}")
     drawn = yaml.safe_load(cfar + "draws: {method: spectra, number: 2}")
-    ((any_, _),) = alarms_of_study(Spec.from_mapping(drawn))
+    ((any_, _),) = alarm_probabilities(GridSpec.from_mapping(drawn))
     assert any_ == pytest.approx(2**14 * 1e-9, rel=1e-4)
 
 
@@ -424,36 +425,44 @@ def test_a_very_large_study_begins_only_after_a_question(here, monkeypatch):
     begun = []
     monkeypatch.setattr(driver, "run", lambda study, **how: begun.append(study) or sys.exit(0))
     assert sweep("run", "huge.yaml", "--yes").exit_code == 0 and len(begun) == 1
-    monkeypatch.setattr(terminal, "MEASURED", 10)
+    monkeypatch.setattr(terminal, "MEASURE_TIME_ABOVE_POINT_DRAWS", 10)
     assert sweep("run", "small.yaml").exit_code == 0 and len(begun) == 2
     with monkeypatch.context() as fewer:
-        fewer.setattr(terminal, "MOST_POINTS", 79)
+        fewer.setattr(terminal, "ASK_ABOVE_POINTS", 79)
         assert "takes --yes: 80 points" in sweep("plan", "small.yaml").stdout
-    monkeypatch.setattr(terminal, "MOST_SECONDS", 1e-9)
+    monkeypatch.setattr(terminal, "ASK_ABOVE_CPU_SECONDS", 1e-9)
     refused(sweep("run", "small.yaml"), "of one core: say --yes to begin it")
 
 
 @pytest.mark.parametrize("study", ["small.yaml", "hills.yaml"])
 def test_a_cost_is_told_of_what_is_simulated_and_is_no_more_than_that_of_its_points(here, study):
-    from sweep.tasks.plan import effects_table
-    from sweep.tasks.studies import study_of
+    from sweep.tasks.studies.study_loading import make_study
+    from sweep.tasks.studies.study_plan import effects_table
 
     (here / "hills.yaml").write_text(HILLS)
-    rows = effects_table(study_of(load(here / study), here / "none.zarr")).rows
-    assert [row.name for row in rows if row.cost == row.cost and not 0 < row.cost <= 1] == []
-    assert [row.name for row in rows if row.cost == row.cost and row.share == 0] == []
+    rows = effects_table(make_study(load(here / study), here / "none.zarr")).rows
+    assert [
+        row.name
+        for row in rows
+        if row.time_fraction == row.time_fraction and not 0 < row.time_fraction <= 1
+    ] == []
+    assert [
+        row.name
+        for row in rows
+        if row.time_fraction == row.time_fraction and row.simulated_fraction == 0
+    ] == []
 
 
 def test_a_plan_prints_nothing_where_the_last_that_it_looks_at_is_beyond_the_model(
     here, monkeypatch
 ):
     from sweep.model.unsupported import UnsupportedShot
-    from sweep.tasks import plan
+    from sweep.tasks.studies import study_plan
 
     def beyond(spec, **how):
         raise UnsupportedShot("full scale is exceeded: raise it")
 
-    monkeypatch.setattr(plan, "effects_table", beyond)
+    monkeypatch.setattr(study_plan, "effects_table", beyond)
     refused(sweep("plan", "small.yaml"), "full scale is exceeded: raise it")
 
 
@@ -467,25 +476,30 @@ def test_a_run_that_draws_and_its_status_tell_where_the_tolerance_is_missed(here
     import numpy as np
     import xarray as xr
 
-    from sweep.tasks.summary import accuracy_table
+    from sweep.tasks.studies.store_summary import draw_accuracy_rows
 
     (here / "drawn.yaml").write_text(STUDY + DRAWN)
     run = sweep("run", "drawn.yaml", "--scheduler", "none")
     told = sweep("status", "results/drawn.zarr")
     store = xr.open_zarr(here / "results" / "drawn.zarr")
-    rows = {row.name: row for row in accuracy_table(here / "results" / "drawn.zarr")}
+    rows = {row.name: row for row in draw_accuracy_rows(here / "results" / "drawn.zarr")}
     assert list(rows) == ["pd_up", "pd_doppler", "pd_down", "pd_shot"]
     for name, row in rows.items():
         widths = store[f"{name}_half_width"]
-        assert (row.points, row.met) == (80, int((widths <= 0.1).sum()))
-        assert row.error == widths.max() and row.missed == row.error - 0.1
-        assert row.number == 60 and row.needed == -(-60 * (row.error / 0.1) ** 2 // 1)
+        assert (row.n_points, row.n_met) == (80, int((widths <= 0.1).sum()))
+        assert row.worst_error == widths.max() and row.excess == row.worst_error - 0.1
+        assert row.samples_at_worst == 60 and row.draws_needed == -(
+            -60 * (row.worst_error / 0.1) ** 2 // 1
+        )
         worst = np.argwhere(widths.values == float(widths.max()))[0]
-        assert row.where.startswith(f"range {float(store.range[worst[0]]):.4g} m, power ")
+        assert row.worst_label.startswith(f"range {float(store.range[worst[0]]):.4g} m, power ")
         for result in (run, told):
-            assert f"{row.met} of 80" in result.stdout and f"{row.needed:,.0f}" in result.stdout
-    assert 0 < rows["pd_shot"].met < 80
-    assert store.accuracy_missed.max() == max(row.missed for row in rows.values())
+            assert (
+                f"{row.n_met} of 80" in result.stdout
+                and f"{row.draws_needed:,.0f}" in result.stdout
+            )
+    assert 0 < rows["pd_shot"].n_met < 80
+    assert store.accuracy_missed.max() == max(row.excess for row in rows.values())
     promised = store.pd_shot_half_width.attrs
     assert (promised["tolerance"], promised["confidence"]) == (0.1, 0.95)
 
@@ -521,7 +535,7 @@ def test_shot_prints_its_report_and_draws_the_shot_that_was_asked_for(here):
     assert "2000.0000" in result.stdout and "45" in result.stdout
     files = [Path(line) for line in result.stdout.split("\n") if line.startswith("results/")]
     assert {file.suffix for file in files} == {".png", ".txt"}
-    assert all(shows(here / file) for file in files)
+    assert all(has_content(here / file) for file in files)
     refused(sweep("shot", "small.yaml", "--at", "range"), "is not NAME=VALUE")
     refused(sweep("shot", "small.yaml", "--at", "rnge=2km"), "rnge: is no parameter")
 
@@ -531,7 +545,7 @@ def test_figures_go_beside_the_store_or_where_asked(ran):
     assert beside and all(name.startswith("results/small-figures/") for name in beside)
     asked = sweep("figures", "results/small.zarr", "--output", "elsewhere").stdout.split()
     assert [Path(name).name for name in asked] == [Path(name).name for name in beside]
-    assert all(shows(ran / name) for name in beside)
+    assert all(has_content(ran / name) for name in beside)
     assert [(ran / name).read_bytes() for name in asked] == [
         (ran / name).read_bytes() for name in beside
     ]
@@ -619,9 +633,9 @@ def test_the_installed_command_runs_on_workers_and_can_be_interrupted(here):
 
 def test_lines_of_progress_come_at_the_start_now_and_then_and_at_the_end(capsys, monkeypatch):
     with monkeypatch.context() as often:
-        often.setattr(progress, "LINE_EVERY", 0.0)
+        often.setattr(progress, "LINE_INTERVAL", 0.0)
         _lines_of_progress(capsys)
-    patient = progress.Lines()
+    patient = progress.ProgressLines()
     patient.begin(points=100, done=0, unit="points")
     for _ in range(50):
         patient.advance(points=1, failed=0)
@@ -629,7 +643,7 @@ def test_lines_of_progress_come_at_the_start_now_and_then_and_at_the_end(capsys,
 
 
 def _lines_of_progress(capsys):
-    lines = progress.Lines()
+    lines = progress.ProgressLines()
     lines.begin(points=100, done=20, unit="points")
     lines.advance(points=30, failed=0)
     lines.advance(points=0, failed=2)
@@ -652,31 +666,31 @@ def _lines_of_progress(capsys):
     ],
 )
 def test_durations_are_said_in_words(seconds, text):
-    assert progress.duration(seconds) == text
+    assert progress.duration_text(seconds) == text
 
 
 def test_a_run_without_a_place_uses_the_specs_execution_and_options_come_first(here):
-    spec = Spec.from_mapping(
+    spec = GridSpec.from_mapping(
         {**yaml.safe_load(STUDY), "execution": {"workers": 3, "scheduler": "none"}}, base=here
     )
-    assert RunOptions().place(spec) is None
-    assert RunOptions(workers=2).place(spec).workers == (2, 2)
-    spec = Spec.from_mapping({**yaml.safe_load(STUDY), "execution": {"workers": 3}}, base=here)
-    assert RunOptions().place(spec).workers == (3, 3)
+    assert RunOptions().resolve_cluster(spec) is None
+    assert RunOptions(workers=2).resolve_cluster(spec).workers == (2, 2)
+    spec = GridSpec.from_mapping({**yaml.safe_load(STUDY), "execution": {"workers": 3}}, base=here)
+    assert RunOptions().resolve_cluster(spec).workers == (3, 3)
 
 
 def test_little_work_is_done_here_and_more_by_workers_unless_it_is_said_otherwise(here):
     little, large = yaml.safe_load(STUDY), yaml.safe_load(STUDY)
     large["axes"]["target.range"]["number"] = 10**6
-    little, large = (Spec.from_mapping(mapping, base=here) for mapping in (little, large))
-    assert about_seconds(little) < LITTLE < about_seconds(large)
-    assert RunOptions().place(little) is None
-    assert RunOptions().place(large).kind == "local"
+    little, large = (GridSpec.from_mapping(mapping, base=here) for mapping in (little, large))
+    assert estimate_cpu_seconds(little) < SERIAL_CPU_SECONDS_MAX < estimate_cpu_seconds(large)
+    assert RunOptions().resolve_cluster(little) is None
+    assert RunOptions().resolve_cluster(large).kind == "local"
     for said in ({"workers": 1}, {"processes": False}, {"block_timeout": 9.0},
                  {"performance_report": "r.html"}, {"evaluate": print}):  # fmt: skip
-        assert RunOptions(**said).place(little).kind == "local"
-    assert RunOptions(scheduler="tcp://10.0.0.5:8786").place(little).kind == "scheduler"
-    assert RunOptions(scheduler="none").place(large) is None
+        assert RunOptions(**said).resolve_cluster(little).kind == "local"
+    assert RunOptions(scheduler="tcp://10.0.0.5:8786").resolve_cluster(little).kind == "scheduler"
+    assert RunOptions(scheduler="none").resolve_cluster(large) is None
 
 
 def test_a_study_is_extended_by_the_file_of_a_larger_one(ran):

@@ -3,7 +3,7 @@
 import pytest
 from test_cli import STUDY, refused, sweep
 
-from sweep.tasks.accuracy import measure
+from sweep.tasks.accuracy import measurement
 
 
 @pytest.fixture
@@ -12,9 +12,9 @@ def here(tmp_path, monkeypatch):
     coherent = STUDY.replace("beamlets: 9", "beamlets: 9, phases: coherent")
     (tmp_path / "small.yaml").write_text(coherent)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(measure, "MOST_ROUNDS", 1)
-    monkeypatch.setattr(measure, "LONG_ENOUGH", 1e-4)
-    monkeypatch.setattr(measure, "UNTIL_TRUTH", 0.0)
+    monkeypatch.setattr(measurement, "ROUNDS_MAX", 1)
+    monkeypatch.setattr(measurement, "TRIAL_TIME_FRACTION", 1e-4)
+    monkeypatch.setattr(measurement, "TIME_DOMAIN_TIME_FRACTION", 0.0)
     return tmp_path
 
 
@@ -55,35 +55,35 @@ def test_mistakes_end_in_plain_words_and_exit_code_2(here):
 
 def test_nothing_is_left_where_it_is_broken_off_at_once(here, monkeypatch):
     def broken(self):
-        raise measure.Nothing
+        raise measurement.NothingMeasured
 
-    monkeypatch.setattr(measure.Measurement, "run", broken)
+    monkeypatch.setattr(measurement.Measurement, "run", broken)
     result = sweep("accuracy", "small.yaml")
     assert result.exit_code == 3 and "nothing is kept" in result.stderr
     assert not (here / "results").exists()
 
 
 def test_what_is_kept_of_an_interrupted_measurement_is_told_with_exit_code_3(here, monkeypatch):
-    whole = measure.Measurement.run
+    whole = measurement.Measurement.run
 
     def cut(self):
         found = whole(self)
-        found.stopped = "interrupted"
+        found.stop_reason = "interrupted"
         return found
 
-    monkeypatch.setattr(measure.Measurement, "run", cut)
+    monkeypatch.setattr(measurement.Measurement, "run", cut)
     result = sweep("accuracy", "small.yaml", "--points", "3")
     assert result.exit_code == 3 and "(interrupted): 3 points" in result.stdout
     assert (here / "results" / "small_accuracy.png").exists()
 
 
 def test_a_study_that_was_run_into_its_place_meanwhile_is_left_alone(here, monkeypatch):
-    whole, store = measure.Measurement.run, "results/small_accuracy.zarr"
+    whole, store = measurement.Measurement.run, "results/small_accuracy.zarr"
 
     def beside_another(self):
         assert sweep("run", "small.yaml", "--scheduler", "none", "--store", store).exit_code == 0
         return whole(self)
 
-    monkeypatch.setattr(measure.Measurement, "run", beside_another)
+    monkeypatch.setattr(measurement.Measurement, "run", beside_another)
     refused(sweep("accuracy", "small.yaml", "--points", "3", "--overwrite"), "a study's results")
     assert "complete" in sweep("status", store).stdout

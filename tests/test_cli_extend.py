@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from small import quiet, small, tree
+from small_studies import file_digests, run_serially, small_spec
 from test_cli import sweep
 
 POWER = "axes.instrument.laser.power"
@@ -13,13 +13,13 @@ POWER = "axes.instrument.laser.power"
 def store(tmp_path, monkeypatch):
     """The store of a study of four points, in the folder that one is in."""
     monkeypatch.chdir(tmp_path)
-    return quiet(four("[1 W, 3 W]"), tmp_path / "four.zarr").store.name
+    return run_serially(four("[1 W, 3 W]"), tmp_path / "four.zarr").store.name
 
 
 def four(powers):
     """A study of two ranges and some powers."""
     axes = {"target.range": ["1 km", "2 km"], "instrument.laser.power": powers[1:-1].split(", ")}
-    return small(axes=axes)
+    return small_spec(axes=axes)
 
 
 def test_it_says_what_there_is_and_ends_with_the_larger_study(store):
@@ -27,7 +27,9 @@ def test_it_says_what_there_is_and_ends_with_the_larger_study(store):
     assert result.exit_code == 0
     assert "4 of 6 points are there; 2 to compute" in result.stderr
     assert "four.zarr: 6 of 6 points, computed 1 of 1 blocks" in result.stdout
-    assert tree(Path(store)) == tree(quiet(four("[1 W, 2 W, 3 W]"), Path("again.zarr")).store)
+    assert file_digests(Path(store)) == file_digests(
+        run_serially(four("[1 W, 2 W, 3 W]"), Path("again.zarr")).store
+    )
     again = sweep("extend", store, "--set", f"{POWER}=[1 W, 2 W, 3 W]", "--scheduler", "none")
     assert again.exit_code == 0 and "nothing to extend" in again.stderr
 
@@ -49,7 +51,7 @@ def test_it_says_what_there_is_and_ends_with_the_larger_study(store):
     ],
 )
 def test_mistakes_are_told_in_words_and_nothing_changes(store, arguments, told):
-    before = tree(Path(store))
+    before = file_digests(Path(store))
     result = sweep("extend", store, *arguments)
     assert result.exit_code == 2 and told in result.stderr and "Traceback" not in result.stderr
-    assert tree(Path(store)) == before and [p.name for p in Path().iterdir()] == [store]
+    assert file_digests(Path(store)) == before and [p.name for p in Path().iterdir()] == [store]

@@ -8,8 +8,8 @@ import yaml
 from test_cli import STUDY, refused, sweep
 
 from sweep.spec import SceneSpec
-from sweep.tasks.eyepoint_study import world_of
-from sweep.tasks.session import LITTLE, RunOptions, about_seconds
+from sweep.tasks.engine.session import SERIAL_CPU_SECONDS_MAX, RunOptions, estimate_cpu_seconds
+from sweep.tasks.studies.eyepoint_study import build_world
 
 SCENE = (
     STUDY.split("target:")[0]
@@ -41,8 +41,11 @@ def test_a_small_flight_is_little_work_where_its_rays_are_counted(here):
     counted = yaml.safe_load(SCENE)
     by_tolerance = counted | {"footprint": {"speckle": "none"}}
     of = [SceneSpec.from_mapping(each, base=here) for each in (counted, by_tolerance)]
-    assert RunOptions().place(of[0]) is None and about_seconds(of[0]) < LITTLE
-    assert RunOptions().place(of[1]).kind == "local"
+    assert (
+        RunOptions().resolve_cluster(of[0]) is None
+        and estimate_cpu_seconds(of[0]) < SERIAL_CPU_SECONDS_MAX
+    )
+    assert RunOptions().resolve_cluster(of[1]).kind == "local"
 
 
 def test_a_scene_is_planned_run_and_exported(here):
@@ -165,5 +168,5 @@ def test_a_file_that_changes_under_a_study_is_noticed(here):
     refused(sweep("run", "array.yaml", "--store", store), "another study", "ground")
     (eyepoints,) = (here / "results" / "eyepoints").iterdir()
     (eyepoints / "offset" / "c" / "0" / "0").unlink()
-    world_of.cache_clear()  # as in another process
+    build_world.cache_clear()  # as in another process
     refused(sweep("resume", store, "--scheduler", "none"), "ground.npy", "changed")

@@ -10,7 +10,7 @@ from test_cli import STUDY
 from test_cli import sweep as command
 
 import sweep
-from sweep.spec import Spec
+from sweep.spec import GridSpec
 
 DRAWS = 30
 
@@ -50,7 +50,7 @@ def test_spectra_are_those_that_the_study_looks_at(here):
             counted = int(near.any("frequency").sum())
             assert 0 < counted < DRAWS
             assert counted == int(store[f"n_detected_{segment}"].sel(range=3))
-    assert Spec.from_stored(found.attrs["spec"]).id == sweep.load("small.yaml").id
+    assert GridSpec.from_stored(found.attrs["spec"]).id == sweep.load("small.yaml").id
 
 
 @pytest.mark.parametrize("record", ["real", "complex"])

@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drawn_files import shows
+from figure_files import has_content
 
 import sweep
-from sweep.analysis.figures import draw
-from sweep.analysis.selection import is_any
+from sweep.analysis.selection import matches_any
+from sweep.analysis.study_figures import draw_figures
 from sweep.model.outputs import (
     ACCURACY_OUTPUTS,
     DRAW_OUTPUTS,
@@ -16,11 +16,11 @@ from sweep.model.outputs import (
     OUTPUTS,
     SPECTRA_OUTPUTS,
 )
-from sweep.spec import SceneSpec, Spec
-from sweep.spec.reading import read_document
+from sweep.spec import GridSpec, SceneSpec
+from sweep.spec.yaml_document import read_document
 
 EXPERIMENTS = sorted((Path(__file__).parents[1] / "experiments").glob("*.yaml"))
-SCENES = [path for path in EXPERIMENTS if "scene" in read_document(path).value]
+SCENES = [path for path in EXPERIMENTS if "scene" in read_document(path).content]
 GRIDS = [path for path in EXPERIMENTS if path not in SCENES]
 OF_EACH_KIND = "quickstart", "range_angle_coarse", "speckled_target", "cfar", "morpheus_three_beam"
 """Run each time; `make test-all` has all."""
@@ -40,7 +40,7 @@ def _shown(paths):
 
 
 def _written(member, kept):
-    values = np.asarray(member.display)[kept].tolist()
+    values = np.asarray(member.display_values)[kept].tolist()
     return [f"{value!r} {member.units}".strip() if member.units else value for value in values]
 
 
@@ -48,16 +48,16 @@ def _held(spec, axis):
     """Places of the values of a plain axis at which figures hold it."""
     written = [figure.where[axis.name] for figure in spec.figures
                if axis.name in getattr(figure, "where", {})]  # fmt: skip
-    held = [spec.coordinate_value(axis.name, value) for several in written
+    held = [spec.read_coordinate(axis.name, value) for several in written
             for value in (several if isinstance(several, list | tuple) else [several])]  # fmt: skip
-    return np.flatnonzero(is_any(np.asarray(axis.members[0].display), held))
+    return np.flatnonzero(matches_any(np.asarray(axis.parameters[0].display_values), held))
 
 
 def _kept(spec, axis):
-    if not axis.zipped:
+    if not axis.is_zipped:
         spread = np.linspace(0, axis.size - 1, min(KEPT, axis.size)).round().astype(int)
         return np.union1d(spread, _held(spec, axis))
-    angles = np.concatenate([m.values for m in axis.members if m.path.endswith("grazing_angle")])
+    angles = np.concatenate([m.values for m in axis.parameters if m.path.endswith("grazing_angle")])
     starts = np.flatnonzero(np.diff(angles, prepend=np.nan))[:4]
     return np.unique([*starts, *(starts + 2), axis.size - 1])
 
@@ -66,11 +66,11 @@ def _thinned(spec):
     """The same study with a few values left on every axis."""
     mapping, axes = spec.to_yaml_mapping(), {}
     for axis in spec.axes:
-        written = {m.path: _written(m, _kept(spec, axis)) for m in axis.members}
-        axes |= {axis.name: {"zip": [written]}} if axis.zipped else written
-    if isinstance(spec, Spec) and spec.draws.whole_spectra:
+        written = {m.path: _written(m, _kept(spec, axis)) for m in axis.parameters}
+        axes |= {axis.name: {"zip": [written]}} if axis.is_zipped else written
+    if isinstance(spec, GridSpec) and spec.draws.draws_whole_spectra:
         mapping["draws"] |= {"number": 5}
-    return Spec.from_mapping(mapping | {"axes": axes})
+    return GridSpec.from_mapping(mapping | {"axes": axes})
 
 
 @pytest.mark.parametrize("path", _shown(GRIDS))
@@ -82,16 +82,16 @@ def test_experiment_runs_to_store_and_figures(path, tmp_path):
     store = tmp_path / "tiny.zarr"
     assert sweep.run(_thinned(spec), store=store, scheduler="none", progress=False).complete
     dataset = sweep.open(store)
-    drawn = {*ERROR_OUTPUTS, *ACCURACY_OUTPUTS, *DRAW_OUTPUTS} if spec.draws.any else set()
+    drawn = {*ERROR_OUTPUTS, *ACCURACY_OUTPUTS, *DRAW_OUTPUTS} if spec.draws.has_draws else set()
     stored = {*OUTPUTS, *drawn}
-    if spec.draws.whole_spectra:
+    if spec.draws.draws_whole_spectra:
         stored = {*SPECTRA_OUTPUTS, *ACCURACY_OUTPUTS, *DRAW_OUTPUTS}
     assert set(dataset.data_vars) == {*stored, "effects", "effects_error"}
     seen = dataset.pd_doppler > 0.2  # else there may be no draw to average over
     footprint = spec.footprint
     is_checked = footprint.beamlets == 0 and footprint.phases == "incoherent"
     for name, variable in dataset.data_vars.items():
-        resolved = spec.draws.whole_spectra and name.startswith(("range_", "radial_"))
+        resolved = spec.draws.draws_whole_spectra and name.startswith(("range_", "radial_"))
         if name == "beamlets_error" and not is_checked:
             assert np.isnan(variable).all()
         else:
@@ -100,13 +100,13 @@ def test_experiment_runs_to_store_and_figures(path, tmp_path):
             assert ((variable >= 0) & (variable <= 1)).all(), name
     if "miss_shot" in dataset:
         np.testing.assert_allclose(dataset.pd_shot + dataset.miss_shot, 1, atol=1e-14)
-    files = draw(store, tmp_path / "figures")
-    assert len(files) >= len(spec.figures) and all(map(shows, files))
+    files = draw_figures(store, tmp_path / "figures")
+    assert len(files) >= len(spec.figures) and all(map(has_content, files))
 
 
 def _lightened(path):
     """The same study of a scene with fewer beamlets and draws; skipped without its files."""
-    document = read_document(path).value
+    document = read_document(path).content
     files = [thing.get("file") for thing in document["scene"]["objects"].values()]
     for file in filter(None, files):
         if not (path.parent / file).exists():
@@ -132,5 +132,5 @@ def test_experiment_over_a_scene_runs_to_store_and_figures(path, tmp_path):
         points = cloud.flags.values > 0
         assert (np.isfinite(cloud.range.values) == points).all()
         assert points.any()
-    files = draw(store, tmp_path / "figures")
-    assert len(files) >= len(spec.figures) and all(map(shows, files))
+    files = draw_figures(store, tmp_path / "figures")
+    assert len(files) >= len(spec.figures) and all(map(has_content, files))

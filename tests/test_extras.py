@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from sweep.cli import main
-from sweep.extras import EXTRAS, remedy
+from sweep.extras import EXTRA_BY_MODULE, install_hint
 
 ROOT = Path(__file__).parents[1]
 OPTIONAL = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
@@ -21,11 +21,13 @@ def imported(extra):
     return {name.replace("-", "_").lower() for name in names}
 
 
-@pytest.mark.parametrize("module", EXTRAS)
+@pytest.mark.parametrize("module", EXTRA_BY_MODULE)
 def test_every_optional_module_is_brought_by_its_extra(module):
-    brought = imported(EXTRAS[module])
-    assert module in brought or EXTRAS[module] == "kubernetes"  # its own packages' dependencies
-    assert EXTRAS[module] in OPTIONAL["all"][0]
+    brought = imported(EXTRA_BY_MODULE[module])
+    assert (
+        module in brought or EXTRA_BY_MODULE[module] == "kubernetes"
+    )  # its own packages' dependencies
+    assert EXTRA_BY_MODULE[module] in OPTIONAL["all"][0]
 
 
 def test_a_missing_package_is_one_line_that_tells_what_installs_it(monkeypatch):
@@ -37,5 +39,5 @@ def test_a_missing_package_is_one_line_that_tells_what_installs_it(monkeypatch):
 
 
 def test_other_errors_have_no_remedy():
-    assert remedy(ModuleNotFoundError("No module named 'mine'", name="mine")) == ""
-    assert remedy(ValueError("trimesh")) == ""
+    assert install_hint(ModuleNotFoundError("No module named 'mine'", name="mine")) == ""
+    assert install_hint(ValueError("trimesh")) == ""

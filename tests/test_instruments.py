@@ -13,22 +13,22 @@ from click.testing import CliRunner
 
 import sweep
 from sweep.cli import main
-from sweep.spec import Spec, SpecError, load
-from sweep.spec.reading import library, read_document
+from sweep.spec import GridSpec, SpecError, load
+from sweep.spec.yaml_document import library_instruments, read_document
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "benchmarks"))
 
-import instruments as page  # noqa: E402
+import instruments_page as page  # noqa: E402
 
-NAMES = list(library())
+NAMES = list(library_instruments())
 DRAWS = 100
 """Shots at each of 64 places: some 300 are detected, and a deviation is known to 6 %."""
 
 
 def spec(instrument, **sections):
     target = {"range": "20 m", "grazing_angle": "60 deg", "reflectance": 0.1}
-    return Spec.from_mapping({"title": "A study", "instrument": instrument, "target": target,
+    return GridSpec.from_mapping({"title": "A study", "instrument": instrument, "target": target,
                               **sections})  # fmt: skip
 
 
@@ -41,10 +41,10 @@ def refusal(instrument):
 @pytest.mark.parametrize("name", NAMES)
 def test_an_instrument_has_its_published_numbers_and_the_page_has_those_that_are_simulated(name):
     """But for two deviations, which it draws of four times as many shots, and what rounds to 0."""
-    found, numbers = page.simulated(name, DRAWS), page.written(name)["numbers"]
+    found, numbers = page.simulate_numbers(name, DRAWS), page.instrument_file(name)["numbers"]
     assert set(found) == set(numbers)
     for key, number in numbers.items():
-        assert page.agrees(number, found[key]), (key, number, found[key])
+        assert page.is_within_allowed(number, found[key]), (key, number, found[key])
     text = (ROOT / "docs" / "instruments.md").read_text()
     part = text.split(f"\n## {name}\n")[1].split("\n## ")[0]
     for key, number in numbers.items():
@@ -53,7 +53,7 @@ def test_an_instrument_has_its_published_numbers_and_the_page_has_those_that_are
         assert cells[4] == "yes"
         if key not in ("sigma_range", "sigma_velocity", "pd_of_snr"):
             assert cells[2].split()[0] == f"{found[key]:.3g}"
-    for each in page.written(name)["assumed"]:
+    for each in page.instrument_file(name)["assumed"]:
         assert f"- {each}" in part
 
 
@@ -61,13 +61,13 @@ def test_an_instrument_has_its_published_numbers_and_the_page_has_those_that_are
 def test_a_name_and_all_that_it_stands_for_are_one_study(name):
     """The same id, and in a store nothing that would need the library."""
     named = spec(name)
-    assert named.id == spec(page.written(name)["instrument"]).id == spec({"like": name}).id
+    assert named.id == spec(page.instrument_file(name)["instrument"]).id == spec({"like": name}).id
     stored = json.loads(named.to_json())["instrument"]
     assert "like" not in stored
     assert set(stored) == {
         "laser", "chirp", "telescope", "receiver", "processing", "looks",
     }  # fmt: skip
-    assert Spec.from_stored(named.to_json()).id == named.id
+    assert GridSpec.from_stored(named.to_json()).id == named.id
 
 
 def test_the_tables_of_the_thesis_are_those_of_its_experiments():
@@ -102,14 +102,14 @@ def test_a_store_holds_the_instrument_in_whole(tmp_path):
 
 
 def test_a_file_of_the_same_name_is_named_by_its_path(tmp_path):
-    own = read_document(library()["rogers_2021"]).value["instrument"]
+    own = read_document(library_instruments()["rogers_2021"]).content["instrument"]
     own["laser"]["power"] = "5 mW"
     study = {"title": "A study", "target": {"range": "20 m", "grazing_angle": "60 deg",
                                             "reflectance": 0.1}}  # fmt: skip
     for name in ("rogers_2021", "mine"):
         (tmp_path / name).write_text(yaml.safe_dump(own))
     for written, power in (("rogers_2021", 4e-3), ("./rogers_2021", 5e-3), ("mine", 5e-3)):
-        found = Spec.from_mapping(study | {"instrument": written}, base=tmp_path)
+        found = GridSpec.from_mapping(study | {"instrument": written}, base=tmp_path)
         assert found.instrument.laser.power == power
 
 
@@ -131,14 +131,14 @@ def test_the_command_lists_the_library_and_tells_of_each(tmp_path):
     assert [line.split()[0] for line in listed.output.splitlines()] == NAMES
     for name in NAMES:
         told = CliRunner().invoke(main, ["instruments", name]).output
-        own = page.written(name)
+        own = page.instrument_file(name)
         assert own["source"] in told and own["doi"] in told
         assert yaml.safe_load(told[told.index("\ninstrument:") :])["instrument"].keys() == (
             own["instrument"].keys()
         )
         file = tmp_path / "own.yaml"
         file.write_text(told)
-        assert read_document(file).value["instrument"] == own["instrument"]
+        assert read_document(file).content["instrument"] == own["instrument"]
         assert spec({"file": str(file)}).id == spec(name).id
     wrong = CliRunner().invoke(main, ["instruments", "rogers"])
     assert wrong.exit_code == 2 and "did you mean 'rogers_2021'?" in wrong.output
@@ -162,8 +162,8 @@ def test_a_beat_of_n_photoelectrons_has_an_snr_of_n():
     # The simulator's SNR of as many, in the middle of bin 40, noise folded in by less than 1e-4
     slow = {"amplifier_noise_current": "0 A", "detector_bandwidth": "8 MHz",
             "amplifier_bandwidth": "8 MHz"}  # fmt: skip
-    place = 40 * page.LIGHT / (2 * 6e9)
-    study = page.study(
+    place = 40 * page.SPEED_OF_LIGHT / (2 * 6e9)
+    study = page.spec_before_target(
         {"like": "settembrini_2026", "receiver": slow},
         {"range": f"{place!r} m", "reflectance": 0.05},
     )
@@ -172,14 +172,16 @@ def test_a_beat_of_n_photoelectrons_has_an_snr_of_n():
     )
     light = 178e-6 * 0.23 * 0.05 / np.pi * 1310e-9**2 / (np.pi * square)
     electrons = 0.95 * light * 32e-6 / 1.602176634e-19
-    assert float(page.computed(study).snr_up) == pytest.approx(electrons, rel=1e-3)
+    assert float(page.run_study(study).snr_up) == pytest.approx(electrons, rel=1e-3)
 
 
 def test_draws_of_noise_follow_settembrinis_law():
     number = 4000
     axes = {"instrument.laser.power": {"log": ["100 uW", "10 mW"], "number": 5}}
     draws = {"method": "noise", "number": number}
-    seen = page.computed(page.study("settembrini_2026", page.WALL, axes=axes, draws=draws))
+    seen = page.run_study(
+        page.spec_before_target("settembrini_2026", page.WALL_TARGET, axes=axes, draws=draws)
+    )
     law = np.exp(-4 * np.pi / (1 + seen.snr_up))
     error = np.sqrt(law * (1 - law) / number)
     assert (abs(seen.n_detected_up / number - law) < 5 * error).all()

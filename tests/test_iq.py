@@ -15,7 +15,7 @@ from sweep.model.pairing import MISPAIRED, MISREAD, TRUE
 from sweep.model.shot import prepare, statistics
 from sweep.model.waveform import resolve
 from sweep.model.window import samples
-from sweep.spec import SceneSpec, Spec, SpecError
+from sweep.spec import GridSpec, SceneSpec, SpecError
 
 RECORD = "instrument.receiver.record"
 GAIN, PHASE = (f"instrument.receiver.iq_{name}_imbalance" for name in ("gain", "phase"))
@@ -116,7 +116,7 @@ def test_imbalance_makes_the_image_of_unequal_samples(phases, velocity, table_4_
 
 def test_a_grid_of_both_records(tmp_path):
     """Both read range and velocity of a receding and of a closing target."""
-    spec = Spec.from_mapping({
+    spec = GridSpec.from_mapping({
         "title": "Records", "instrument": instrument(),
         "target": {"range": "100 m", "reflectance": 0.1, "radial_velocity": "-35 m/s",
                    "grazing_angle": "90 deg"},
@@ -173,4 +173,4 @@ def test_what_makes_no_complex_record_is_told(changed, told):
     target = {"range": "100 m", "reflectance": 0.1, "radial_velocity": "5 m/s",
               "grazing_angle": "90 deg"}  # fmt: skip
     with pytest.raises(SpecError, match=told):
-        Spec.from_mapping({"title": "x", "instrument": written, "target": target})
+        GridSpec.from_mapping({"title": "x", "instrument": written, "target": target})

@@ -15,13 +15,13 @@ import pytest
 from numba.core.errors import NumbaError, TypingError
 
 import sweep
-import sweep.kernels
+import sweep.kernel_cache
 from sweep.model.detection import detect_rows
 
 PACKAGE = Path(sweep.__file__).parent
 
 CALLED = """
-from sweep.kernels import njit
+from sweep.kernel_cache import njit
 from sweep.model.constants import FACTOR
 
 @njit(cache=True)
@@ -30,7 +30,7 @@ def scale(x):
 """
 
 CALLER = """
-from sweep.kernels import njit
+from sweep.kernel_cache import njit
 from sweep.model.called import scale
 
 @njit(cache=True)
@@ -54,7 +54,7 @@ class SmallPackage:
         self.folder, self.package = folder, folder / "sweep"
         self.model = self.package / "model"
         self.model.mkdir(parents=True)
-        for name in ("__init__.py", "kernels.py"):
+        for name in ("__init__.py", "kernel_cache.py"):
             shutil.copy(PACKAGE / name, self.package / name)
         (self.model / "__init__.py").touch()
         (self.model / "called.py").write_text(CALLED)
@@ -151,7 +151,7 @@ def test_nothing_is_written_into_the_package_nor_removed_from_it(small, tmp_path
 
 def test_functions_of_others_are_cached_where_numba_has_them(small, tmp_path):
     (small.folder / "mine.py").write_text("import numba\n@numba.njit(cache=True)\ndef f(): pass\n")
-    code = "import sweep.kernels, sweep.model.caller, mine, os; print(mine.f.stats.cache_path)"
+    code = "import sweep.kernel_cache, sweep.model.caller, mine, os; print(mine.f.stats.cache_path)"
     cache = tmp_path / "cache"
     found = small.run(code=code, NUMBA_CACHE_DIR=str(cache))
     assert Path(found).parent == cache and not Path(found).name.startswith("sweep-kernels")
@@ -215,7 +215,7 @@ def test_the_folder_may_be_removed_while_kernels_are_compiled(small, tmp_path):
     code = """
 import shutil
 from sweep.model import called, caller
-from sweep.kernels import cache_folder
+from sweep.kernel_cache import cache_folder
 called.scale(1.0)
 shutil.rmtree(cache_folder().path.parent)
 print(caller.scale_twice(1.0))
@@ -231,7 +231,7 @@ def test_kernels_that_nobody_has_used_for_a_month_are_removed_as_others_are_comp
     small.run(**cache)
     (root,) = tmp_path.glob("sweep-kernels-*")
     (first,) = root.iterdir()
-    month_ago = time.time() - sweep.kernels.UNUSED_SECONDS_MAX - 60.0
+    month_ago = time.time() - sweep.kernel_cache.UNUSED_CACHE_AGE_MAX - 60.0
     (root / "notes").mkdir()  # of somebody's
     os.utime(root / "notes", (month_ago, month_ago))
     os.utime(first, (month_ago, month_ago))
@@ -264,9 +264,9 @@ print(scale_twice(1.0))
 
 CHANGED_CONSTANT = """
 import os, pathlib
-import sweep.kernels
-sweep.kernels.cache_folder()  # fingerprints the sources
-path = pathlib.Path(sweep.kernels.__file__).parent / "model" / "constants.py"
+import sweep.kernel_cache
+sweep.kernel_cache.cache_folder()  # fingerprints the sources
+path = pathlib.Path(sweep.kernel_cache.__file__).parent / "model" / "constants.py"
 path.write_text("FACTOR = 5.00")
 """
 
@@ -313,8 +313,8 @@ def test_all_kernels_of_the_package_are_cached_by_the_fingerprint():
         if "njit" in path.read_text()
     }
     others = {name for name in users if not name.startswith("model/")}
-    assert others == {"kernels.py", "tasks/accuracy/bench.py"} and len(users) > 15
-    for name in users - {"kernels.py"}:
+    assert others == {"kernel_cache.py", "tasks/accuracy/bench.py"} and len(users) > 15
+    for name in users - {"kernel_cache.py"}:
         assert "from numba" not in (PACKAGE / name).read_text()
 
 
@@ -322,15 +322,15 @@ def test_kernels_are_cached_among_temporary_files_where_the_user_has_no_home(mon
     def fail():
         raise RuntimeError("could not determine the home directory")
 
-    monkeypatch.setattr(sweep.kernels, "user_cache_dir", fail)
+    monkeypatch.setattr(sweep.kernel_cache, "user_cache_dir", fail)
     monkeypatch.setattr(numba.config, "CACHE_DIR", "")
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    folder = sweep.kernels.cache_folder.__wrapped__()
+    folder = sweep.kernel_cache.cache_folder.__wrapped__()
     assert folder.path is not None and folder.path.parent.parent == tmp_path
 
 
 def test_the_model_is_cached_by_the_fingerprint():
-    folder = sweep.kernels.cache_folder()
+    folder = sweep.kernel_cache.cache_folder()
     assert Path(detect_rows.stats.cache_path).parent == folder.path and folder.reason == ""
 
 
@@ -356,32 +356,32 @@ def _doubled(table):
 def test_a_kernel_that_borrows_leaves_counts_of_references_as_they_are():
     table = np.arange(6.0).reshape(2, 3)
     before = sys.getrefcount(table)
-    kernel = sweep.kernels.njit(cache=True, borrows=True)(_sum_of_first_row)
+    kernel = sweep.kernel_cache.njit(cache=True, borrows=True)(_sum_of_first_row)
     assert [kernel(table) for _ in range(100)] == [3.0] * 100
     assert sys.getrefcount(table) == before
 
 
 @pytest.mark.parametrize("returns_array", [_first_row, _first_row_and_sum])
 def test_a_kernel_that_borrows_returns_no_array(returns_array):
-    kernel = sweep.kernels.njit(cache=True, borrows=True)(returns_array)
+    kernel = sweep.kernel_cache.njit(cache=True, borrows=True)(returns_array)
     # Numba refuses to return an array alone.
     with pytest.raises((TypeError, TypingError), match=r"borrows arrays|returning of array"):
         kernel(np.ones((2, 3)))
     # Uncached, as the cache would hand it to the kernel that borrows.
-    assert sweep.kernels.njit()(returns_array)(np.ones((2, 3))) is not None
+    assert sweep.kernel_cache.njit()(returns_array)(np.ones((2, 3))) is not None
 
 
 def test_a_kernel_that_borrows_makes_no_array():
-    kernel = sweep.kernels.njit(cache=True, borrows=True)(_doubled)
+    kernel = sweep.kernel_cache.njit(cache=True, borrows=True)(_doubled)
     # The kind of error depends on what has been compiled before.
     with pytest.raises(NumbaError, match="NRT required"):
         kernel(np.ones((2, 3)))
 
 
 def test_a_kernel_makes_arrays_though_the_one_that_calls_it_borrows():
-    inner = sweep.kernels.njit()(_doubled)
+    inner = sweep.kernel_cache.njit()(_doubled)
 
     def call(table):
         return inner(table)
 
-    assert sweep.kernels.njit(borrows=True)(call)(np.ones((2, 3))) == 12.0
+    assert sweep.kernel_cache.njit(borrows=True)(call)(np.ones((2, 3))) == 12.0

@@ -4,47 +4,78 @@ import ast
 from functools import cache
 from pathlib import Path
 
-import house_size
+import code_size
 
 PACKAGE = Path(__file__).parents[1] / "sweep"
 MODULES = sorted(PACKAGE.rglob("*.py"))
 
 MAY_IMPORT = {
     "units": {"units"},
-    "documents": {"documents"},
-    "plain_files": {"plain_files"},
+    "safe_json": {"safe_json"},
+    "regular_files": {"regular_files"},
     "extras": {"extras"},
-    "kernels": {"kernels"},
+    "kernel_cache": {"kernel_cache"},
     "messages": {"messages"},
-    "storage": {"storage", "documents", "messages", "plain_files"},
-    "model": {"model", "kernels"},
+    "storage": {"storage", "safe_json", "messages", "regular_files"},
+    "model": {"model", "kernel_cache"},
     "scenes": {"scenes", "messages", "model", "units"},
-    "spec": {"spec", "documents", "messages", "plain_files", "scenes", "model", "units"},
+    "spec": {"spec", "safe_json", "messages", "regular_files", "scenes", "model", "units"},
     "tasks": {
-        "tasks", "documents", "extras", "kernels", "messages", "plain_files", "storage", "spec",
-        "scenes", "model", "units",
+        "tasks",
+        "safe_json",
+        "extras",
+        "kernel_cache",
+        "messages",
+        "regular_files",
+        "storage",
+        "spec",
+        "scenes",
+        "model",
+        "units",
     },
     "analysis": {"analysis", "messages", "storage", "spec", "scenes", "model", "units"},
     "report": {"report", "analysis", "messages", "storage", "spec", "scenes", "model", "units"},
     "cli": {
-        "cli", "extras", "messages", "plain_files", "tasks", "report", "analysis", "storage",
-        "spec", "scenes", "model", "units",
+        "cli",
+        "extras",
+        "messages",
+        "regular_files",
+        "tasks",
+        "report",
+        "analysis",
+        "storage",
+        "spec",
+        "scenes",
+        "model",
+        "units",
     },
     "__init__": {"tasks", "analysis", "spec"},
-}  # fmt: skip
+}
 """Imports run one way; analysis and report read stores, however they were computed."""
 
 NOT_IN_THE_MODEL = {
-    "click", "dask", "distributed", "logging", "os", "pathlib", "pint", "pydantic", "rasterio",
-    "rich", "trimesh", "xarray", "yaml", "zarr",
-}  # fmt: skip
+    "click",
+    "dask",
+    "distributed",
+    "logging",
+    "os",
+    "pathlib",
+    "pint",
+    "pydantic",
+    "rasterio",
+    "rich",
+    "trimesh",
+    "xarray",
+    "yaml",
+    "zarr",
+}
 """Pure physics: arrays in, arrays out."""
 
 
 @cache
 def _nodes(path: Path) -> list[ast.AST]:
     """All that a module is made of."""
-    return list(ast.walk(house_size.parsed(path)))
+    return list(ast.walk(code_size.parse_module(path)))
 
 
 @cache
@@ -112,7 +143,7 @@ def three(): ...
 @cache
 def none(): ...
 """
-    assert house_size.compiled_in(ast.parse(module)) == 3
+    assert code_size.count_compiled_in_module(ast.parse(module)) == 3
 
 
 def test_the_walk_sees_what_it_must():
@@ -126,9 +157,13 @@ def test_stores_are_opened_by_their_checked_document_alone():
     for path, node in calls:
         called = getattr(node.func, "attr", "")
         if called in {"open_zarr", "open_datatree", "open_dataset", "open_consolidated"}:
-            checked = (key.arg is None and key.value.id == "CHECKED" for key in node.keywords)
+            checked = (
+                key.arg is None and key.value.id == "OPEN_ZARR_KWARGS" for key in node.keywords
+            )
             assert any(checked), path
         if called in {"open_group", "open_array"}:
             assert _module_name(path) in {
-                "sweep.storage.opening", "sweep.storage.sound", "sweep.tasks.verify",
-            }  # fmt: skip
+                "sweep.storage.store_format",
+                "sweep.storage.verified_store",
+                "sweep.tasks.studies.store_verification",
+            }

@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from engine import every
+from shot_helpers import parametrize_product
 
 import sweep
 from sweep.model.detection import RAYLEIGH_DEVIATION
 from sweep.model.looks import Looks
-from sweep.spec import SceneSpec, Spec, SpecError
+from sweep.spec import GridSpec, SceneSpec, SpecError
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 LEVEL = 5 * RAYLEIGH_DEVIATION
@@ -34,7 +34,7 @@ TARGET = {"range": "100 m", "reflectance": 0.1, "radial_velocity": "0 m/s",
 
 
 def grid(looks, **parts):
-    return Spec.from_mapping(
+    return GridSpec.from_mapping(
         {"title": "Looks", "instrument": instrument(looks), "target": TARGET} | parts
     )
 
@@ -63,7 +63,7 @@ def results(spec, path):
 
 @pytest.mark.parametrize(
     ("looks", "kind"),
-    every(3, [{"number": 8, "speckle": "independent"}, {"number": 8}, {"number": 1},
+    parametrize_product(3, [{"number": 8, "speckle": "independent"}, {"number": 8}, {"number": 1},
               {"number": 6, "combine": "binary", "votes": 3}, {"number": 8, "combine": "coherent"}],
           [grid, flight]),
 )  # fmt: skip

@@ -9,16 +9,22 @@ from dataclasses import asdict, replace
 import pytest
 from click.testing import CliRunner
 from rich.console import Console
-from small import quiet, small, small_file
+from small_studies import run_serially, small_mapping, small_spec
 
 import sweep
 from sweep.cli import main
 from sweep.cli.terminal import print_table
-from sweep.messages import PrintableStream, as_command, one_line, printable, suggestion
+from sweep.messages import (
+    PrintableStream,
+    escape_to_one_line,
+    escape_unprintable,
+    suggest_shell_commands,
+    suggestion,
+)
 from sweep.spec import SpecError
-from sweep.tasks import progress
-from sweep.tasks.journal import Holder
-from sweep.tasks.progress import BusyError, StoreError, TaskError
+from sweep.tasks.engine import progress
+from sweep.tasks.engine.journal import LockHolder
+from sweep.tasks.engine.progress import BusyError, StoreError, TaskError
 
 HOSTILE = "\x1b]0;owned\x07\x1b[2J\x9b31m\r\u202egnp\u2066\u200b\x7f"
 """Escape sequences of 7 and 8 bits, a carriage return, and marks that turn text around."""
@@ -38,16 +44,16 @@ def told(*arguments, exit_code=0):
 def test_each_character_that_a_terminal_obeys_is_shown_as_an_escape_sequence(character):
     code = ord(character)
     shown = f"\\x{code:02x}" if code < 256 else f"\\u{code:04x}"
-    assert printable(f"a{character}b") == f"a{shown}b"
+    assert escape_unprintable(f"a{character}b") == f"a{shown}b"
 
 
 @pytest.mark.parametrize("text", ["two\nlines\tand a tab", "25 µm, 90°, Zürich, 雷达, 🛰", ""])
 def test_text_that_is_only_read_stays_as_it_is(text):
-    assert printable(text) == text
+    assert escape_unprintable(text) == text
 
 
 def test_text_of_one_line_cannot_forge_another():
-    assert one_line("node1\ncomplete\t") == "node1\\ncomplete\\t"
+    assert escape_to_one_line("node1\ncomplete\t") == "node1\\ncomplete\\t"
 
 
 def test_a_stream_is_written_to_by_nothing_else_than_printable_text():
@@ -66,12 +72,12 @@ def fails(study, block):
 
 def test_failures_locks_and_titles_of_a_store_are_told_in_printable_text(tmp_path):
     store = tmp_path / "a.zarr"
-    spec = small(title="A\nstudy")
-    outcome = quiet(spec, store, scheduler="none", evaluate=fails)
+    spec = small_spec(title="A\nstudy")
+    outcome = run_serially(spec, store, scheduler="none", evaluate=fails)
     assert not outcome.complete and outcome.failures
     text = told("status", store)
     assert "block 0 failed on" in text and "\\x1b]0;owned\\x07" in text
-    lock = replace(Holder.myself(), host=f"{HOSTILE}\ncomplete", token="another")
+    lock = replace(LockHolder.of_this_process(), host=f"{HOSTILE}\ncomplete", token="another")
     (store / ".sweep" / "lock").write_text(json.dumps(asdict(lock)))
     text = told("status", store)
     assert "running: process" in text and "complete" not in text.splitlines()
@@ -84,7 +90,7 @@ def test_failures_locks_and_titles_of_a_store_are_told_in_printable_text(tmp_pat
 
 def test_versions_and_ids_in_a_store_are_told_in_printable_text(tmp_path):
     store = tmp_path / "a.zarr"
-    assert quiet(small(), store).complete
+    assert run_serially(small_spec(), store).complete
     document = json.loads((store / "zarr.json").read_text())
     software = document["attributes"]["software"]
     document["attributes"] |= {
@@ -129,10 +135,10 @@ def test_a_spec_s_words_are_told_in_printable_text(tmp_path):
 
 def test_tables_and_lines_of_a_run_are_printable(capsys, monkeypatch):
     print_table(HOSTILE, ["one", "two"], [[HOSTILE, "a\nb"]])
-    progress.Lines().say(HOSTILE)
+    progress.ProgressLines().say(HOSTILE)
     shown = io.StringIO()
     monkeypatch.setattr(progress, "sys", sys)
-    bar = progress.Bar()
+    bar = progress.ProgressBar()
     bar.console = Console(file=shown, force_terminal=True)
     bar.say(HOSTILE)
     out, err = capsys.readouterr()
@@ -143,7 +149,7 @@ def test_a_traceback_after_a_command_is_printable(monkeypatch, capsys):
     def broken(*_):
         raise RuntimeError(HOSTILE)
 
-    monkeypatch.setattr("sweep.spec.reading.library", broken)
+    monkeypatch.setattr("sweep.spec.yaml_document.library_instruments", broken)
     for name in ("stdout", "stderr"):
         monkeypatch.setattr(sys, name, getattr(sys, name))  # put back afterwards
     with pytest.raises(RuntimeError) as caught:
@@ -159,7 +165,7 @@ def test_a_traceback_after_a_command_is_printable(monkeypatch, capsys):
 @pytest.mark.parametrize("name", ["my lidar.zarr", "a'b.zarr", "$(rm x).zarr", "-x.zarr", "ä;b"])
 def test_a_command_that_is_suggested_names_the_path_whatever_it_holds(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with as_command():
+    with suggest_shell_commands():
         command = suggestion("resume", name, retry_failed=True).strip("`")
     words = shlex.split(command)
     assert words[:2] == ["sweep", "resume"] and words[3:] == ["--retry-failed"]
@@ -171,7 +177,7 @@ def test_a_command_that_is_suggested_names_the_path_whatever_it_holds(name, tmp_
 def test_commands_after_an_incomplete_run_work_for_a_path_with_blanks(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     store = tmp_path / "my lidar.zarr"
-    quiet(small(), store, scheduler="none", evaluate=fails)
+    run_serially(small_spec(), store, scheduler="none", evaluate=fails)
     for arguments in (["status", store], ["resume", store, "--scheduler", "none"]):
         result = CliRunner().invoke(main, [*map(str, arguments)])
         assert f"sweep resume '{store}' --retry-failed" in result.output
@@ -181,14 +187,14 @@ def test_errors_of_the_command_suggest_commands_and_errors_in_python_suggest_cal
     tmp_path, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
-    quiet(small(), "a b.zarr")
+    run_serially(small_spec(), "a b.zarr")
     with pytest.raises(StoreError, match=r"`sweep\.status\('.*a b\.zarr'\)` .*overwrite=True"):
-        quiet(small(), "a b.zarr")
+        run_serially(small_spec(), "a b.zarr")
     with pytest.raises(StoreError, match=r"another store=, .*overwrite=True"):
-        quiet(small(seed=4), "a b.zarr")
+        run_serially(small_spec(seed=4), "a b.zarr")
     with pytest.raises(StoreError, match=r"`sweep\.run\(spec, store=new\)`"):
-        sweep.extend("a b.zarr", small(seed=4), progress=False)
-    (tmp_path / "study.yaml").write_text(json.dumps(small_file()))
+        sweep.extend("a b.zarr", small_spec(seed=4), progress=False)
+    (tmp_path / "study.yaml").write_text(json.dumps(small_mapping()))
     again = ("run", "study.yaml", "--store", "a b.zarr", "--scheduler", "none")
     assert "a b.zarr'` tells about it, --overwrite begins anew" in told(*again, exit_code=2)
     changed = told("extend", "a b.zarr", "--set", "seed=4", exit_code=2)
@@ -201,8 +207,8 @@ def test_errors_of_the_command_suggest_commands_and_errors_in_python_suggest_cal
 
 def test_what_has_failed_before_is_tried_again_by_a_call_in_python(tmp_path):
     store = tmp_path / "a.zarr"
-    assert quiet(small(), store).why == ""
-    quiet(small(seed=4), tmp_path / "b.zarr", scheduler="none", evaluate=fails)
+    assert run_serially(small_spec(), store).why == ""
+    run_serially(small_spec(seed=4), tmp_path / "b.zarr", scheduler="none", evaluate=fails)
     outcome = sweep.resume(tmp_path / "b.zarr", progress=False, scheduler="none")
     assert outcome.why.endswith("retry_failed=True tries them again")
 

@@ -8,7 +8,7 @@ from click.testing import CliRunner
 
 import sweep
 from sweep.cli import main
-from sweep.spec import Spec, SpecError, load
+from sweep.spec import GridSpec, SpecError, load
 
 GOOD = """\
 title: My lidar
@@ -203,7 +203,10 @@ def good():
 
 CALLS = [
     (lambda: sweep.load(None), "loaded from the path of a YAML file, not from a NoneType"),
-    (lambda: sweep.load({"title": "x"}), "not from a dict; `sweep.spec.Spec.from_mapping(...)`"),
+    (
+        lambda: sweep.load({"title": "x"}),
+        "not from a dict; `sweep.spec.GridSpec.from_mapping(...)`",
+    ),
     (lambda: sweep.load("god.yaml"), "god.yaml: does not exist; did you mean 'good.yaml'?"),
     (lambda: sweep.run("good.yaml", store="a.zarr"), "not a str: give `sweep.load('good.yaml')`"),
     (lambda: sweep.run({}, store="a.zarr"), "a study is needed, not a dict"),
@@ -221,14 +224,16 @@ CALLS = [
     (lambda: sweep.open(good()), "and not by a Spec"),
     (lambda: sweep.open("good.yaml"), "`sweep.run(spec, store=store)` computes a spec into one"),
     (lambda: sweep.open("empty"), "`sweep.run(spec, store=store)` computes a spec into one"),
-    (lambda: Spec.from_mapping("title"), "must be a mapping (you wrote 'title')"),
+    (lambda: GridSpec.from_mapping("title"), "must be a mapping (you wrote 'title')"),
 ]
 
 
 @pytest.mark.parametrize(("call", "words"), CALLS)
 def test_a_wrong_call_ends_in_words_and_changes_nothing(here, call, words):
     before = sorted(Path().rglob("*"))
-    with pytest.raises((TypeError, ValueError, SpecError, sweep.tasks.progress.TaskError)) as told:
+    with pytest.raises(
+        (TypeError, ValueError, SpecError, sweep.tasks.engine.progress.TaskError)
+    ) as told:
         call()
     assert words in str(told.value)
     assert sorted(Path().rglob("*")) == before

@@ -15,14 +15,15 @@ from pathlib import Path
 import pytest
 import yaml
 from click.testing import CliRunner
-from small import small, small_file
+from small_studies import small_mapping, small_spec
 
 import sweep
 from sweep.cli import main
-from sweep.storage.locations import JOURNAL
-from sweep.tasks import progress, summary
-from sweep.tasks.interrupts import Interrupts
-from sweep.tasks.streams import ForgivingStream, PatientStream, is_terminal
+from sweep.storage.locations import JOURNAL_DIR
+from sweep.tasks.engine import progress
+from sweep.tasks.engine.interrupts import InterruptHandler
+from sweep.tasks.engine.text_streams import ForgivingStream, PatientStream, is_terminal
+from sweep.tasks.studies import store_summary
 
 SWEEP = [sys.executable, "-c", "from sweep.cli import main; main()"]
 
@@ -47,7 +48,7 @@ def test_a_stream_that_fails_goes_silent(error):
     stream = ForgivingStream(inside)
     print("one", file=stream, flush=True)
     print("two", file=stream, flush=True)
-    assert inside.calls == 1 and stream.error is error
+    assert inside.calls == 1 and stream.failure is error
 
 
 def test_a_stream_that_is_missing_closed_or_no_stream_takes_everything():
@@ -56,7 +57,7 @@ def test_a_stream_that_is_missing_closed_or_no_stream_takes_everything():
     for inside in (None, closed, object()):
         stream = ForgivingStream(inside)
         print("text", file=stream, flush=True)
-        stream.finish()
+        stream.finish_writing()
         assert not stream.isatty() and not is_terminal(inside) and stream.encoding
         with pytest.raises(io.UnsupportedOperation):
             stream.fileno()
@@ -66,7 +67,7 @@ def test_letters_that_an_encoding_lacks_are_written_by_their_numbers():
     inside = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
     stream = ForgivingStream(inside)
     print("5 µm", file=stream, flush=True)
-    assert inside.buffer.getvalue() == b"5 \\xb5m\n" and stream.error is None
+    assert inside.buffer.getvalue() == b"5 \\xb5m\n" and stream.failure is None
 
 
 def test_a_reader_that_is_late_misses_words_and_hears_later_ones():
@@ -89,7 +90,7 @@ def test_a_reader_that_is_late_misses_words_and_hears_later_ones():
 @pytest.fixture
 def spec(tmp_path):
     file = tmp_path / "study.yaml"
-    file.write_text(yaml.safe_dump(small_file()))
+    file.write_text(yaml.safe_dump(small_mapping()))
     return file
 
 
@@ -121,7 +122,7 @@ RUN = """
 import sys, time
 from pathlib import Path
 sys.path.insert(0, sys.argv[3])
-from small import small
+from small_studies import small_spec
 import sweep
 
 def evaluate(study, block):
@@ -130,7 +131,7 @@ def evaluate(study, block):
 
 if __name__ == "__main__":
     where = {"workers": 2} if sys.argv[4] == "workers" else {"scheduler": "none"}
-    outcome = sweep.run(small(), store=sys.argv[1], evaluate=evaluate, **where)
+    outcome = sweep.run(small_spec(), store=sys.argv[1], evaluate=evaluate, **where)
     Path(sys.argv[2]).write_text(f"{outcome.blocks_done} {outcome.stopped}")
 """
 
@@ -156,7 +157,7 @@ def test_a_run_whose_terminal_is_closed_stops_and_can_be_resumed(tmp_path, where
     tests = str(Path(__file__).parent / "tasks")
     command = [sys.executable, str(script), str(store), str(said), tests, where]
     started, terminal = in_a_terminal(command)
-    log = store / JOURNAL / "receipts.jsonl"
+    log = store / JOURNAL_DIR / "receipts.jsonl"
     end = time.monotonic() + 120
     while not log.exists() or log.read_bytes().count(b"\n") < 2:
         assert started.poll() is None and time.monotonic() < end
@@ -165,7 +166,7 @@ def test_a_run_whose_terminal_is_closed_stops_and_can_be_resumed(tmp_path, where
     assert started.wait(120) == 0
     blocks, _, stopped = said.read_text().partition(" ")
     assert stopped == "interrupted" and 2 <= int(blocks) < 12
-    events = [json.loads(line) for line in (store / JOURNAL / "sessions.jsonl").open()]
+    events = [json.loads(line) for line in (store / JOURNAL_DIR / "sessions.jsonl").open()]
     assert events[-1]["event"] == "ended" and events[-1]["stopped"] == "interrupted"
     assert sweep.resume(store, progress=False, scheduler="none").complete
 
@@ -209,19 +210,19 @@ def test_a_process_that_ignores_hangups_goes_on_ignoring_them():
     """As nohup has it."""
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        with Interrupts() as interrupts:
+        with InterruptHandler() as interrupts:
             os.kill(os.getpid(), signal.SIGHUP)
-            assert not interrupts.stopping
+            assert not interrupts.is_stopping
     finally:
         signal.signal(signal.SIGHUP, before)
 
 
 def test_hangups_stop_a_run_and_never_at_once():
     """A shell, and the system, send one each."""
-    with Interrupts() as interrupts:
+    with InterruptHandler() as interrupts:
         os.kill(os.getpid(), signal.SIGHUP)
         os.kill(os.getpid(), signal.SIGHUP)
-        assert interrupts.stopping
+        assert interrupts.is_stopping
 
 
 class NoTerminal:
@@ -234,15 +235,15 @@ class NoTerminal:
 @pytest.mark.parametrize("stream", [None, NoTerminal(), Failing(BrokenPipeError())])
 def test_a_program_without_standard_error_computes(tmp_path, monkeypatch, stream):
     monkeypatch.setattr(sys, "stderr", stream)
-    assert sweep.run(small(), store=tmp_path / "s.zarr", scheduler="none").complete
+    assert sweep.run(small_spec(), store=tmp_path / "s.zarr", scheduler="none").complete
 
 
 def test_a_bar_whose_terminal_is_gone_goes_on(monkeypatch):
     stream = Failing(OSError(5, "Input/output error"))
     stream.isatty = lambda: True
     monkeypatch.setattr(sys, "stderr", stream)
-    bar = progress.chosen(True)
-    assert isinstance(bar, progress.Bar)
+    bar = progress.make_progress(True)
+    assert isinstance(bar, progress.ProgressBar)
     bar.begin(points=2, done=0, unit="points")
     bar.say("something")
     bar.advance(points=2, failed=0)
@@ -263,7 +264,7 @@ class Deaf(progress.Progress):
 def test_a_listener_that_fails_is_told_nothing_more(tmp_path, caplog):
     deaf = Deaf()
     assert sweep.run(
-        small(), store=tmp_path / "s.zarr", scheduler="none", progress=deaf
+        small_spec(), store=tmp_path / "s.zarr", scheduler="none", progress=deaf
     ).complete  # fmt: skip
     assert deaf.called == 1
     assert [record.getMessage() for record in caplog.records] == [
@@ -276,7 +277,7 @@ def test_a_table_that_can_not_be_made_is_no_failure_of_the_study(tmp_path, spec,
     def fail(store):
         raise OSError(24, "Too many open files")
 
-    monkeypatch.setattr(summary, "summary", fail)
+    monkeypatch.setattr(store_summary, "detection_summary", fail)
     asked = ["run", str(spec), "--store", str(tmp_path / "s.zarr"), "--scheduler", "none"]
     done = CliRunner().invoke(main, asked)
     assert done.exit_code == 0, done.output

@@ -15,7 +15,7 @@ from sweep.model.looks import fading_any_two
 from sweep.model.outputs import DRAW_OUTPUTS
 from sweep.model.shot import find, prepare, statistics
 from sweep.model.waveform import ANY_TWO, DOPPLER_SLOPE, DOWN_SLOPE, SHOT_DETECTION
-from sweep.spec import Spec, SpecError
+from sweep.spec import GridSpec, SpecError
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 CARRIER, BANDWIDTH, RATE = 193.4e12, 1e9, 1e14
@@ -204,7 +204,7 @@ def test_a_grid_has_segments_of_any_slope(tmp_path, record):
     if record == "real":  # without the light that has no chirp
         chirp["doppler_slope"] = -0.25
     del chirp["segments"]
-    spec = Spec.from_mapping(
+    spec = GridSpec.from_mapping(
         FLAT | {"instrument": instrument(chirp, receiver={"record": record}), "axes": axes}
     )
     done = sweep.run(spec, store=tmp_path / "grid.zarr", scheduler="none", progress=False)
@@ -230,7 +230,7 @@ def test_drawn_spectra_of_which_one_segment_is_missed(tmp_path):
     }  # fmt: skip
     stores = {}
     for rule, number in (("both_chirps", 50), ("any_two", 1200)):
-        spec = Spec.from_mapping(FLAT | {
+        spec = GridSpec.from_mapping(FLAT | {
             "instrument": instrument({}, chosen | {"shot_detection": rule}, power="4 mW"),
             "footprint": {"speckle": "none"},
             "draws": {"number": number, "method": "spectra"},
@@ -258,7 +258,7 @@ def test_drawn_spectra_of_which_one_segment_is_missed(tmp_path):
 ])  # fmt: skip
 def test_lists_that_do_not_tell_range_and_velocity_are_refused(chirp, processing, words):
     with pytest.raises(SpecError, match=words):
-        Spec.from_mapping(FLAT | {"instrument": instrument(chirp, processing)})
+        GridSpec.from_mapping(FLAT | {"instrument": instrument(chirp, processing)})
 
 
 def test_lines_of_any_slope_are_those_of_the_record(table_4_1):

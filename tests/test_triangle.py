@@ -8,7 +8,7 @@ import yaml
 
 import sweep
 from sweep.model.pairing import TRUE, UNCONFIRMED
-from sweep.spec import SceneSpec, Spec
+from sweep.spec import GridSpec, SceneSpec
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 STREET = {
@@ -40,7 +40,7 @@ def instrument(**chirp):
 
 
 def test_a_grid_lists_its_segments_and_may_vary_them(tmp_path):
-    spec = Spec.from_mapping({
+    spec = GridSpec.from_mapping({
         "title": "Waveforms", "instrument": instrument(),
         "target": {"range": "100 m", "reflectance": 0.1, "radial_velocity": "5 m/s",
                    "grazing_angle": "90 deg"},

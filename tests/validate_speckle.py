@@ -20,26 +20,26 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from drawn_shots import (
-    EFFECTS,
+from scatterer_shots import (
+    COMPARED_EFFECTS,
     SEGMENTS,
-    detections,
     draw_shots,
-    facet_of,
+    first_value,
     line_deviation,
-    number,
+    point_facet,
+    prepare_single_category,
+    segment_detections,
     shot_detections,
-    shots_of,
 )
 from scatterers import SPEED_OF_LIGHT, Facet, echo_beat
 
 from sweep.model.shot import Shots, find
 from sweep.model.unsupported import UnsupportedShot
-from sweep.spec import Spec, SpecError
-from sweep.tasks.grid_study import GridStudy
+from sweep.spec import GridSpec, SpecError
+from sweep.tasks.studies.grid_study import GridStudy
 
 WAVELENGTH = 1550e-9
-SIGMAS = 5.0
+ALLOWED_SIGMAS = 5.0
 DRAWS = 24_000
 WINDOWS = ("rectangular", "hann", "hamming", "blackman", "flattop")
 TOLERANCE = 1e-3
@@ -51,36 +51,43 @@ PD_RANGE = (0.02, 0.985)
 # Random specs
 
 
-def mapping_at_random(rng: np.random.Generator) -> dict[str, Any]:
+def random_mapping(rng: np.random.Generator) -> dict[str, Any]:
     """A spec of one point, which may be refused."""
     rule = str(rng.choice(["any_bin", "peak_bin", "looks"], p=[0.55, 0.25, 0.2]))
-    padding = int(rng.choice([1, 2, 4], p=[0.6, 0.25, 0.15]))
+    padding_factor = int(rng.choice([1, 2, 4], p=[0.6, 0.25, 0.15]))
     fft_size = int(2 ** rng.integers(8, 13 if rule != "looks" else 11))
-    length = max(fft_size // padding, 64)
-    fft_size, rate = length * padding, float(rng.choice([100e6, 200e6, 400e6]))
-    record = length / rate
-    waist, bandwidth = np.exp(rng.uniform(np.log(7e-4), np.log(8e-3))), 10 ** rng.uniform(8.7, 9.6)
-    delay = rng.uniform(0.05, 0.4) * record
-    duration = delay + record * (1.0 if padding > 1 else rng.uniform(1.0, 1.1))
+    record_length = max(fft_size // padding_factor, 64)
+    fft_size, rate = record_length * padding_factor, float(rng.choice([100e6, 200e6, 400e6]))
+    record_duration = record_length / rate
+    beam_waist, bandwidth = (
+        np.exp(rng.uniform(np.log(7e-4), np.log(8e-3))),
+        10 ** rng.uniform(8.7, 9.6),
+    )
+    acquisition_delay = rng.uniform(0.05, 0.4) * record_duration
+    duration = acquisition_delay + record_duration * (
+        1.0 if padding_factor > 1 else rng.uniform(1.0, 1.1)
+    )
     range_beat = rng.uniform(0.04, 0.42) * rate
-    distance = range_beat * SPEED_OF_LIGHT * duration / (2 * bandwidth)
-    grazing = float(rng.choice([90.0, np.exp(rng.uniform(0.0, np.log(90)))], p=[0.1, 0.9]))
-    bin_width = rate / length
-    place = str(rng.choice(["doppler at dc", "up at dc", "far"], p=[0.25, 0.08, 0.67]))
-    doppler = {
+    target_range = range_beat * SPEED_OF_LIGHT * duration / (2 * bandwidth)
+    grazing_angle_deg = float(
+        rng.choice([90.0, np.exp(rng.uniform(0.0, np.log(90)))], p=[0.1, 0.9])
+    )
+    bin_width = rate / record_length
+    line_position = str(rng.choice(["doppler at dc", "up at dc", "far"], p=[0.25, 0.08, 0.67]))
+    doppler_frequency = {
         "doppler at dc": rng.uniform(-2.5, 2.5) * bin_width * rng.integers(0, 2),
         "up at dc": range_beat + rng.uniform(-2.5, 2.5) * bin_width,
         "far": rng.choice([-1, 1]) * rng.uniform(0.0, 0.45 * rate - range_beat),
-    }[place]
-    far_field = distance > 4 * np.pi * waist**2 / WAVELENGTH
-    sideways = rng.uniform(-30, 30) if far_field and rng.random() < 0.6 else 0.0
+    }[line_position]
+    far_field = target_range > 4 * np.pi * beam_waist**2 / WAVELENGTH
+    transverse_velocity = rng.uniform(-30, 30) if far_field and rng.random() < 0.6 else 0.0
     segments = str(rng.choice(
         ["up doppler down", "up down", "down up", "up down doppler"], p=[0.6, 0.2, 0.1, 0.1]
     ))  # fmt: skip
     any_two = "doppler" in segments and rng.random() < 0.3
     record_kind = str(rng.choice(["real", "complex"], p=[0.7, 0.3]))
     instrument = {
-        "laser": {"wavelength": WAVELENGTH, "power": 1.0, "beam_waist": waist},
+        "laser": {"wavelength": WAVELENGTH, "power": 1.0, "beam_waist": beam_waist},
         "chirp": {
             "bandwidth": bandwidth, "start_frequency": 5.5e9, "duration": duration,
             "segments": segments, "gap": float(rng.choice([0.0, rng.uniform(0, 5e-6)])),
@@ -94,72 +101,81 @@ def mapping_at_random(rng: np.random.Generator) -> dict[str, Any]:
         },
         "processing": {
             "sample_rate": rate, "fft_size": fft_size, "window": str(rng.choice(WINDOWS)),
-            "tnr": rng.uniform(5.5, 12.0), "acquisition_delay": delay,
+            "tnr": rng.uniform(5.5, 12.0), "acquisition_delay": acquisition_delay,
             "detection": "peak_bin" if rule == "looks" else rule,
             "shot_detection": "any_two" if any_two else "both_chirps",
         },
     }  # fmt: skip
     if rule == "looks":
-        count = int(rng.integers(2, 9))
+        n_looks = int(rng.integers(2, 9))
         instrument["looks"] = {
-            "number": count, "combine": str(rng.choice(["power", "binary"])),
-            "votes": int(rng.integers(1, count + 1)),
+            "number": n_looks, "combine": str(rng.choice(["power", "binary"])),
+            "votes": int(rng.integers(1, n_looks + 1)),
             "speckle": str(rng.choice(["motion", "common", "independent"], p=[0.6, 0.2, 0.2])),
         }  # fmt: skip
     return {
         "title": "Speckle at random",
         "instrument": instrument,
         "target": {
-            "range": distance, "reflectance": 0.1, "reflectance_law": "lambert",
-            "grazing_angle": math.radians(grazing),
-            "radial_velocity": doppler * WAVELENGTH / 2, "transverse_velocity": sideways,
+            "range": target_range,
+            "reflectance": 0.1,
+            "reflectance_law": "lambert",
+            "grazing_angle": math.radians(grazing_angle_deg),
+            "radial_velocity": doppler_frequency * WAVELENGTH / 2,
+            "transverse_velocity": transverse_velocity,
         },
-    }  # fmt: skip
+    }
 
 
 class RandomSpec(NamedTuple):
     """A valid spec of one point, with what its study stores."""
 
     mapping: dict[str, Any]
-    spec: Spec
+    spec: GridSpec
     parameters: Mapping[str, Any]
     shots: Shots
-    stored: dict[str, float]
+    stored_pd: dict[str, float]
     """pd_up, pd_doppler (nan if there is none), pd_down and pd_shot."""
 
 
-def spec_at_random(seed: int, which: int) -> RandomSpec:
+def random_valid_spec(seed: int, spec_number: int) -> RandomSpec:
     """The spec of a number in the table: random ones until one is valid and says something."""
-    rng = np.random.default_rng([seed, which])
+    rng = np.random.default_rng([seed, spec_number])
     while True:
-        mapping = mapping_at_random(rng)
-        ratio = np.exp(rng.uniform(np.log(0.8), np.log(5.0)))
+        mapping = random_mapping(rng)
+        signal_over_threshold = np.exp(rng.uniform(np.log(0.8), np.log(5.0)))
         try:
-            found = spec_of_ratio(mapping, ratio)
+            found = spec_of_ratio(mapping, signal_over_threshold)
         except (SpecError, UnsupportedShot):
             continue
-        chirps = [found.stored["pd_up"], found.stored["pd_down"]]
-        if PD_RANGE[0] < min(chirps) and max(chirps) < PD_RANGE[1]:
+        chirp_pd = [found.stored_pd["pd_up"], found.stored_pd["pd_down"]]
+        if PD_RANGE[0] < min(chirp_pd) and max(chirp_pd) < PD_RANGE[1]:
             return found
 
 
 def spec_of_ratio(mapping: dict[str, Any], ratio: float) -> RandomSpec:
     """The spec with the laser power for which a chirp's |X| is so many times the threshold."""
-    study = GridStudy(Spec.from_mapping(with_units(mapping)))
-    shots = shots_of(study.grid.parameters(0), EFFECTS)
+    study = GridStudy(GridSpec.from_mapping(with_units(mapping)))
+    shots = prepare_single_category(study.grid.parameters(0), COMPARED_EFFECTS)
     magnitude = np.nanmax(find(shots)[[0, 2], 2, 0])
-    mapping["instrument"]["laser"]["power"] = (ratio * number(shots.threshold) / magnitude) ** 2
-    spec = Spec.from_mapping(with_units(mapping))
+    mapping["instrument"]["laser"]["power"] = (
+        ratio * first_value(shots.threshold) / magnitude
+    ) ** 2
+    spec = GridSpec.from_mapping(with_units(mapping))
     study = GridStudy(spec)
     results = study.evaluate(0)
-    stored = {name: number(results[name]) for name in (*(f"pd_{s}" for s in SEGMENTS), "pd_shot")}
+    stored = {
+        name: first_value(results[name]) for name in (*(f"pd_{s}" for s in SEGMENTS), "pd_shot")
+    }
     if np.isnan(stored["pd_shot"]):
         raise UnsupportedShot("beyond the model")
     parameters = study.grid.parameters(0)
-    return RandomSpec(mapping, spec, parameters, shots_of(parameters, EFFECTS), stored)
+    return RandomSpec(
+        mapping, spec, parameters, prepare_single_category(parameters, COMPARED_EFFECTS), stored
+    )
 
 
-UNITS = {
+UNIT_BY_FIELD = {
     "wavelength": "m", "power": "W", "beam_waist": "m", "bandwidth": "Hz", "start_frequency": "Hz",
     "duration": "s", "gap": "s", "aperture": "m", "responsivity": "A/W",
     "detector_bandwidth": "Hz", "optical_passband": "m", "noise_equivalent_power": "W/Hz^0.5",
@@ -173,7 +189,7 @@ def with_units(section: Any, name: str = "") -> Any:
     """A section of a spec whose numbers in SI have their units written out."""
     if isinstance(section, dict):
         return {key: with_units(value, key) for key, value in section.items()}
-    return f"{float(section)!r} {UNITS[name]}" if name in UNITS else section
+    return f"{float(section)!r} {UNIT_BY_FIELD[name]}" if name in UNIT_BY_FIELD else section
 
 
 # Comparison
@@ -185,9 +201,9 @@ class Comparison(NamedTuple):
     quantity: str
     stored: float
     drawn: float
-    sigma: float
+    drawn_deviation: float
     """Standard deviation of the drawn share."""
-    stated: float
+    stated_error: float
     """Largest error that docs/physics.md states for the law of this kind."""
     tolerance: float
 
@@ -196,51 +212,71 @@ class Comparison(NamedTuple):
         return self.stored - self.drawn
 
     @property
-    def over_allowed(self) -> float:
+    def error_over_allowed(self) -> float:
         """Difference over that which is allowed; beyond it above 1."""
-        return abs(self.difference) / (SIGMAS * self.sigma + self.tolerance + self.stated)
+        return abs(self.difference) / (
+            ALLOWED_SIGMAS * self.drawn_deviation + self.tolerance + self.stated_error
+        )
 
 
-class Row(NamedTuple):
+class ComparisonRow(NamedTuple):
     """A spec of the table with its comparisons."""
 
-    which: int
+    spec_number: int
     rule: str
     window: str
     padding: int
     fft_size: int
     record: str
     segments: str
-    slope: float
+    grazing_angle_deg: float
     """Grazing angle [deg]."""
-    spread: float
+    line_deviation_bins: float
     """Deviation of the lines [bins of fs/L]."""
-    from_end: float
+    bins_from_end: float
     """Distance of the nearest segment's line from DC or Nyquist [bins of fs/L]."""
-    threshold: float
+    threshold_over_noise: float
     """[sigma]"""
     comparisons: tuple[Comparison, ...]
 
     @property
     def worst(self) -> Comparison:
-        return max(self.comparisons, key=lambda one: one.over_allowed)
+        return max(self.comparisons, key=lambda comparison: comparison.error_over_allowed)
 
     @property
     def is_near_end(self) -> bool:
-        return self.from_end < NEAR_END + DEVIATIONS_NEAR_END * self.spread
+        return (
+            self.bins_from_end < NEAR_END_BINS + NEAR_END_LINE_DEVIATIONS * self.line_deviation_bins
+        )
 
-    def kind(self, comparison: Comparison) -> tuple[str, ...]:
+    def error_group(self, comparison: Comparison) -> tuple[str, ...]:
         """Kind by which errors are summed up."""
         quantity = "shot" if comparison.quantity == "shot" else "segment"
-        words = self.rule.split()
-        rule = words[0] if len(words) < 3 else f"looks {'power' if 'mean' in words else 'votes'}"
-        any_two = " any_two" if quantity == "shot" and "any_two" in words else ""
-        slope = "below 5 deg" if self.slope < 5 else "to 30 deg" if self.slope < 30 else "steeper"
-        return (quantity, rule + any_two, self.window, "DC" if self.is_near_end else "", slope)
+        rule_words = self.rule.split()
+        rule = (
+            rule_words[0]
+            if len(rule_words) < 3
+            else f"looks {'power' if 'mean' in rule_words else 'votes'}"
+        )
+        any_two = " any_two" if quantity == "shot" and "any_two" in rule_words else ""
+        slope_class = (
+            "below 5 deg"
+            if self.grazing_angle_deg < 5
+            else "to 30 deg"
+            if self.grazing_angle_deg < 30
+            else "steeper"
+        )
+        return (
+            quantity,
+            rule + any_two,
+            self.window,
+            "DC" if self.is_near_end else "",
+            slope_class,
+        )
 
 
-NEAR_END, DEVIATIONS_NEAR_END = 4.0, 3.0
-NARROW = 0.2
+NEAR_END_BINS, NEAR_END_LINE_DEVIATIONS = 4.0, 3.0
+NARROW_LINE_BINS = 0.2
 """Deviation [bins of fs/L] up to which lines near DC are taken for one."""
 
 
@@ -260,44 +296,48 @@ class StatedErrors(NamedTuple):
     """``any_bin`` of a line within a main lobe of DC or Nyquist."""
     across_end: float = 0.06
     """``any_bin`` of lines that spread across DC or Nyquist."""
-    chirps: float = 0.01
+    joint_segments: float = 0.01
     """Further error of the law of several segments with ``any_bin``."""
-    looks: float = 0.025
+    moving_looks: float = 0.025
     """Shots of several looks whose speckle motion changes; segments have the half."""
     alike_looks: float = 0.015
     """Shots of several looks in common or independent speckle."""
 
 
-STATED = StatedErrors()
-WIDE = 4.0
+STATED_ERRORS = StatedErrors()
+WIDE_LINE_BINS = 4.0
 
 
 def stated_error(quantity: str, shots: Shots, facet: Facet) -> float:
     """Largest error that docs/physics.md states for the law of a segment or of the shot."""
     if shots.looks.several:
         if not shots.looks.moving:
-            return STATED.alike_looks if quantity == "shot" else STATED.peak_bin
-        return STATED.looks if quantity == "shot" else STATED.looks / 2
+            return STATED_ERRORS.alike_looks if quantity == "shot" else STATED_ERRORS.peak_bin
+        return STATED_ERRORS.moving_looks if quantity == "shot" else STATED_ERRORS.moving_looks / 2
     if shots.detection == "peak_bin":
-        both = quantity == "shot" and shots.any_two
-        return STATED.peak_bin_any_two if both else STATED.peak_bin
-    spread, is_padded = line_deviation(facet), shots.fft_size > shots.window.length
-    errors = [STATED.any_bin]
+        is_any_two_shot = quantity == "shot" and shots.any_two
+        return STATED_ERRORS.peak_bin_any_two if is_any_two_shot else STATED_ERRORS.peak_bin
+    line_deviation_bins, is_padded = line_deviation(facet), shots.fft_size > shots.window.length
+    errors = [STATED_ERRORS.any_bin]
     if shots.window.name == "rectangular":
-        errors.append(STATED.padded if is_padded else STATED.rectangular)
-    if is_padded and spread > WIDE:
-        errors.append(STATED.wide)
-    if is_near_end(facet, spread):
-        errors.append(STATED.across_end if spread > NARROW else STATED.near_end)
-    return max(errors) + (STATED.chirps if quantity == "shot" else 0.0)
+        errors.append(STATED_ERRORS.padded if is_padded else STATED_ERRORS.rectangular)
+    if is_padded and line_deviation_bins > WIDE_LINE_BINS:
+        errors.append(STATED_ERRORS.wide)
+    if is_near_end(facet, line_deviation_bins):
+        errors.append(
+            STATED_ERRORS.across_end
+            if line_deviation_bins > NARROW_LINE_BINS
+            else STATED_ERRORS.near_end
+        )
+    return max(errors) + (STATED_ERRORS.joint_segments if quantity == "shot" else 0.0)
 
 
-def is_near_end(facet: Facet, spread: float) -> bool:
+def is_near_end(facet: Facet, line_deviation_bins: float) -> bool:
     """True where lines or the main lobe of a segment lie across DC or Nyquist."""
-    return distance_from_end(facet) < NEAR_END + DEVIATIONS_NEAR_END * spread
+    return distance_from_end(facet) < NEAR_END_BINS + NEAR_END_LINE_DEVIATIONS * line_deviation_bins
 
 
-def rule_of(shots: Shots) -> str:
+def detection_rule_text(shots: Shots) -> str:
     """Rule of detection in a few words."""
     looks, rule = shots.looks, shots.detection
     if looks.several:
@@ -309,95 +349,101 @@ def rule_of(shots: Shots) -> str:
 
 def distance_from_end(facet: Facet) -> float:
     """Distance of the nearest segment's line from DC or Nyquist [bins of fs/L]."""
-    nearest = math.inf
+    nearest_bins = math.inf
     for segment in () if facet.complex_record else facet.segments:
-        cycles = echo_beat(facet, segment) / facet.sample_rate
-        place = abs(cycles - round(cycles)) * facet.window.size
-        nearest = min(nearest, place, facet.window.size / 2 - place)
-    return nearest
+        cycles_per_sample = echo_beat(facet, segment) / facet.sample_rate
+        bins_from_dc = abs(cycles_per_sample - round(cycles_per_sample)) * facet.window.size
+        nearest_bins = min(nearest_bins, bins_from_dc, facet.window.size / 2 - bins_from_dc)
+    return nearest_bins
 
 
-def compared(seed: int, which: int, draws: int = DRAWS) -> Row:
+def compare_spec(seed: int, spec_number: int, draws: int = DRAWS) -> ComparisonRow:
     """Draw a random spec's shots, and compare how often they are detected with what is stored."""
-    random = spec_at_random(seed, which)
-    shots = random.shots
-    drawn = draw_shots(random.parameters, shots, draws=draws, seed=which)
-    detected = detections(drawn, shots)
-    detected["shot"] = shot_detections(detected, shots)
-    facet = facet_of(random.parameters, shots)
+    random_spec = random_valid_spec(seed, spec_number)
+    shots = random_spec.shots
+    drawn_shots = draw_shots(random_spec.parameters, shots, draws=draws, seed=spec_number)
+    detected_by_quantity = segment_detections(drawn_shots, shots)
+    detected_by_quantity["shot"] = shot_detections(detected_by_quantity, shots)
+    facet = point_facet(random_spec.parameters, shots)
     comparisons = []
-    for quantity, values in detected.items():
-        share, stored = float(values.mean()), random.stored[f"pd_{quantity}"]
-        likely = np.clip([share, stored], 1 / draws, 1 - 1 / draws)
-        sigma = float(np.sqrt(likely * (1 - likely) / values.size).max())
+    for quantity, values in detected_by_quantity.items():
+        detected_share, stored_pd = float(values.mean()), random_spec.stored_pd[f"pd_{quantity}"]
+        pd_bounds = np.clip([detected_share, stored_pd], 1 / draws, 1 - 1 / draws)
+        share_deviation = float(np.sqrt(pd_bounds * (1 - pd_bounds) / values.size).max())
         stated = stated_error(quantity, shots, facet)
-        comparisons.append(Comparison(quantity, stored, share, sigma, stated, TOLERANCE))
-    return Row(
-        which=which,
-        rule=rule_of(shots),
+        comparisons.append(
+            Comparison(quantity, stored_pd, detected_share, share_deviation, stated, TOLERANCE)
+        )
+    return ComparisonRow(
+        spec_number=spec_number,
+        rule=detection_rule_text(shots),
         window=shots.window.name,
         padding=shots.fft_size // shots.window.length,
         fft_size=shots.fft_size,
         record="I/Q" if shots.complex_record else "real",
         segments=" ".join(facet.segments),
-        slope=math.degrees(facet.grazing_angle),
-        spread=line_deviation(facet),
-        from_end=distance_from_end(facet),
-        threshold=number(shots.threshold / shots.bin_deviation),
+        grazing_angle_deg=math.degrees(facet.grazing_angle),
+        line_deviation_bins=line_deviation(facet),
+        bins_from_end=distance_from_end(facet),
+        threshold_over_noise=first_value(shots.threshold / shots.bin_deviation),
         comparisons=tuple(comparisons),
     )
 
 
-HEAD = (
+TABLE_HEADER = (
     f"{'no':>4} {'rule':22} {'window':>12} {'N':>5} {'rec':>4} {'waveform':16} {'slope':>6} "
     f"{'spread':>6} {'to DC':>6} {'Th':>5} | {'worst':8} {'stored':>7} {'drawn':>7} {'sigma':>6} "
     f"{'differs':>8} {'stated':>6} {'ratio':>6}"
 )
 
 
-def line_of(row: Row) -> str:
+def format_row(row: ComparisonRow) -> str:
     """A row of the table, by the comparison that is worst."""
     worst = row.worst
     window = f"{row.window} x{row.padding}"
-    place = f"{row.from_end:6.1f}" if row.from_end < 100 else "   far"
+    bins_from_end_text = f"{row.bins_from_end:6.1f}" if row.bins_from_end < 100 else "   far"
     return (
-        f"{row.which:4} {row.rule:22} {window:>12.12} {row.fft_size:5} {row.record:>4} "
-        f"{row.segments:16} {row.slope:6.1f} {row.spread:6.2f} {place} {row.threshold:5.2f} | "
-        f"{worst.quantity:8} {worst.stored:7.4f} {worst.drawn:7.4f} {worst.sigma:6.4f} "
-        f"{worst.difference:+8.4f} {worst.stated:6.3f} {worst.over_allowed:6.2f}"
-        + (" BEYOND" if worst.over_allowed > 1 else "")
+        f"{row.spec_number:4} {row.rule:22} {window:>12.12} {row.fft_size:5} {row.record:>4} "
+        f"{row.segments:16} {row.grazing_angle_deg:6.1f} {row.line_deviation_bins:6.2f} "
+        f"{bins_from_end_text} {row.threshold_over_noise:5.2f} | "
+        f"{worst.quantity:8} {worst.stored:7.4f} {worst.drawn:7.4f} {worst.drawn_deviation:6.4f} "
+        f"{worst.difference:+8.4f} {worst.stated_error:6.3f} {worst.error_over_allowed:6.2f}"
+        + (" BEYOND" if worst.error_over_allowed > 1 else "")
     )
 
 
-def rows_of(seed: int, specs: int, draws: int, processes: int) -> Iterator[Row]:
+def iter_rows(seed: int, n_specs: int, draws: int, processes: int) -> Iterator[ComparisonRow]:
     """Compare specs 0 .. specs - 1 of a seed, in their order."""
     if processes == 1:
-        yield from (compared(seed, which, draws) for which in range(specs))
+        yield from (compare_spec(seed, spec_number, draws) for spec_number in range(n_specs))
         return
     with ProcessPoolExecutor(processes) as pool:
-        yield from pool.map(partial(compared, seed, draws=draws), range(specs))
+        yield from pool.map(partial(compare_spec, seed, draws=draws), range(n_specs))
 
 
-def summary(rows: list[Row]) -> str:
+def error_summary(rows: list[ComparisonRow]) -> str:
     """Largest errors by kind, and how many specs are beyond what is allowed."""
     by_kind: dict[tuple[str, ...], list[Comparison]] = defaultdict(list)
     for row in rows:
         for comparison in row.comparisons:
-            by_kind[row.kind(comparison)].append(comparison)
+            by_kind[row.error_group(comparison)].append(comparison)
     lines = [
         f"{'pd of':8} {'rule':18} {'window':12} {'':3} {'slope':12} {'n':>4} {'largest error':>14} "
         f"{'sigmas':>7} {'stated':>7}"
     ]
-    for kind, comparisons in sorted(by_kind.items()):
-        largest = max(comparisons, key=lambda one: abs(one.difference))
+    for group, comparisons in sorted(by_kind.items()):
+        largest = max(comparisons, key=lambda candidate: abs(candidate.difference))
         lines.append(
-            f"{kind[0]:8} {kind[1]:18} {kind[2]:12} {kind[3]:3} {kind[4]:12} {len(comparisons):4} "
-            f"{largest.difference:+14.4f} {abs(largest.difference) / largest.sigma:7.1f} "
-            f"{largest.stated:7.3f}"
+            f"{group[0]:8} {group[1]:18} {group[2]:12} {group[3]:3} {group[4]:12} "
+            f"{len(comparisons):4} "
+            f"{largest.difference:+14.4f} {abs(largest.difference) / largest.drawn_deviation:7.1f} "
+            f"{largest.stated_error:7.3f}"
         )
-    beyond = [row.which for row in rows if row.worst.over_allowed > 1]
-    numbers = f": {', '.join(map(str, beyond))}" if beyond else ""
-    lines.append(f"{len(beyond)} of {len(rows)} specs are beyond what is allowed{numbers}")
+    specs_beyond = [row.spec_number for row in rows if row.worst.error_over_allowed > 1]
+    numbers_text = f": {', '.join(map(str, specs_beyond))}" if specs_beyond else ""
+    lines.append(
+        f"{len(specs_beyond)} of {len(rows)} specs are beyond what is allowed{numbers_text}"
+    )
     return "\n".join(lines)
 
 
@@ -410,13 +456,13 @@ def main() -> int:
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
     options = parser.parse_args()
     begun, rows = time.perf_counter(), []
-    print(HEAD)
-    for row in rows_of(options.seed, options.specs, options.draws, options.processes):
+    print(TABLE_HEADER)
+    for row in iter_rows(options.seed, options.specs, options.draws, options.processes):
         rows.append(row)
-        print(line_of(row), flush=True)
-    print(summary(rows))
+        print(format_row(row), flush=True)
+    print(error_summary(rows))
     print(f"{options.draws} draws a spec, {time.perf_counter() - begun:.0f} s")
-    return int(any(row.worst.over_allowed > 1 for row in rows))
+    return int(any(row.worst.error_over_allowed > 1 for row in rows))
 
 
 if __name__ == "__main__":

@@ -18,26 +18,44 @@ from matplotlib.colors import Colormap, LogNorm, Normalize
 from matplotlib.figure import Figure as Sheet
 
 from sweep.analysis import labels
-from sweep.analysis.charts import LOG, WORDS, Axis, Chart, Line, Map, Panel, Scale
+from sweep.analysis.charts import (
+    CATEGORY,
+    LOG,
+    Chart,
+    ChartAxis,
+    ChartLine,
+    ColourScale,
+    HeatMap,
+    Panel,
+)
 
 DPI = 150
-SCALE = "viridis"
-NOT_COMPUTED = "0.75"
+COLOUR_MAP_NAME = "viridis"
+MISSING_COLOUR = "0.75"
 """Grey of what is not there: nan, or a point not computed yet."""
 
-LINES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#785A2D")
+LINE_COLOURS = (
+    "#0072B2",
+    "#D55E00",
+    "#009E73",
+    "#CC79A7",
+    "#E69F00",
+    "#56B4E9",
+    "#000000",
+    "#785A2D",
+)
 """Colours for lines: of Okabe and Ito (2008), and a brown that red-blind eyes tell from them."""
 
-DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)), (0, (8, 2)), (0, (3, 3)))
+DASH_STYLES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)), (0, (8, 2)), (0, (3, 3)))
 
 
-FORMATS = ("png", "pdf", "svg")
+PICTURE_FORMATS = ("png", "pdf", "svg")
 """Formats of pictures; text and lines of the last two are no pixels."""
 
-PRINTED_DPI = 300
+VECTOR_FORMAT_DPI = 300
 """Of what stays pixels in PDF and SVG: surfaces and clouds of many points."""
 
-STYLE: dict[Any, Any] = {
+RC_PARAMS: dict[Any, Any] = {
     "font.family": "DejaVu Sans",  # comes with matplotlib: the same on every machine
     "grid.color": "0.9",
     "grid.linewidth": 0.6,
@@ -48,12 +66,12 @@ STYLE: dict[Any, Any] = {
     "path.snap": True,
 }
 
-SOURCE = "Source"
+PNG_SOURCE_FIELD = "Source"
 """Field of a PNG's metadata that says what it was drawn from; of other formats, the subject."""
 
-_SOURCES = {"png": SOURCE, "pdf": "Subject", "svg": "Description"}
+_SOURCE_FIELD_BY_FORMAT = {"png": PNG_SOURCE_FIELD, "pdf": "Subject", "svg": "Description"}
 
-_NO_TRACES: dict[str, dict[str, str | None]] = {
+_OMITTED_METADATA: dict[str, dict[str, str | None]] = {
     "png": {"Software": None},
     "pdf": {"Creator": None, "Producer": None, "CreationDate": None},
     "svg": {"Creator": None, "Date": None},
@@ -62,234 +80,284 @@ _NO_TRACES: dict[str, dict[str, str | None]] = {
 
 
 @contextmanager
-def style() -> Iterator[None]:
+def uniform_style() -> Iterator[None]:
     """Return the one style of all pictures, whatever its user has set."""
     with rc_context():
         rcdefaults()
-        rcParams.update(STYLE)
+        rcParams.update(RC_PARAMS)
         yield
 
 
-def sheet(width: float, height: float) -> Sheet:
+def blank_sheet(width: float, height: float) -> Sheet:
     """Return an empty sheet, width and height in inches."""
-    figure = Sheet(figsize=(width, height), dpi=DPI, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
+    new_sheet = Sheet(figsize=(width, height), dpi=DPI, layout="constrained")
+    FigureCanvasAgg(new_sheet)
+    return new_sheet
 
 
-def panels(
+def sheet_with_axes(
     width: float, height: float, rows: int, columns: int, **options: Any
 ) -> tuple[Sheet, list[Axes]]:
     """Return a sheet with a grid of axes, listed row by row."""
-    figure = sheet(width, height)
-    axes = figure.subplots(rows, columns, squeeze=False, **options)
-    return figure, list(axes.ravel())
+    new_sheet = blank_sheet(width, height)
+    axes = new_sheet.subplots(rows, columns, squeeze=False, **options)
+    return new_sheet, list(axes.ravel())
 
 
-def empty(message: str) -> Sheet:
+def message_sheet(message: str) -> Sheet:
     """Return a sheet that says why there is nothing on it."""
-    figure = sheet(8.0, 2.0)
-    figure.text(0.5, 0.5, message, ha="center", va="center", color="0.3", parse_math=False)
-    return figure
+    new_sheet = blank_sheet(8.0, 2.0)
+    new_sheet.text(0.5, 0.5, message, ha="center", va="center", color="0.3", parse_math=False)
+    return new_sheet
 
 
-def title(figure: Sheet, text: str) -> None:
+def set_title(target_sheet: Sheet, text: str) -> None:
     """Title of a whole sheet, as it is written: a dollar in it is no formula."""
-    figure.suptitle(text, fontsize=11, fontweight="bold", parse_math=False)
+    target_sheet.suptitle(text, fontsize=11, fontweight="bold", parse_math=False)
 
 
-def caption(figure: Sheet, text: str) -> None:
+def set_caption(target_sheet: Sheet, text: str) -> None:
     """Small print at the foot of a sheet, broken into lines that fit it."""
     if text:
-        characters = int(figure.get_figwidth() * 15)
-        figure.supxlabel(
-            "\n".join(textwrap.wrap(text, characters)), fontsize=8, color="0.25", x=0.02,
+        characters_per_line = int(target_sheet.get_figwidth() * 15)
+        target_sheet.supxlabel(
+            "\n".join(textwrap.wrap(text, characters_per_line)), fontsize=8, color="0.25", x=0.02,
             ha="left", parse_math=False,
         )  # fmt: skip
 
 
-def save(figure: Sheet, path: Path, *, source: str = "") -> Path:
+def save_sheet(finished_sheet: Sheet, file_path: Path, *, source: str = "") -> Path:
     """Write the sheet in the format of the suffix; the same sheet gives the same bytes.
 
     ``source`` says what it was drawn from, and goes into the file's metadata.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    kind = path.suffix.removeprefix(".")
-    dpi = DPI if kind == "png" else PRINTED_DPI
-    with style():
-        metadata = _NO_TRACES[kind] | ({_SOURCES[kind]: source} if source else {})
-        figure.savefig(path, format=kind, dpi=dpi, metadata=metadata)
-    return path
+    file_path.parent.mkdir(parents=True, exist_ok=True)
+    picture_format = file_path.suffix.removeprefix(".")
+    dpi = DPI if picture_format == "png" else VECTOR_FORMAT_DPI
+    with uniform_style():
+        metadata = _OMITTED_METADATA[picture_format] | (
+            {_SOURCE_FIELD_BY_FORMAT[picture_format]: source} if source else {}
+        )
+        finished_sheet.savefig(file_path, format=picture_format, dpi=dpi, metadata=metadata)
+    return file_path
 
 
-MOST_TOGETHER = 4
+LINES_TOGETHER_MAX = 4
 """Lines that one panel can hold and still be read; more have panels of their own."""
 
-MARKED = 40
+MARKED_POINTS_MAX = 40
 """Points up to which each has a mark."""
 
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 
-MAP, HIGH_LINES, LOW_LINES, SMALL = (9.5, 4.4), (10.0, 3.6), (10.0, 1.75), (4.3, 3.0)
+MAP_PANEL_INCHES, HIGH_LINE_PANEL_INCHES, LOW_LINE_PANEL_INCHES, SMALL_PANEL_INCHES = (
+    (9.5, 4.4),
+    (10.0, 3.6),
+    (10.0, 1.75),
+    (4.3, 3.0),
+)
 """Widths of rows and heights of panels [inches]; of charts with several in a row, of a panel."""
 
 
-def sheet_of(chart: Chart, heading: str, note: str) -> Sheet:
+def draw_chart(chart: Chart, heading: str, footnote: str) -> Sheet:
     """Return the sheet of a chart, with what stands over it and what is added at its foot."""
-    figure = _sheet_of_maps(chart, chart.scale) if chart.scale else _sheet_of_lines(chart)
-    title(figure, heading)
-    caption(figure, labels.joined([*chart.caption, note]))
-    return figure
+    drawn_sheet = (
+        _draw_maps(chart, chart.colour_scale) if chart.colour_scale else _draw_lines(chart)
+    )
+    set_title(drawn_sheet, heading)
+    set_caption(drawn_sheet, labels.join_sentences([*chart.caption, footnote]))
+    return drawn_sheet
 
 
-def _sheet_of_maps(chart: Chart, scale: Scale) -> Sheet:
+def _draw_maps(chart: Chart, colour_scale: ColourScale) -> Sheet:
     """Arrange maps in one column, or in two if there are several parts."""
-    columns = min(2, len({panel.when["part"] for panel in chart.panels}))
-    rows = -(-len(chart.panels) // columns)
-    sheet, axes = panels(
-        MAP[0] * (1 + 0.4 * (columns - 1)), MAP[1] * rows + 0.8, rows, columns, sharex=True,
+    n_columns = min(2, len({panel.facet_choices["part"] for panel in chart.panels}))
+    n_rows = -(-len(chart.panels) // n_columns)
+    maps_sheet, axes_list = sheet_with_axes(
+        MAP_PANEL_INCHES[0] * (1 + 0.4 * (n_columns - 1)),
+        MAP_PANEL_INCHES[1] * n_rows + 0.8,
+        n_rows,
+        n_columns,
+        sharex=True,
         sharey=True,
-    )  # fmt: skip
-    norm = norm_of(scale)
-    for own in axes[len(chart.panels) :]:
-        own.set_visible(False)
-    for i, (own, panel) in enumerate(zip(axes, chart.panels, strict=False)):
-        _map(own, norm, panel)
-        own.set_title(panel.title, size=10)
-        if i + columns >= len(chart.panels):
-            own.set_xlabel(panel.x.words)
-            own.tick_params(labelbottom=True)
-        if i % columns == 0:
-            own.set_ylabel(panel.y.words)
-    sheet.colorbar(
-        ScalarMappable(norm, colours()), ax=axes, label=textwrap.fill(scale.words, 44), pad=0.015,
+    )
+    norm = colour_norm(colour_scale)
+    for panel_axes in axes_list[len(chart.panels) :]:
+        panel_axes.set_visible(False)
+    for i, (panel_axes, panel) in enumerate(zip(axes_list, chart.panels, strict=False)):
+        _draw_map(panel_axes, norm, panel)
+        panel_axes.set_title(panel.title, size=10)
+        if i + n_columns >= len(chart.panels):
+            panel_axes.set_xlabel(panel.x.label)
+            panel_axes.tick_params(labelbottom=True)
+        if i % n_columns == 0:
+            panel_axes.set_ylabel(panel.y.label)
+    maps_sheet.colorbar(
+        ScalarMappable(norm, colour_map()),
+        ax=axes_list,
+        label=textwrap.fill(colour_scale.label, 44),
+        pad=0.015,
         fraction=0.05,
-    )  # fmt: skip
-    return sheet
+    )
+    return maps_sheet
 
 
-def norm_of(scale: Scale) -> Normalize:
+def colour_norm(colour_scale: ColourScale) -> Normalize:
     """Colours' norm of a scale."""
-    return (LogNorm if scale.decades else Normalize)(scale.low, scale.high)
+    return (LogNorm if colour_scale.is_log else Normalize)(colour_scale.low, colour_scale.high)
 
 
-def colours() -> Colormap:
+def colour_map() -> Colormap:
     """Colour map, grey where there is no value."""
-    return colormaps[SCALE].with_extremes(bad=NOT_COMPUTED)
+    return colormaps[COLOUR_MAP_NAME].with_extremes(bad=MISSING_COLOUR)
 
 
-def edges(centres: np.ndarray, logarithmic: bool) -> np.ndarray:
+def cell_edges(centres: np.ndarray, logarithmic: bool) -> np.ndarray:
     """Edges (n + 1,) of cells around their centres (n,)."""
     if centres.size == 1:
         return centres[0] * np.array([0.9, 1.1]) if centres[0] else np.array([-0.5, 0.5])
-    c = np.log(centres) if logarithmic else centres.astype(float)
-    middle = (c[1:] + c[:-1]) / 2
-    e = np.concatenate([[2 * c[0] - middle[0]], middle, [2 * c[-1] - middle[-1]]])
-    return np.exp(e) if logarithmic else e
+    positions = np.log(centres) if logarithmic else centres.astype(float)
+    midpoints = (positions[1:] + positions[:-1]) / 2
+    edge_positions = np.concatenate(
+        [[2 * positions[0] - midpoints[0]], midpoints, [2 * positions[-1] - midpoints[-1]]]
+    )
+    return np.exp(edge_positions) if logarithmic else edge_positions
 
 
-def _map(axes: Axes, norm: Normalize, panel: Panel) -> None:
-    layer, sides = panel.map, []
-    assert layer is not None
-    for side, values, axis in (("x", layer.x, panel.x), ("y", layer.y, panel.y)):
-        if axis.kind == WORDS:
-            axes.set(**{f"{side}ticks": np.arange(values.size), f"{side}ticklabels": values})
+def _draw_map(axes: Axes, norm: Normalize, panel: Panel) -> None:
+    heat_map, mesh_edges = panel.heat_map, []
+    assert heat_map is not None
+    for axis_name, values, axis in (("x", heat_map.x, panel.x), ("y", heat_map.y, panel.y)):
+        if axis.kind == CATEGORY:
+            axes.set(
+                **{f"{axis_name}ticks": np.arange(values.size), f"{axis_name}ticklabels": values}
+            )
             values = np.arange(values.size)
-        sides.append(edges(values, axis.kind == LOG))
-    values = np.ma.masked_invalid(layer.values)
-    axes.pcolormesh(*sides, values, norm=norm, cmap=colours(), rasterized=True)
-    if len(layer.levels) and min(values.shape) > 1 and values.count():
-        _contours(axes, layer, values)
-    _scale(axes, "x", panel.x)
-    _scale(axes, "y", panel.y)
-    axes.set_facecolor(NOT_COMPUTED)
+        mesh_edges.append(cell_edges(values, axis.kind == LOG))
+    values = np.ma.masked_invalid(heat_map.values)
+    axes.pcolormesh(*mesh_edges, values, norm=norm, cmap=colour_map(), rasterized=True)
+    if len(heat_map.contour_levels) and min(values.shape) > 1 and values.count():
+        _draw_contours(axes, heat_map, values)
+    _set_axis(axes, "x", panel.x)
+    _set_axis(axes, "y", panel.y)
+    axes.set_facecolor(MISSING_COLOUR)
 
 
-def _contours(axes: Axes, layer: Map, values: np.ma.MaskedArray) -> None:
+def _draw_contours(axes: Axes, heat_map: HeatMap, values: np.ma.MaskedArray) -> None:
     """Contours with their levels, black with a pale rim: they stand out from every colour."""
-    known = [level for level in layer.levels if values.min() < level < values.max()]
-    if not known:
+    levels_in_range = [
+        level for level in heat_map.contour_levels if values.min() < level < values.max()
+    ]
+    if not levels_in_range:
         return
-    rim: list[patheffects.AbstractPathEffect] = [
+    outline: list[patheffects.AbstractPathEffect] = [
         patheffects.withStroke(linewidth=3.2, foreground="white", alpha=0.75)
     ]
     contours = axes.contour(
-        layer.x, layer.y, values, levels=known, colors="black", linewidths=1.3, zorder=3
+        heat_map.x,
+        heat_map.y,
+        values,
+        levels=levels_in_range,
+        colors="black",
+        linewidths=1.3,
+        zorder=3,
     )
-    contours.set_path_effects(rim)
-    width, height = (np.ptp(own) for own in (layer.x, layer.y))
-    middles = []
-    for lines in contours.allsegs:
-        line = max(lines, key=len)
-        steps = np.hypot(np.diff(line[:, 0]) / width, np.diff(line[:, 1]) / height)
-        along = np.concatenate([[0.0], np.cumsum(steps)])
-        middles.append(tuple(line[np.searchsorted(along, along[-1] / 2)]))
-    for label in axes.clabel(contours, fmt="%g", fontsize=10, manual=middles):
-        label.set_path_effects(rim)
+    contours.set_path_effects(outline)
+    x_span, y_span = (np.ptp(coordinates) for coordinates in (heat_map.x, heat_map.y))
+    label_positions = []
+    for segments in contours.allsegs:
+        longest_segment = max(segments, key=len)
+        steps = np.hypot(
+            np.diff(longest_segment[:, 0]) / x_span, np.diff(longest_segment[:, 1]) / y_span
+        )
+        arc_length = np.concatenate([[0.0], np.cumsum(steps)])
+        label_positions.append(
+            tuple(longest_segment[np.searchsorted(arc_length, arc_length[-1] / 2)])
+        )
+    for label in axes.clabel(contours, fmt="%g", fontsize=10, manual=label_positions):
+        label.set_path_effects(outline)
 
 
-def _scale(axes: Axes, side: Literal["x", "y"], axis: Axis) -> None:
+def _set_axis(axes: Axes, axis_name: Literal["x", "y"], axis: ChartAxis) -> None:
     """Kind and ends of an axis."""
-    if axis.kind != WORDS:
-        axes.set(**{f"{side}scale": axis.kind})
+    if axis.kind != CATEGORY:
+        axes.set(**{f"{axis_name}scale": axis.kind})
     if axis.limits is not None:
-        axes.set(**{f"{side}lim": axis.limits})
+        axes.set(**{f"{axis_name}lim": axis.limits})
 
 
-def _sheet_of_lines(chart: Chart) -> Sheet:
+def _draw_lines(chart: Chart) -> Sheet:
     """Panels of lines one under the other, or in the chart's own rows."""
-    every, apart = (chart.panels, False) if chart.rows else _apart(chart.panels)
-    rows = chart.rows or [1] * len(every)
-    width, height = SMALL if chart.rows else LOW_LINES if apart else HIGH_LINES
-    alike = len({panel.y for panel in every}) == 1
-    columns = max(rows)
-    sheet, grid = panels(
-        width * columns + 1.9 * bool(chart.rows), height * len(rows) + 1.4, len(rows), columns,
-        sharex=True, sharey=alike,
-    )  # fmt: skip
-    places = [(row, column) for row, number in enumerate(rows) for column in range(number)]
-    for i, axes in enumerate(grid):
-        axes.set_visible(divmod(i, columns) in places)
-    for (row, column), panel in zip(places, every, strict=True):
-        axes = grid[row * columns + column]
-        _panel(axes, panel)
-        below = (row + 1, column) in places
-        axes.tick_params(labelbottom=not below, labelsize=8 if chart.rows else None)
-        if not below:
-            axes.set_xlabel(panel.x.words)
-        if not alike:
-            axes.set_ylabel(panel.y.words, size=9)
-    if alike:
-        sheet.supylabel(textwrap.fill(every[0].y.words, 44), fontsize=10)
-    if not apart:
-        _legend(sheet, grid)
-    return sheet
+    drawn_panels, is_split = (
+        (chart.panels, False) if chart.panels_per_row else _one_line_per_panel(chart.panels)
+    )
+    panels_per_row = chart.panels_per_row or [1] * len(drawn_panels)
+    width, height = (
+        SMALL_PANEL_INCHES
+        if chart.panels_per_row
+        else LOW_LINE_PANEL_INCHES
+        if is_split
+        else HIGH_LINE_PANEL_INCHES
+    )
+    share_y_axis = len({panel.y for panel in drawn_panels}) == 1
+    n_columns = max(panels_per_row)
+    lines_sheet, axes_list = sheet_with_axes(
+        width * n_columns + 1.9 * bool(chart.panels_per_row),
+        height * len(panels_per_row) + 1.4,
+        len(panels_per_row),
+        n_columns,
+        sharex=True,
+        sharey=share_y_axis,
+    )
+    occupied_cells = [
+        (row, column) for row, n_panels in enumerate(panels_per_row) for column in range(n_panels)
+    ]
+    for i, axes in enumerate(axes_list):
+        axes.set_visible(divmod(i, n_columns) in occupied_cells)
+    for (row, column), panel in zip(occupied_cells, drawn_panels, strict=True):
+        axes = axes_list[row * n_columns + column]
+        _draw_panel(axes, panel)
+        has_panel_below = (row + 1, column) in occupied_cells
+        axes.tick_params(
+            labelbottom=not has_panel_below, labelsize=8 if chart.panels_per_row else None
+        )
+        if not has_panel_below:
+            axes.set_xlabel(panel.x.label)
+        if not share_y_axis:
+            axes.set_ylabel(panel.y.label, size=9)
+    if share_y_axis:
+        lines_sheet.supylabel(textwrap.fill(drawn_panels[0].y.label, 44), fontsize=10)
+    if not is_split:
+        _draw_legend(lines_sheet, axes_list)
+    return lines_sheet
 
 
-def _apart(panels: Sequence[Panel]) -> tuple[Sequence[Panel], bool]:
+def _one_line_per_panel(panels: Sequence[Panel]) -> tuple[Sequence[Panel], bool]:
     """Panels with a single line each, where lines of one would lie over each other."""
-    packed = any(line.together > 1 for panel in panels for line in panel.lines)
-    split = [
-        (panel, [line for line in panel.lines if line.look != "level"],
-         [line for line in panel.lines if line.look == "level"])
+    is_reduced = any(line.points_per_value > 1 for panel in panels for line in panel.lines)
+    split_panels = [
+        (panel, [line for line in panel.lines if line.style != "level"],
+         [line for line in panel.lines if line.style == "level"])
         for panel in panels
     ]  # fmt: skip
-    if max(len(lines) for _, lines, _ in split) <= (1 if packed else MOST_TOGETHER):
+    if max(len(lines) for _, lines, _ in split_panels) <= (1 if is_reduced else LINES_TOGETHER_MAX):
         return panels, False
     return [
-        replace(panel, lines=[line, *levels], when={**panel.when, "line": line.name})
-        for panel, lines, levels in split
+        replace(
+            panel, lines=[line, *levels], facet_choices={**panel.facet_choices, "line": line.name}
+        )
+        for panel, lines, levels in split_panels
         for line in lines
     ], True
 
 
-def _panel(axes: Axes, panel: Panel) -> None:
-    stated = any(line.look == "stated" for line in panel.lines)
+def _draw_panel(axes: Axes, panel: Panel) -> None:
+    has_stated = any(line.style == "stated" for line in panel.lines)
     for line in panel.lines:
-        _line(axes, line, solid=stated or line.together > 1)
-    _scale(axes, "x", panel.x)
-    _scale(axes, "y", panel.y)
-    if panel.x.kind != WORDS:
+        _draw_line(axes, line, solid=has_stated or line.points_per_value > 1)
+    _set_axis(axes, "x", panel.x)
+    _set_axis(axes, "y", panel.y)
+    if panel.x.kind != CATEGORY:
         axes.margins(x=0.0 if max(line.x.size for line in panel.lines) > 1 else 0.05)
     if panel.y.kind != LOG:
         axes.ticklabel_format(axis="y", style="sci", scilimits=(-3, 5))
@@ -298,9 +366,9 @@ def _panel(axes: Axes, panel: Panel) -> None:
     axes.set_title(panel.title, size=9, loc="left")
 
 
-def _line(axes: Axes, line: Line, *, solid: bool) -> None:
+def _draw_line(axes: Axes, line: ChartLine, *, solid: bool) -> None:
     """One line over its band."""
-    if line.look == "level":
+    if line.style == "level":
         axes.axhline(line.y[0], color="0.6", linewidth=0.8, zorder=1)
         if not line.name:
             return
@@ -309,31 +377,40 @@ def _line(axes: Axes, line: Line, *, solid: bool) -> None:
             textcoords="offset points", va="center", fontsize=8, color="0.35",
         )  # fmt: skip
         return
-    look: dict[str, Any] = {"color": LINES[line.number % 8], "linewidth": 1.3}
-    marked = line.x.size <= MARKED
-    if line.look == "stated":
-        axes.plot(line.x, line.y, linestyle="--", label=line.name, **look | {"linewidth": 1.1})
+    plot_options: dict[str, Any] = {"color": LINE_COLOURS[line.style_index % 8], "linewidth": 1.3}
+    has_markers = line.x.size <= MARKED_POINTS_MAX
+    if line.style == "stated":
+        axes.plot(
+            line.x, line.y, linestyle="--", label=line.name, **plot_options | {"linewidth": 1.1}
+        )
         return
-    look |= {"label": line.name, "markersize": 4}
-    look |= {"marker": MARKERS[line.number % 8]} if marked else {}
+    plot_options |= {"label": line.name, "markersize": 4}
+    plot_options |= {"marker": MARKERS[line.style_index % 8]} if has_markers else {}
     if line.low is not None and line.high is not None:
-        if line.look == "bars":
-            ends = [line.y - line.low, line.high - line.y]
-            axes.errorbar(line.x, line.y, ends, elinewidth=0.8, capsize=2, **look)
+        if line.style == "bars":
+            error_bars = [line.y - line.low, line.high - line.y]
+            axes.errorbar(line.x, line.y, error_bars, elinewidth=0.8, capsize=2, **plot_options)
             return
         axes.fill_between(
-            line.x, line.low, line.high, color=look["color"], alpha=0.22, linewidth=0,
-            step="mid" if line.together > 1 else None,
+            line.x, line.low, line.high, color=plot_options["color"], alpha=0.22, linewidth=0,
+            step="mid" if line.points_per_value > 1 else None,
         )  # fmt: skip
-    axes.plot(line.x, line.y, linestyle="-" if solid else DASHES[line.number % 8], **look)
+    axes.plot(
+        line.x,
+        line.y,
+        linestyle="-" if solid else DASH_STYLES[line.style_index % 8],
+        **plot_options,
+    )
 
 
-def _legend(sheet: Sheet, grid: Sequence[Axes]) -> None:
+def _draw_legend(lines_sheet: Sheet, axes_list: Sequence[Axes]) -> None:
     """Each name of a line once."""
-    handles: dict[str, Any] = {}
-    for axes in grid:
+    handle_by_name: dict[str, Any] = {}
+    for axes in axes_list:
         for handle, name in zip(*axes.get_legend_handles_labels(), strict=True):
-            handles.setdefault(name, handle)
-    if handles:
-        place: Any = "outside right upper"
-        sheet.legend(handles.values(), handles, loc=place, frameon=False, fontsize=8)
+            handle_by_name.setdefault(name, handle)
+    if handle_by_name:
+        legend_location: Any = "outside right upper"
+        lines_sheet.legend(
+            handle_by_name.values(), handle_by_name, loc=legend_location, frameon=False, fontsize=8
+        )

@@ -1,7 +1,7 @@
 """Charts as data, and those of grids: a variable over two coordinates, or along one.
 
-Files of them are drawn by :mod:`sweep.analysis.canvas`, pages by :mod:`sweep.report.page`: a sheet
-shows the panels side by side, a page one at a time, by the choice of each facet.
+Files of them are drawn by :mod:`sweep.analysis.canvas`, pages by :mod:`sweep.report.html_page`: a
+sheet shows the panels side by side, a page one at a time, by the choice of each facet.
 """
 
 from __future__ import annotations
@@ -17,26 +17,38 @@ import numpy as np
 import xarray as xr
 
 from sweep.analysis import labels
-from sweep.analysis.answers.probability import SEGMENTS, detection_probability, half_width
-from sweep.analysis.selection import HIGHEST, LOWEST, MEAN, Points, Side, split, spread
+from sweep.analysis.answers.probability import (
+    SEGMENTS_AND_SHOT,
+    detection_probability,
+    pd_half_width,
+)
+from sweep.analysis.selection import (
+    HIGHEST,
+    LOWEST,
+    MEAN,
+    PointSelection,
+    SortedCoordinate,
+    split_by_coordinates,
+    thin_evenly,
+)
 
-LINEAR, LOG, WORDS = "linear", "log", "category"
+LINEAR, LOG, CATEGORY = "linear", "log", "category"
 
-CHANCE = (-0.03, 1.03)
+PROBABILITY_LIMITS = (-0.03, 1.03)
 """Limits of an axis of probabilities."""
 
 
 @dataclass(frozen=True)
-class Axis:
+class ChartAxis:
     """An axis: words with units, its kind, and its ends; none where those of the data will do."""
 
-    words: str = ""
+    label: str = ""
     kind: str = LINEAR
     limits: tuple[float | None, float | None] | None = None
 
 
 @dataclass(frozen=True, eq=False)
-class Line:
+class ChartLine:
     """Values along an axis; nan where there is none.
 
     A legend has its name; a number stands for its colour, dash and mark. A band may be about
@@ -48,48 +60,48 @@ class Line:
     x: np.ndarray
     y: np.ndarray
     name: str = ""
-    number: int = 0
+    style_index: int = 0
     low: np.ndarray | None = None
     high: np.ndarray | None = None
-    look: str = "line"
-    together: int = 1
-    told: Sequence[str] = ()
+    style: str = "line"
+    points_per_value: int = 1
+    hover_texts: Sequence[str] = ()
 
 
 @dataclass(frozen=True, eq=False)
-class Map:
+class HeatMap:
     """Values (rows, columns) over y and x; nan where there is none. Levels have contours."""
 
     x: np.ndarray
     y: np.ndarray
     values: np.ndarray
-    levels: Sequence[float] = ()
+    contour_levels: Sequence[float] = ()
 
 
 @dataclass(frozen=True)
-class Scale:
+class ColourScale:
     """Colours of a variable: probabilities from 0 to 1, wide spans by decades."""
 
     low: float
     high: float
-    decades: bool
-    words: str
+    is_log: bool
+    label: str
 
 
 @dataclass(frozen=True, eq=False)
 class Panel:
     """Lines or a map over two axes, at one choice of each facet."""
 
-    when: Mapping[str, str]
-    x: Axis
-    y: Axis
-    lines: Sequence[Line] = ()
-    map: Map | None = None
+    facet_choices: Mapping[str, str]
+    x: ChartAxis
+    y: ChartAxis
+    lines: Sequence[ChartLine] = ()
+    heat_map: HeatMap | None = None
 
     @property
     def title(self) -> str:
         """The choices in words."""
-        return ", ".join(filter(None, self.when.values()))
+        return ", ".join(filter(None, self.facet_choices.values()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,65 +115,69 @@ class Chart:
     alt: str
     caption: Sequence[str]
     panels: Sequence[Panel]
-    facets: Mapping[str, str] = field(default_factory=dict)
-    scale: Scale | None = None
-    rows: Sequence[int] = ()
+    facet_labels: Mapping[str, str] = field(default_factory=dict)
+    colour_scale: ColourScale | None = None
+    panels_per_row: Sequence[int] = ()
 
 
 @dataclass(frozen=True)
-class Room:
+class ChartSizeLimits:
     """Room for a chart: parts, cells of a map across and up and in all, maps abreast."""
 
-    parts: int
-    columns: int
-    rows: int
-    cells: float
-    abreast: int
+    parts_max: int
+    columns_max: int
+    rows_max: int
+    cells_max: float
+    maps_abreast: int
 
 
-SHEET = Room(parts=9, columns=1100, rows=500, cells=math.inf, abreast=2)
+SHEET_LIMITS = ChartSizeLimits(
+    parts_max=9, columns_max=1100, rows_max=500, cells_max=math.inf, maps_abreast=2
+)
 """Cells of a panel as wide as the sheet: no more than its pixels, so that none is lost."""
 
-MOST_LINES = 8
-STRETCHES = 500
+LINES_PER_PANEL_MAX = 8
+LINE_INTERVALS = 500
 """Stretches into which a line of more than twice as many points is cut."""
 
-_DECADES_FOR_LOG = 3
-_CHANCES_OF_HARM = ("miss_", "pfa_", "log10_pfa_", "p_leakage_")
+_LOG_SCALE_DECADES_MIN = 3
+_HARMFUL_PREFIXES = ("miss_", "pfa_", "log10_pfa_", "p_leakage_")
 
 
 @dataclass(frozen=True)
-class Ruler:
+class CoordinateAxis:
     """A coordinate along an axis: in the units that a reader wants, words as they are."""
 
-    axis: Axis
+    axis: ChartAxis
     factor: float
     units: str
 
     @classmethod
-    def of(cls, found: Points, name: str) -> Ruler:
+    def from_points(cls, points: PointSelection, name: str) -> CoordinateAxis:
         """Return the ruler of a coordinate."""
-        values, units = np.unique(found.values(name)), found.units(name)
-        if labels.is_words(values):
-            return cls(Axis(labels.coordinate(name), WORDS), 1.0, "")
-        factor, units = labels.shown_in(values, units)
-        words = labels.with_units(labels.coordinate(name), units)
-        return cls(Axis(words, LOG if is_geometric(values) else LINEAR), factor, units)
+        values, units = np.unique(points.coordinate_values(name)), points.coordinate_units(name)
+        if labels.is_categorical(values):
+            return cls(ChartAxis(labels.coordinate_label(name), CATEGORY), 1.0, "")
+        factor, units = labels.display_factor_and_units(values, units)
+        label = labels.axis_label(labels.coordinate_label(name), units)
+        return cls(ChartAxis(label, LOG if is_log_spaced(values) else LINEAR), factor, units)
 
-    def shown(self, values: np.ndarray) -> np.ndarray:
+    def to_axis_units(self, values: np.ndarray) -> np.ndarray:
         """Values as they stand on the axis."""
-        if self.axis.kind == WORDS:
+        if self.axis.kind == CATEGORY:
             return np.array([str(value) for value in values])
         return values * self.factor
 
-    def span(self, values: np.ndarray) -> str:
+    def describe_span(self, values: np.ndarray) -> str:
         """First and last value in words."""
-        shown = self.shown(values)
-        ends = [labels.quantity(v, self.units) for v in (shown[0], shown[-1])]
-        return f"{self.axis.words} from {ends[0]} to {ends[1]}"
+        axis_values = self.to_axis_units(values)
+        end_texts = [
+            labels.format_quantity(v, self.units) for v in (axis_values[0], axis_values[-1])
+        ]
+        return f"{self.axis.label} from {end_texts[0]} to {end_texts[1]}"
 
 
-def is_geometric(values: np.ndarray) -> bool:
+def is_log_spaced(values: np.ndarray) -> bool:
     """Tell whether values are spread evenly in their logarithm, over a decade or more."""
     if values.size < 3 or values.min() <= 0 or values.max() < 10 * values.min():
         return False
@@ -169,254 +185,350 @@ def is_geometric(values: np.ndarray) -> bool:
     return bool(steps.max() < 1.5 * steps.min())
 
 
-def scale_of(variable: str, words: str, layers: Sequence[np.ndarray]) -> Scale:
+def fit_colour_scale(variable: str, label: str, layers: Sequence[np.ndarray]) -> ColourScale:
     """Colours of a variable: 0..1 for probabilities of detection, else what the values span."""
     values = np.concatenate([layer.ravel() for layer in layers])
-    known = values[np.isfinite(values)]
-    if variable.startswith("pd_") or not known.size:
-        return Scale(0.0, 1.0, False, words)
-    low, high = float(known.min()), float(known.max())
-    above = known[known > 0]
-    if low >= 0 and above.size and high > 10**_DECADES_FOR_LOG * float(np.median(above)):
-        return Scale(max(float(np.percentile(above, 1)), high * 1e-12), high, True, words)
-    return Scale(low, high if high > low else low + 1.0, False, words)
+    finite_values = values[np.isfinite(values)]
+    if variable.startswith("pd_") or not finite_values.size:
+        return ColourScale(0.0, 1.0, False, label)
+    low, high = float(finite_values.min()), float(finite_values.max())
+    positive_values = finite_values[finite_values > 0]
+    if (
+        low >= 0
+        and positive_values.size
+        and high > 10**_LOG_SCALE_DECADES_MIN * float(np.median(positive_values))
+    ):
+        return ColourScale(
+            max(float(np.percentile(positive_values, 1)), high * 1e-12), high, True, label
+        )
+    return ColourScale(low, high if high > low else low + 1.0, False, label)
 
 
-def worst(variable: str) -> str:
+def worst_statistic(variable: str) -> str:
     """Worst kind of the values that share a cell; empty if neither end is bad."""
     if variable.startswith(("pd_", "snr_")):
         return LOWEST
-    return HIGHEST if variable.startswith(_CHANCES_OF_HARM) else ""
+    return HIGHEST if variable.startswith(_HARMFUL_PREFIXES) else ""
 
 
-def facets_of(
-    found: Points, shown: Sequence[str], most: int
-) -> tuple[list[tuple[str, Points]], int]:
+def split_into_parts(
+    points: PointSelection, shown_names: Sequence[str], parts_max: int
+) -> tuple[list[tuple[str, PointSelection]], int]:
     """Parts of points of which a panel shows one, and how many are left out."""
-    if not found.size:
+    if not points.size:
         return [], 0
-    every, _ = split(found, found.further(shown), found.size)
-    several = [
-        (words, part) for words, part in every if all(len(part.distinct(n)) > 1 for n in shown)
+    all_parts, _ = split_by_coordinates(
+        points, points.distinguishing_coordinates(shown_names), points.size
+    )
+    varied_parts = [
+        (part_label, part)
+        for part_label, part in all_parts
+        if all(len(part.unique_values(n)) > 1 for n in shown_names)
     ]
-    return spread(several or every, most)
+    return thin_evenly(varied_parts or all_parts, parts_max)
 
 
-def not_shown(number: int) -> str:
+def omission_remark(n_omitted: int) -> str:
     """Remark that some values are left out; empty where none is."""
-    return f"{labels.counted(number, 'further value')} not shown" if number else ""
+    return f"{labels.format_count(n_omitted, 'further value')} not shown" if n_omitted else ""
 
 
-def surface(
-    found: Points,
+def surface_chart(
+    points: PointSelection,
     *,
     x: str,
     y: str,
     variable: str,
-    words: str,
-    room: Room = SHEET,
+    label: str,
+    size_limits: ChartSizeLimits = SHEET_LIMITS,
     levels: Sequence[float] = (),
 ) -> Chart:
     """Return a variable over two coordinates, a panel for each value of what else varies.
 
     Contours are drawn at some levels of the variable, where both coordinates are numbers.
     """
-    parts, left_out = facets_of(found, [x, y], room.parts)
-    planes = [_plane(part, variable, x, y) for _, part in parts]
-    kinds = [MEAN, worst(variable)] if worst(variable) else [MEAN]
-    most = _most(planes, room, len(kinds) * len(parts))
-    by = [
-        max(across.together(most[0]) for _, across, _ in planes),
-        max(up.together(most[1]) for _, _, up in planes),
+    parts, n_omitted = split_into_parts(points, [x, y], size_limits.parts_max)
+    planes = [_to_plane(part, variable, x, y) for _, part in parts]
+    cell_statistics = [MEAN, worst_statistic(variable)] if worst_statistic(variable) else [MEAN]
+    cells_max = _cells_max(planes, size_limits, len(cell_statistics) * len(parts))
+    points_per_cell = [
+        max(x_coordinate.points_per_cell(cells_max[0]) for _, x_coordinate, _ in planes),
+        max(y_coordinate.points_per_cell(cells_max[1]) for _, _, y_coordinate in planes),
     ]
-    kinds = kinds if max(by) > 1 else [MEAN]
-    lazy = [
-        plane.cells(variable, [(up, most[1]), (across, most[0])], kind).data
-        for plane, across, up in planes
-        for kind in kinds
+    cell_statistics = cell_statistics if max(points_per_cell) > 1 else [MEAN]
+    lazy_cells = [
+        plane.coarsen(
+            variable, [(y_coordinate, cells_max[1]), (x_coordinate, cells_max[0])], cell_statistic
+        ).data
+        for plane, x_coordinate, y_coordinate in planes
+        for cell_statistic in cell_statistics
     ]
-    layers = [np.asarray(layer, float) for layer in dask.compute(*lazy)]
-    x_ruler, y_ruler = Ruler.of(found, x), Ruler.of(found, y)
+    layers = [np.asarray(layer, float) for layer in dask.compute(*lazy_cells)]
+    x_axis, y_axis = CoordinateAxis.from_points(points, x), CoordinateAxis.from_points(points, y)
     panels: list[Panel] = []
-    for ((name, _), (_, across, up)), kind in product(zip(parts, planes, strict=True), kinds):
-        when = {"part": name, "cell": f"{kind} of each cell" if max(by) > 1 else ""}
-        columns, rows = across.middles(most[0]), up.middles(most[1])
-        contours = () if WORDS in (x_ruler.axis.kind, y_ruler.axis.kind) else levels
-        layer = Map(x_ruler.shown(columns), y_ruler.shown(rows), layers[len(panels)], contours)
-        panels.append(Panel(when, x_ruler.axis, y_ruler.axis, map=layer))
-    spans = [ruler.span(np.unique(found.values(n))) for ruler, n in ((x_ruler, x), (y_ruler, y))]
-    remarks = [_reduction(math.prod(by), planes[0][1:], kinds), not_shown(left_out)]
-    if levels and panels and panels[0].map and panels[0].map.levels:
+    for ((part_label, _), (_, x_coordinate, y_coordinate)), cell_statistic in product(
+        zip(parts, planes, strict=True), cell_statistics
+    ):
+        facet_choices = {
+            "part": part_label,
+            "cell": f"{cell_statistic} of each cell" if max(points_per_cell) > 1 else "",
+        }
+        x_values, y_values = (
+            x_coordinate.cell_means(cells_max[0]),
+            y_coordinate.cell_means(cells_max[1]),
+        )
+        contour_levels = () if CATEGORY in (x_axis.axis.kind, y_axis.axis.kind) else levels
+        layer = HeatMap(
+            x_axis.to_axis_units(x_values),
+            y_axis.to_axis_units(y_values),
+            layers[len(panels)],
+            contour_levels,
+        )
+        panels.append(Panel(facet_choices, x_axis.axis, y_axis.axis, heat_map=layer))
+    span_texts = [
+        coordinate_axis.describe_span(np.unique(points.coordinate_values(n)))
+        for coordinate_axis, n in ((x_axis, x), (y_axis, y))
+    ]
+    remarks = [
+        _reduction_remark(math.prod(points_per_cell), planes[0][1:], cell_statistics),
+        omission_remark(n_omitted),
+    ]
+    if levels and panels and panels[0].heat_map and panels[0].heat_map.contour_levels:
         remarks.append(f"contours: {' and '.join(f'{level:g}' for level in levels)}")
     if any(np.isnan(layer).any() for layer in layers):
         remarks.append("grey or empty: not computed, or without a value")
     return Chart(
-        words,
-        f"Heat map of {words} over {' and '.join(spans)}: {labels.extent(layers[0])}.",
+        label,
+        f"Heat map of {label} over {' and '.join(span_texts)}: "
+        f"{labels.describe_extent(layers[0])}.",
         remarks,
         panels,
         {"part": "Shown for", "cell": "Each cell shows the"},
-        scale_of(variable, words, layers),
+        fit_colour_scale(variable, label, layers),
     )
 
 
-def _most(planes: Sequence[tuple[Points, Side, Side]], room: Room, layers: int) -> tuple[int, int]:
+def _cells_max(
+    planes: Sequence[tuple[PointSelection, SortedCoordinate, SortedCoordinate]],
+    size_limits: ChartSizeLimits,
+    n_layers: int,
+) -> tuple[int, int]:
     """Cells across and up that all maps keep to."""
-    columns = room.columns // (room.abreast if len(planes) > 1 else 1)
-    width = min(columns, max(across.values.size for _, across, _ in planes))
-    height = min(room.rows, max(up.values.size for _, _, up in planes))
-    shrink = min(1.0, math.sqrt(room.cells / layers / (width * height)))
-    return max(2, int(width * shrink)), max(2, int(height * shrink))
+    columns_max = size_limits.columns_max // (size_limits.maps_abreast if len(planes) > 1 else 1)
+    n_columns = min(columns_max, max(x_coordinate.values.size for _, x_coordinate, _ in planes))
+    n_rows = min(
+        size_limits.rows_max, max(y_coordinate.values.size for _, _, y_coordinate in planes)
+    )
+    shrink = min(1.0, math.sqrt(size_limits.cells_max / n_layers / (n_columns * n_rows)))
+    return max(2, int(n_columns * shrink)), max(2, int(n_rows * shrink))
 
 
-def _plane(found: Points, variable: str, x: str, y: str) -> tuple[Points, Side, Side]:
+def _to_plane(
+    points: PointSelection, variable: str, x: str, y: str
+) -> tuple[PointSelection, SortedCoordinate, SortedCoordinate]:
     """Points over two axes, and the places along x and along y."""
-    if found.dim_of(x) != found.dim_of(y):
-        return found, found.side(x), found.side(y)
-    columns, column = np.unique(found.values(x), return_inverse=True)
-    rows, row = np.unique(found.values(y), return_inverse=True)
-    both = found.dim_of(x)
-    places = np.asarray(found.places[both].index)
-    along = Side(both, places, places)
-    values = np.full((rows.size, columns.size), np.nan)
-    values[row.ravel(), column.ravel()] = found.cells(variable, [(along, along.values.size)], MEAN)
-    plane = Points.of(xr.Dataset({variable: (("y", "x"), values)}))
-    across, up = Side("x", np.arange(columns.size), columns), Side("y", np.arange(rows.size), rows)
-    return plane, across, up
+    if points.dim_of(x) != points.dim_of(y):
+        return points, points.sorted_coordinate(x), points.sorted_coordinate(y)
+    x_values, column_index = np.unique(points.coordinate_values(x), return_inverse=True)
+    y_values, row_index = np.unique(points.coordinate_values(y), return_inverse=True)
+    shared_dim = points.dim_of(x)
+    point_indices = np.asarray(points.dim_tables[shared_dim].index)
+    flat_coordinate = SortedCoordinate(shared_dim, point_indices, point_indices)
+    values = np.full((y_values.size, x_values.size), np.nan)
+    values[row_index.ravel(), column_index.ravel()] = points.coarsen(
+        variable, [(flat_coordinate, flat_coordinate.values.size)], MEAN
+    )
+    plane = PointSelection.from_dataset(xr.Dataset({variable: (("y", "x"), values)}))
+    x_coordinate, y_coordinate = (
+        SortedCoordinate("x", np.arange(x_values.size), x_values),
+        SortedCoordinate("y", np.arange(y_values.size), y_values),
+    )
+    return plane, x_coordinate, y_coordinate
 
 
-def _reduction(each: int, sides: Sequence[Side], kinds: Sequence[str]) -> str:
+def _reduction_remark(
+    points_per_cell: int, coordinates: Sequence[SortedCoordinate], cell_statistics: Sequence[str]
+) -> str:
     """Remark on the number of points that share a cell; empty where none do."""
-    if each == 1:
+    if points_per_cell == 1:
         return ""
-    number = math.prod(side.values.size for side in sides)
-    told = f"reduced: each cell stands for {each} neighbouring points of {number:,}: their mean"
-    if len(kinds) > 1:
-        told += f", and the {kinds[1]} of them, which hides no narrow dip or peak"
-    return told
+    n_points = math.prod(coordinate.values.size for coordinate in coordinates)
+    remark = (
+        f"reduced: each cell stands for {points_per_cell} neighbouring points of {n_points:,}: "
+        "their mean"
+    )
+    if len(cell_statistics) > 1:
+        remark += f", and the {cell_statistics[1]} of them, which hides no narrow dip or peak"
+    return remark
 
 
-def slices(
-    found: Points,
+def slice_chart(
+    points: PointSelection,
     *,
     x: str,
     by: str,
     variable: str,
-    words: str,
-    most: int = 6,
+    label: str,
+    parts_max: int = 6,
     levels: Sequence[float] = (),
 ) -> Chart:
     """Return a variable along a coordinate, a line for each value of another; lines at levels."""
-    lines_by = [by] if by else []
-    parts, left_out = facets_of(found, [x, *lines_by], most)
-    named, lacking = lines_of(parts, lines_by)
-    drawn, remarks = along([(own, variable) for _, _, own in named], x)
-    ruler = Ruler.of(found, x)
-    scale = scale_of(variable, words, [line.y for line in drawn])
-    limits = CHANCE if variable.startswith("pd_") else None
-    up = Axis(words, LOG if scale.decades else LINEAR, limits)
-    panels = panels_of(named, drawn, ruler, up)
-    told = alternative(words, ruler.span(np.unique(found.values(x))), panels[0])
+    line_coordinates = [by] if by else []
+    parts, n_omitted_parts = split_into_parts(points, [x, *line_coordinates], parts_max)
+    named_points, n_omitted_lines = split_into_lines(parts, line_coordinates)
+    drawn_lines, remarks = lines_along(
+        [(line_points, variable) for _, _, line_points in named_points], x
+    )
+    x_axis = CoordinateAxis.from_points(points, x)
+    value_scale = fit_colour_scale(variable, label, [line.y for line in drawn_lines])
+    limits = PROBABILITY_LIMITS if variable.startswith("pd_") else None
+    y_axis = ChartAxis(label, LOG if value_scale.is_log else LINEAR, limits)
+    panels = make_panels(named_points, drawn_lines, x_axis, y_axis)
+    alt_text = lines_alt_text(
+        label, x_axis.describe_span(np.unique(points.coordinate_values(x))), panels[0]
+    )
     panels = [
         replace(panel, lines=[*panel.lines, *_level_lines(panel, levels)]) for panel in panels
     ]
     return Chart(
-        words,
-        told,
-        [*remarks, not_shown(left_out + lacking)],
+        label,
+        alt_text,
+        [*remarks, omission_remark(n_omitted_parts + n_omitted_lines)],
         panels,
         {"part": "Shown for"},
     )
 
 
-def _level_lines(panel: Panel, levels: Sequence[float]) -> list[Line]:
+def _level_lines(panel: Panel, levels: Sequence[float]) -> list[ChartLine]:
     """Return level lines as long as the other lines of a panel."""
     x = panel.lines[0].x
-    return [Line(x, np.full(x.size, level), f"{level:g}", look="level") for level in levels]
+    return [ChartLine(x, np.full(x.size, level), f"{level:g}", style="level") for level in levels]
 
 
-Named = tuple[str, str, Points]
+NamedPoints = tuple[str, str, PointSelection]
 """The part that a line is of, its name, and its points."""
 
 
-def lines_of(parts: Sequence[tuple[str, Points]], by: Sequence[str]) -> tuple[list[Named], int]:
+def split_into_lines(
+    parts: Sequence[tuple[str, PointSelection]], line_coordinates: Sequence[str]
+) -> tuple[list[NamedPoints], int]:
     """Lines of every part, and how many are left out."""
-    named: list[Named] = []
-    fewer = 0
-    for part, points in parts:
-        own, lacking = split(points, by, MOST_LINES)
-        fewer += lacking
-        named += [(part, name, line) for name, line in own]
-    return named, fewer
+    named_points: list[NamedPoints] = []
+    n_omitted = 0
+    for part_label, part_points in parts:
+        part_lines, n_omitted_lines = split_by_coordinates(
+            part_points, line_coordinates, LINES_PER_PANEL_MAX
+        )
+        n_omitted += n_omitted_lines
+        named_points += [
+            (part_label, line_name, line_points) for line_name, line_points in part_lines
+        ]
+    return named_points, n_omitted
 
 
-def panels_of(
-    named: Sequence[Named], drawn: Sequence[Line], ruler: Ruler, up: Axis, **choices: str
+def make_panels(
+    named_points: Sequence[NamedPoints],
+    drawn_lines: Sequence[ChartLine],
+    x_axis: CoordinateAxis,
+    y_axis: ChartAxis,
+    **further_choices: str,
 ) -> list[Panel]:
     """Return a panel for each part; a name has the same colour in all of them."""
-    numbers = {name: k for k, name in enumerate(dict.fromkeys(name for _, name, _ in named))}
-    found: dict[str, list[Line]] = {}
-    for (part, name, _), line in zip(named, drawn, strict=True):
-        own = replace(line, x=ruler.shown(line.x), name=name, number=numbers[name])
-        found.setdefault(part, []).append(own)
-    return [Panel({"part": p} | choices, ruler.axis, up, lines) for p, lines in found.items()]
+    style_by_name = {
+        name: k for k, name in enumerate(dict.fromkeys(name for _, name, _ in named_points))
+    }
+    lines_by_part: dict[str, list[ChartLine]] = {}
+    for (part, name, _), line in zip(named_points, drawn_lines, strict=True):
+        styled_line = replace(
+            line, x=x_axis.to_axis_units(line.x), name=name, style_index=style_by_name[name]
+        )
+        lines_by_part.setdefault(part, []).append(styled_line)
+    return [
+        Panel({"part": p} | further_choices, x_axis.axis, y_axis, lines)
+        for p, lines in lines_by_part.items()
+    ]
 
 
-def alternative(words: str, span: str, panel: Panel) -> str:
+def lines_alt_text(label: str, span_text: str, panel: Panel) -> str:
     """Extent of the lines of a panel, in words."""
-    told = [f"{line.name or 'the line'}: {labels.extent(line.y)}" for line in panel.lines]
-    return f"Lines of {words} over {span}. {'; '.join(told)}."
+    line_texts = [
+        f"{line.name or 'the line'}: {labels.describe_extent(line.y)}" for line in panel.lines
+    ]
+    return f"Lines of {label} over {span_text}. {'; '.join(line_texts)}."
 
 
-def along(found: Sequence[tuple[Points, str]], x: str) -> tuple[list[Line], list[str]]:
+def lines_along(
+    points_and_variables: Sequence[tuple[PointSelection, str]], x: str
+) -> tuple[list[ChartLine], list[str]]:
     """Variables along a coordinate, all in one reading, and remarks on how they are drawn.
 
     A line of many points is cut into intervals: their means, in a band from the lowest to the
     highest of their points. Else the band is the interval of each point, where pd is drawn or
     the dataset has ``.._low`` and ``.._high``. Of other coordinates the first place is taken.
     """
-    lazy: list[list[Any]] = []
-    made: list[tuple[Side, int, float, bool]] = []
-    for points, variable in found:
-        side = points.side(x)
-        kinds, confidence = _kinds(points.dataset, variable)
-        most = STRETCHES * (1 if side.values.size > 2 * STRETCHES else 2)
-        drawn = len(kinds) > 1
-        shown = (MEAN, LOWEST, HIGHEST) if drawn or side.together(most) > 1 else (MEAN,)
-        own = replace(points, dataset=kinds)
-        lazy.append([own.cells(k if drawn else MEAN, [(side, most)], k).data for k in shown])
-        made.append((side, most, confidence, drawn))
-    result, remarks = [], []
-    for (side, most, confidence, drawn), arrays in zip(made, dask.compute(*lazy), strict=True):
+    lazy_arrays: list[list[Any]] = []
+    reductions: list[tuple[SortedCoordinate, int, float, bool]] = []
+    for points, variable in points_and_variables:
+        coordinate = points.sorted_coordinate(x)
+        dataset_with_ends, confidence = _mean_and_ends(points.dataset, variable)
+        cells_max = LINE_INTERVALS * (1 if coordinate.values.size > 2 * LINE_INTERVALS else 2)
+        has_ends = len(dataset_with_ends) > 1
+        cell_statistics = (
+            (MEAN, LOWEST, HIGHEST)
+            if has_ends or coordinate.points_per_cell(cells_max) > 1
+            else (MEAN,)
+        )
+        points_with_ends = replace(points, dataset=dataset_with_ends)
+        lazy_arrays.append(
+            [
+                points_with_ends.coarsen(k if has_ends else MEAN, [(coordinate, cells_max)], k).data
+                for k in cell_statistics
+            ]
+        )
+        reductions.append((coordinate, cells_max, confidence, has_ends))
+    chart_lines, remarks = [], []
+    for (coordinate, cells_max, confidence, has_ends), arrays in zip(
+        reductions, dask.compute(*lazy_arrays), strict=True
+    ):
         mean, *ends = (np.asarray(a, float) for a in arrays)
-        together = side.together(most)
+        points_per_value = coordinate.points_per_cell(cells_max)
         band: dict[str, Any] = dict(zip(("low", "high"), ends, strict=False))
-        result.append(Line(side.middles(most), mean, together=together, **band))
-        remarks.append(_remark(together, confidence, drawn))
-    return result, list(dict.fromkeys(remarks))
+        chart_lines.append(
+            ChartLine(
+                coordinate.cell_means(cells_max), mean, points_per_value=points_per_value, **band
+            )
+        )
+        remarks.append(_band_remark(points_per_value, confidence, has_ends))
+    return chart_lines, list(dict.fromkeys(remarks))
 
 
-def _kinds(dataset: xr.Dataset, variable: str) -> tuple[xr.Dataset, float]:
+def _mean_and_ends(dataset: xr.Dataset, variable: str) -> tuple[xr.Dataset, float]:
     """Mean, lowest and highest of a variable, as far as they differ; confidence of intervals."""
     segment = variable.removeprefix("pd_")
     if f"{variable}_low" in dataset:
-        ends = {MEAN: variable, LOWEST: f"{variable}_low", HIGHEST: f"{variable}_high"}
-        kinds = xr.Dataset({kind: dataset[name] for kind, name in ends.items()})
-    elif segment in SEGMENTS and half_width(dataset, segment) is not None:
-        kinds = detection_probability(dataset, segment)
-        kinds = kinds.rename({"pd": MEAN, "low": LOWEST, "high": HIGHEST})
+        variable_by_statistic = {
+            MEAN: variable,
+            LOWEST: f"{variable}_low",
+            HIGHEST: f"{variable}_high",
+        }
+        dataset_with_ends = xr.Dataset(
+            {kind: dataset[name] for kind, name in variable_by_statistic.items()}
+        )
+    elif segment in SEGMENTS_AND_SHOT and pd_half_width(dataset, segment) is not None:
+        dataset_with_ends = detection_probability(dataset, segment)
+        dataset_with_ends = dataset_with_ends.rename({"pd": MEAN, "low": LOWEST, "high": HIGHEST})
     else:
         return xr.Dataset({MEAN: dataset[variable]}), 0.0
-    return kinds, float(kinds[LOWEST].attrs.get("confidence", 0.0))
+    return dataset_with_ends, float(dataset_with_ends[LOWEST].attrs.get("confidence", 0.0))
 
 
-def _remark(together: int, confidence: float, drawn: bool) -> str:
+def _band_remark(points_per_value: int, confidence: float, has_ends: bool) -> str:
     """Remark on how a line is reduced; empty where each point is on it."""
-    interval = f"{100 * confidence:g} % confidence interval" if confidence else "interval"
-    if together > 1:
-        with_ends = f", their {interval}s included" if confidence else ""
+    interval_text = f"{100 * confidence:g} % confidence interval" if confidence else "interval"
+    if points_per_value > 1:
+        ends_note = f", their {interval_text}s included" if confidence else ""
         return (
-            f"line: mean of {together} neighbouring points; band: from the lowest of them "
-            f"to the highest{with_ends}, so that no narrow dip is hidden"
+            f"line: mean of {points_per_value} neighbouring points; band: from the lowest of them "
+            f"to the highest{ends_note}, so that no narrow dip is hidden"
         )
-    return f"band: {interval} of each point" if drawn else ""
+    return f"band: {interval_text} of each point" if has_ends else ""

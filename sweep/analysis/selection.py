@@ -20,217 +20,261 @@ import xarray as xr
 from sweep.analysis import labels
 
 if TYPE_CHECKING:
-    from sweep.spec import Axis, Member, SceneSpec, Spec
+    from sweep.spec import Axis, AxisParameter, GridSpec, SceneSpec
 
 
 MEAN, LOWEST, HIGHEST = "mean", "lowest", "highest"
 
-PIECE = 2**20
+VALUES_PER_SUM = 2**20
 """Values that are added up at a time."""
 
 
 @dataclass(frozen=True)
-class Side:
+class SortedCoordinate:
     """A dimension as a figure runs along it: places in rising order of a coordinate's values."""
 
     dim: str
-    positions: np.ndarray
+    indices: np.ndarray
     values: np.ndarray
 
-    def together(self, most: int) -> int:
+    def points_per_cell(self, cells_max: int) -> int:
         """Return the number of neighbours in a cell, so that there are `most` cells or fewer."""
-        return 1 if labels.is_words(self.values) else -(-self.values.size // most)
+        return 1 if labels.is_categorical(self.values) else -(-self.values.size // cells_max)
 
-    def middles(self, most: int) -> np.ndarray:
+    def cell_means(self, cells_max: int) -> np.ndarray:
         """Mean value of the coordinate in each cell."""
-        by = self.together(most)
-        if by == 1:
+        cell_size = self.points_per_cell(cells_max)
+        if cell_size == 1:
             return self.values
-        starts = np.arange(0, self.values.size, by)
+        starts = np.arange(0, self.values.size, cell_size)
         sums = np.add.reduceat(self.values, starts)
         return sums / np.diff(starts, append=self.values.size)
 
 
-def known(array: xr.DataArray) -> xr.DataArray:
+def to_float_with_nan(array: xr.DataArray) -> xr.DataArray:
     """Return an array as floats; nan where a count is not made yet."""
     return array if array.dtype.kind == "f" else array.astype(float).where(array >= 0)
 
 
 @dataclass(frozen=True)
-class Points:
+class PointSelection:
     """Points of a dataset: all combinations of some places along its dimensions.
 
     Places are rows of their dimension's table: their number, and the coordinates there.
     """
 
     dataset: xr.Dataset
-    places: Mapping[str, pandas.DataFrame]
+    dim_tables: Mapping[str, pandas.DataFrame]
 
     @classmethod
-    def of(cls, dataset: xr.Dataset) -> Points:
+    def from_dataset(cls, dataset: xr.Dataset) -> PointSelection:
         """All points of a dataset."""
-        largest = max(dataset.data_vars.values(), key=lambda array: array.ndim)
-        every: dict[str, dict[str, np.ndarray]] = {str(dim): {} for dim in largest.dims}
-        for name, coordinate in dataset.coords.items():
-            if coordinate.dims and coordinate.dims[0] in every:
-                every[str(coordinate.dims[0])][str(name)] = coordinate.values
-        places = {
-            dim: pandas.DataFrame(own, index=pandas.RangeIndex(dataset.sizes[dim]))
-            for dim, own in every.items()
+        largest_array = max(dataset.data_vars.values(), key=lambda array: array.ndim)
+        columns_by_dim: dict[str, dict[str, np.ndarray]] = {
+            str(dim): {} for dim in largest_array.dims
         }
-        return cls(dataset, places)
+        for name, coordinate in dataset.coords.items():
+            if coordinate.dims and coordinate.dims[0] in columns_by_dim:
+                columns_by_dim[str(coordinate.dims[0])][str(name)] = coordinate.values
+        tables = {
+            dim: pandas.DataFrame(columns, index=pandas.RangeIndex(dataset.sizes[dim]))
+            for dim, columns in columns_by_dim.items()
+        }
+        return cls(dataset, tables)
 
     @property
     def size(self) -> int:
         """Number of points."""
-        return math.prod(map(len, self.places.values()))
+        return math.prod(map(len, self.dim_tables.values()))
 
     def dim_of(self, name: str) -> str:
         """Return the dimension of a coordinate; a zipped axis, which is none, is its own."""
-        return next((dim for dim, own in self.places.items() if name in own), name)
+        return next((dim for dim, table in self.dim_tables.items() if name in table), name)
 
-    def values(self, name: str) -> np.ndarray:
+    def coordinate_values(self, name: str) -> np.ndarray:
         """Return a coordinate, or the number of the place, at each place along its dimension."""
-        own = self.places[self.dim_of(name)]
-        return np.asarray(own.get(name, own.index))
+        table = self.dim_tables[self.dim_of(name)]
+        return np.asarray(table.get(name, table.index))
 
-    def units(self, name: str) -> str:
+    def coordinate_units(self, name: str) -> str:
         """Units of a coordinate."""
         coordinate = self.dataset.coords.get(name)
         return "" if coordinate is None else str(coordinate.attrs.get("units", ""))
 
-    def at(self, dim: str, chosen: np.ndarray) -> Points:
+    def isel(self, dim: str, indices: np.ndarray) -> PointSelection:
         """Points at some of the places along a dimension, by their indices or a mask."""
-        return replace(self, places={**self.places, dim: self.places[dim].iloc[chosen]})
+        return replace(
+            self, dim_tables={**self.dim_tables, dim: self.dim_tables[dim].iloc[indices]}
+        )
 
-    def where(self, name: str, wanted: list[object]) -> Points:
+    def sel(self, name: str, values: list[object]) -> PointSelection:
         """Points at which a coordinate has one of the values."""
-        return self.at(self.dim_of(name), is_any(self.values(name), wanted))
+        return self.isel(self.dim_of(name), matches_any(self.coordinate_values(name), values))
 
-    def once(self) -> Points:
+    def drop_duplicates(self) -> PointSelection:
         """Points without repetition of all their coordinates."""
-        places = {dim: own.drop_duplicates() if len(own.columns) else own
-                  for dim, own in self.places.items()}  # fmt: skip
-        return replace(self, places=places)
+        tables = {dim: table.drop_duplicates() if len(table.columns) else table
+                  for dim, table in self.dim_tables.items()}  # fmt: skip
+        return replace(self, dim_tables=tables)
 
-    def distinct(self, name: str) -> list[object]:
+    def unique_values(self, name: str) -> list[object]:
         """Values of a coordinate, in the order in which they first appear."""
-        return list(pandas.unique(self.values(name)))
+        return list(pandas.unique(self.coordinate_values(name)))
 
-    def varying(self) -> list[str]:
+    def varying_coordinates(self) -> list[str]:
         """Coordinates with more than one value."""
-        return [n for own in self.places.values() for n in own if own[n].nunique(dropna=False) > 1]
+        return [
+            n
+            for table in self.dim_tables.values()
+            for n in table
+            if table[n].nunique(dropna=False) > 1
+        ]
 
-    def further(self, names: Sequence[str]) -> list[str]:
+    def distinguishing_coordinates(self, names: Sequence[str]) -> list[str]:
         """Coordinates that tell points apart which those named leave together, the fewest."""
-        return [name for dim in self.places for name in self.further_along(dim, names)]
+        return [name for dim in self.dim_tables for name in self.distinguishing_along(dim, names)]
 
-    def further_along(self, dim: str, names: Sequence[str]) -> list[str]:
-        """Those of :meth:`further` that lie along a dimension."""
-        own = self.places[dim]
-        told = [name for name in names if name in own]
-        needed: list[str] = []
-        number = len(own[told].drop_duplicates()) if told else 1
-        for name in [n for n in own if n not in told]:
-            apart = len(own[[*told, *needed, name]].drop_duplicates())
-            if apart > number:
-                number = apart
-                needed.append(name)
-        return needed
+    def distinguishing_along(self, dim: str, names: Sequence[str]) -> list[str]:
+        """Those of :meth:`distinguishing_coordinates` that lie along a dimension."""
+        table = self.dim_tables[dim]
+        given_names = [name for name in names if name in table]
+        distinguishing: list[str] = []
+        n_distinct = len(table[given_names].drop_duplicates()) if given_names else 1
+        for name in [n for n in table if n not in given_names]:
+            n_with_name = len(table[[*given_names, *distinguishing, name]].drop_duplicates())
+            if n_with_name > n_distinct:
+                n_distinct = n_with_name
+                distinguishing.append(name)
+        return distinguishing
 
-    def apart(self, name: str) -> list[tuple[object, Points]]:
+    def group_by(self, name: str) -> list[tuple[object, PointSelection]]:
         """Points of each value of a coordinate, in the order in which the values first appear."""
         dim = self.dim_of(name)
-        groups = self.places[dim].groupby(self.values(name), sort=False, dropna=False)
-        return [(value, replace(self, places={**self.places, dim: own})) for value, own in groups]
+        groups = self.dim_tables[dim].groupby(
+            self.coordinate_values(name), sort=False, dropna=False
+        )
+        return [
+            (value, replace(self, dim_tables={**self.dim_tables, dim: table}))
+            for value, table in groups
+        ]
 
-    def side(self, name: str) -> Side:
+    def sorted_coordinate(self, name: str) -> SortedCoordinate:
         """Places along a coordinate, once a value: numbers rising, words as they appear."""
-        values, first = np.unique(self.values(name), return_index=True)
-        if labels.is_words(values):
-            order = np.argsort(first)
-            values, first = values[order], first[order]
+        values, first_rows = np.unique(self.coordinate_values(name), return_index=True)
+        if labels.is_categorical(values):
+            order = np.argsort(first_rows)
+            values, first_rows = values[order], first_rows[order]
         dim = self.dim_of(name)
-        return Side(dim, np.asarray(self.places[dim].index)[first], values)
+        return SortedCoordinate(dim, np.asarray(self.dim_tables[dim].index)[first_rows], values)
 
-    def first(self, *sides: Side) -> dict[str, int]:
+    def first_indices(self, *coordinates: SortedCoordinate) -> dict[str, int]:
         """Return the first place along every dimension but those of some sides."""
-        shown = {side.dim for side in sides}
-        return {dim: int(own.index[0]) for dim, own in self.places.items() if dim not in shown}
+        shown_dims = {coordinate.dim for coordinate in coordinates}
+        return {
+            dim: int(table.index[0])
+            for dim, table in self.dim_tables.items()
+            if dim not in shown_dims
+        }
 
-    def cells(self, variable: str, sides: Sequence[tuple[Side, int]], kind: str) -> xr.DataArray:
+    def coarsen(
+        self, variable: str, coordinates: Sequence[tuple[SortedCoordinate, int]], statistic: str
+    ) -> xr.DataArray:
         """Return a variable in cells along some sides, at the first place along the others; lazy.
 
         Sides come with the largest number of their cells; kinds are ``mean``, ``lowest``,
         ``highest``.
         """
-        array = self.dataset[variable].isel(self.first(*(side for side, _ in sides)))
-        for side, _ in sides:
-            if not np.array_equal(side.positions, np.arange(array.sizes[side.dim])):
-                array = array.isel({side.dim: side.positions})
-        array = xr.DataArray(known(array).variable)
-        together = {side.dim: side.together(most) for side, most in sides}
-        if max(together.values()) > 1:
-            cells = array.coarsen(together, boundary="pad")
-            array = {MEAN: cells.mean, LOWEST: cells.min, HIGHEST: cells.max}[kind]()
-        return array.transpose(*together)
+        array = self.dataset[variable].isel(
+            self.first_indices(*(coordinate for coordinate, _ in coordinates))
+        )
+        for coordinate, _ in coordinates:
+            if not np.array_equal(coordinate.indices, np.arange(array.sizes[coordinate.dim])):
+                array = array.isel({coordinate.dim: coordinate.indices})
+        array = xr.DataArray(to_float_with_nan(array).variable)
+        points_per_cell = {
+            coordinate.dim: coordinate.points_per_cell(cells_max)
+            for coordinate, cells_max in coordinates
+        }
+        if max(points_per_cell.values()) > 1:
+            coarsened = array.coarsen(points_per_cell, boundary="pad")
+            array = {MEAN: coarsened.mean, LOWEST: coarsened.min, HIGHEST: coarsened.max}[
+                statistic
+            ]()
+        return array.transpose(*points_per_cell)
 
 
-def is_any(values: np.ndarray, wanted: list[object]) -> np.ndarray:
+def matches_any(values: np.ndarray, wanted_values: list[object]) -> np.ndarray:
     """Mask of the values that are among those wanted, to the last digits of a float."""
     if values.dtype.kind not in "fiu":
-        return np.isin([str(v) for v in values], [str(w) for w in wanted])
-    matches = [np.isclose(values, float(w), rtol=1e-9, atol=0.0) for w in wanted]  # type: ignore[arg-type]
+        return np.isin([str(v) for v in values], [str(w) for w in wanted_values])
+    matches = [np.isclose(values, float(w), rtol=1e-9, atol=0.0) for w in wanted_values]  # type: ignore[arg-type]
     return np.logical_or.reduce(matches)
 
 
-def confined(found: Points, spec: Spec, where: Mapping[str, object]) -> Points:
+def select_where(
+    points: PointSelection, spec: GridSpec, where: Mapping[str, object]
+) -> PointSelection:
     """Points at which coordinates have one of some values, as written in the study."""
-    for name, written in where.items():
-        several = list(written) if isinstance(written, tuple | list) else [written]
-        if name in found.dataset.coords:
-            several = [spec.coordinate_value(name, value) for value in several]
-        found = found.where(name, several)
-    return found
+    for name, raw_value in where.items():
+        wanted_values = list(raw_value) if isinstance(raw_value, tuple | list) else [raw_value]
+        if name in points.dataset.coords:
+            wanted_values = [spec.read_coordinate(name, value) for value in wanted_values]
+        points = points.sel(name, wanted_values)
+    return points
 
 
-def split(found: Points, names: Sequence[str], most: int) -> tuple[list[tuple[str, Points]], int]:
+def split_by_coordinates(
+    points: PointSelection, names: Sequence[str], parts_max: int
+) -> tuple[list[tuple[str, PointSelection]], int]:
     """Points apart by the values of coordinates, in words; and the number of parts left out."""
-    parts = [("", found)]
+    parts = [("", points)]
     for name in names:
-        units = found.units(name)
+        units = points.coordinate_units(name)
         parts = [
-            (", ".join(filter(None, [text, labels.valued(name, value, units)])), piece)
-            for text, part in parts
-            for value, piece in part.apart(name)
+            (
+                ", ".join(
+                    filter(None, [label, labels.format_coordinate_value(name, value, units)])
+                ),
+                subpart,
+            )
+            for label, part in parts
+            for value, subpart in part.group_by(name)
         ]
-    return spread(parts, most)
+    return thin_evenly(parts, parts_max)
 
 
-def spread(parts: list[tuple[str, Points]], most: int) -> tuple[list[tuple[str, Points]], int]:
+def thin_evenly(
+    parts: list[tuple[str, PointSelection]], parts_max: int
+) -> tuple[list[tuple[str, PointSelection]], int]:
     """At most so many parts, spread over all, and the number of those left out."""
-    if len(parts) <= most:
+    if len(parts) <= parts_max:
         return parts, 0
-    return [parts[round(i * (len(parts) - 1) / (most - 1))] for i in range(most)], len(parts) - most
+    return [parts[round(i * (len(parts) - 1) / (parts_max - 1))] for i in range(parts_max)], len(
+        parts
+    ) - parts_max
 
 
-def coordinate_of(spec: Spec, path: str) -> Member | None:
+def find_axis_parameter(spec: GridSpec, path: str) -> AxisParameter | None:
     """Return the parameter of a path where it is on an axis."""
-    return next((m for axis in spec.axes for m in axis.members if m.path == path), None)
+    return next((m for axis in spec.axes for m in axis.parameters if m.path == path), None)
 
 
-def parameters_at(spec: Spec | SceneSpec, position: Mapping[str, int]) -> dict[str, Any]:
+def parameters_at(spec: GridSpec | SceneSpec, axis_indices: Mapping[str, int]) -> dict[str, Any]:
     """SI values of all parameters at a position along the axes, by dotted path."""
     return dict(spec.parameters()) | {
-        member.path: np.asarray(member.values)[position[axis.name]].item()
+        axis_parameter.path: np.asarray(axis_parameter.values)[axis_indices[axis.name]].item()
         for axis in spec.axes
-        for member in axis.members
+        for axis_parameter in axis.parameters
     }
 
 
-RANGE, GRAZING_ANGLE = "target.range", "target.grazing_angle"
-PUBLISHED = ((GRAZING_ANGLE, "15 deg"), (GRAZING_ANGLE, "85 deg"), (RANGE, "3500 m"))
-NEAREST = "5 m"
+RANGE_PATH, GRAZING_ANGLE_PATH = "target.range", "target.grazing_angle"
+PUBLISHED_CUTS = (
+    (GRAZING_ANGLE_PATH, "15 deg"),
+    (GRAZING_ANGLE_PATH, "85 deg"),
+    (RANGE_PATH, "3500 m"),
+)
+MEAN_RANGE_MIN = "5 m"
 """Nearer ranges are left out of means: there the echo's own shot noise counts [T 4.2]."""
 
 
@@ -239,98 +283,148 @@ class Cut:
     """One coordinate at a value, the other along the cut; both empty for a whole study."""
 
     name: str
-    held: str
-    value: object
-    along: str
+    fixed_name: str
+    fixed_value: object
+    varying_name: str
 
-    def of(self, found: Points) -> Points:
+    def select_from(self, points: PointSelection) -> PointSelection:
         """Points of the cut, each once."""
-        return found.where(self.held, [self.value]).once() if self.held else found
-
-
-def cuts(spec: Spec) -> list[Cut]:
-    """Cuts of a study's zipped axis through range and angle; else the published three; else all."""
-    ranges, angles = coordinate_of(spec, RANGE), coordinate_of(spec, GRAZING_ANGLE)
-    whole = [Cut("all", "", None, ranges.name if ranges else angles.name if angles else "")]
-    if ranges is None or angles is None:
-        return whole
-    members = {RANGE: ranges, GRAZING_ANGLE: angles}
-    zipped = next((axis for axis in spec.axes if {ranges, angles} <= set(axis.members)), None)
-    if zipped is not None:
-        held = _pieces(zipped)
-    else:
-        published = [(members[p], spec.coordinate_value(p, text)) for p, text in PUBLISHED]
-        held = [(m, v) for m, v in published if np.isclose(m.display, float(v)).any()]
-    found = [
-        Cut(
-            labels.quantity(value, member.units).replace("°", " deg"),
-            member.name,
-            value,
-            angles.name if member is ranges else ranges.name,
+        return (
+            points.sel(self.fixed_name, [self.fixed_value]).drop_duplicates()
+            if self.fixed_name
+            else points
         )
-        for member, value in held
+
+
+def study_cuts(spec: GridSpec) -> list[Cut]:
+    """Cuts of a study's zipped axis through range and angle; else the published three; else all."""
+    range_parameter, angle_parameter = (
+        find_axis_parameter(spec, RANGE_PATH),
+        find_axis_parameter(spec, GRAZING_ANGLE_PATH),
+    )
+    uncut = [
+        Cut(
+            "all",
+            "",
+            None,
+            range_parameter.coordinate
+            if range_parameter
+            else angle_parameter.coordinate
+            if angle_parameter
+            else "",
+        )
     ]
-    return found or whole
+    if range_parameter is None or angle_parameter is None:
+        return uncut
+    parameter_by_path = {RANGE_PATH: range_parameter, GRAZING_ANGLE_PATH: angle_parameter}
+    zipped_axis = next(
+        (axis for axis in spec.axes if {range_parameter, angle_parameter} <= set(axis.parameters)),
+        None,
+    )
+    if zipped_axis is not None:
+        fixed_values = _constant_runs(zipped_axis)
+    else:
+        published_values = [
+            (parameter_by_path[p], spec.read_coordinate(p, text)) for p, text in PUBLISHED_CUTS
+        ]
+        fixed_values = [
+            (m, v) for m, v in published_values if np.isclose(m.display_values, float(v)).any()
+        ]
+    cut_list = [
+        Cut(
+            labels.format_quantity(value, axis_parameter.units).replace("°", " deg"),
+            axis_parameter.coordinate,
+            value,
+            angle_parameter.coordinate
+            if axis_parameter is range_parameter
+            else range_parameter.coordinate,
+        )
+        for axis_parameter, value in fixed_values
+    ]
+    return cut_list or uncut
 
 
-def _pieces(axis: Axis) -> list[tuple[Member, object]]:
+def _constant_runs(axis: Axis) -> list[tuple[AxisParameter, object]]:
     """Stretches of a zipped axis in which one parameter stays and another varies, in order."""
-    members = [m for m in axis.members if m.path in (RANGE, GRAZING_ANGLE)]
-    pieces: list[tuple[Member, object]] = []
-    start = 0
-    while start < axis.size:
-        alike = [member.display[start:] == member.display[start] for member in members]
-        lengths = [int(np.argmin([*own, False])) for own in alike]
-        longest = int(np.argmax(lengths))
-        piece = (members[longest], members[longest].display[start].item())
-        if piece not in pieces:
-            pieces.append(piece)
-        start += lengths[longest]
-    return pieces
+    axis_parameters = [m for m in axis.parameters if m.path in (RANGE_PATH, GRAZING_ANGLE_PATH)]
+    runs: list[tuple[AxisParameter, object]] = []
+    run_start = 0
+    while run_start < axis.size:
+        is_same = [
+            axis_parameter.display_values[run_start:] == axis_parameter.display_values[run_start]
+            for axis_parameter in axis_parameters
+        ]
+        run_lengths = [int(np.argmin([*same_mask, False])) for same_mask in is_same]
+        longest_parameter = int(np.argmax(run_lengths))
+        run = (
+            axis_parameters[longest_parameter],
+            axis_parameters[longest_parameter].display_values[run_start].item(),
+        )
+        if run not in runs:
+            runs.append(run)
+        run_start += run_lengths[longest_parameter]
+    return runs
 
 
-def beyond(found: Points, spec: Spec, distance: str, *, included: bool = False) -> Points:
+def select_beyond(
+    points: PointSelection, spec: GridSpec, distance: str, *, inclusive: bool = False
+) -> PointSelection:
     """Points farther than a distance (or at it), where range is on an axis."""
-    member = coordinate_of(spec, RANGE)
-    if member is None:
-        return found
-    least = float(spec.coordinate_value(RANGE, distance))
-    ranges = found.values(member.name)
-    return found.at(found.dim_of(member.name), ranges >= least if included else ranges > least)
+    range_parameter = find_axis_parameter(spec, RANGE_PATH)
+    if range_parameter is None:
+        return points
+    range_min = float(spec.read_coordinate(RANGE_PATH, distance))
+    ranges = points.coordinate_values(range_parameter.coordinate)
+    return points.isel(
+        points.dim_of(range_parameter.coordinate),
+        ranges >= range_min if inclusive else ranges > range_min,
+    )
 
 
 @dataclass(frozen=True)
 class Statistics:
     """Number of the finite values of some points; their mean, median and extremes, nan of none."""
 
-    number: int
+    n_finite: int
     mean: float
     median: float
-    least: float
-    largest: float
+    minimum: float
+    maximum: float
 
     @classmethod
-    def of(cls, values: np.ndarray) -> Statistics:
+    def from_values(cls, values: np.ndarray) -> Statistics:
         """Return those of values without infinity, which are sorted in place."""
-        total = sum(np.nansum(part) for part in np.array_split(values, values.size // PIECE + 1))
+        total = sum(
+            np.nansum(part) for part in np.array_split(values, values.size // VALUES_PER_SUM + 1)
+        )
         values.sort()  # nan comes last
-        number = int(np.searchsorted(values, np.nan))
-        if not number:
+        n_finite = int(np.searchsorted(values, np.nan))
+        if not n_finite:
             return cls(0, *[math.nan] * 4)
-        middle = values[(number - 1) // 2 : number // 2 + 1].mean()
-        return cls(number, float(total / number), float(middle), *values[[0, number - 1]].tolist())
+        median = values[(n_finite - 1) // 2 : n_finite // 2 + 1].mean()
+        return cls(
+            n_finite, float(total / n_finite), float(median), *values[[0, n_finite - 1]].tolist()
+        )
 
 
-def statistics(groups: Sequence[Points], variable: str) -> list[Statistics]:
+def compute_statistics(groups: Sequence[PointSelection], variable: str) -> list[Statistics]:
     """Statistics of a variable over the points of each group, read once for all of them."""
-    places = [{dim: np.asarray(own.index) for dim, own in g.places.items()} for g in groups]
-    arrays = [known(g.dataset[variable].isel(at)) for g, at in zip(groups, places, strict=True)]
+    indices_by_group = [
+        {dim: np.asarray(table.index) for dim, table in g.dim_tables.items()} for g in groups
+    ]
+    arrays = [
+        to_float_with_nan(g.dataset[variable].isel(group_indices))
+        for g, group_indices in zip(groups, indices_by_group, strict=True)
+    ]
     with TemporaryFile() as file:  # which holds the values, as memory may not
         sizes = [array.size for array in arrays]
-        room = np.memmap(file, float, "w+", shape=(sum(sizes) + 1,)).view(np.ndarray)
-        parts = np.split(room, np.cumsum(sizes))[:-1]
+        buffer = np.memmap(file, float, "w+", shape=(sum(sizes) + 1,)).view(np.ndarray)
+        group_buffers = np.split(buffer, np.cumsum(sizes))[:-1]
         dask.array.store(
             [array.where(np.isfinite(array)).chunk().data for array in arrays],
-            [part.reshape(array.shape) for part, array in zip(parts, arrays, strict=True)],
+            [
+                group_buffer.reshape(array.shape)
+                for group_buffer, array in zip(group_buffers, arrays, strict=True)
+            ],
         )
-        return [Statistics.of(part) for part in parts]
+        return [Statistics.from_values(group_buffer) for group_buffer in group_buffers]

@@ -13,16 +13,16 @@ import pandas
 import xarray as xr
 
 from sweep.analysis import labels
-from sweep.analysis.answers.probability import of_a_shot
+from sweep.analysis.answers.probability import false_alarms_per_shot
 from sweep.analysis.selection import (
-    NEAREST,
-    Points,
-    beyond,
-    confined,
-    cuts,
+    MEAN_RANGE_MIN,
+    PointSelection,
+    compute_statistics,
     parameters_at,
-    split,
-    statistics,
+    select_beyond,
+    select_where,
+    split_by_coordinates,
+    study_cuts,
 )
 from sweep.model import noise_only
 from sweep.model.looks import Looks
@@ -31,14 +31,14 @@ from sweep.model.threshold import tnr_of
 from sweep.units import percent
 
 if TYPE_CHECKING:
-    from sweep.spec import Spec
-    from sweep.spec import Table as Asked
+    from sweep.spec import GridSpec
+    from sweep.spec import TableFigure as TableSpec
 
 Cell = str | float | int
 
 
 @dataclass(frozen=True)
-class Block:
+class PageTable:
     """One table of a page: a heading, the names of its columns, its rows."""
 
     heading: str
@@ -47,54 +47,54 @@ class Block:
 
 
 @dataclass(frozen=True)
-class Page:
+class TablePage:
     """Tables under one title, with notes; and the same figures as records for a CSV file."""
 
     title: str
-    blocks: Sequence[Block]
+    page_tables: Sequence[PageTable]
     notes: Sequence[str]
     records: Sequence[dict[str, Cell]]
 
-    def text(self) -> str:
+    def to_text(self) -> str:
         """Return the page as plain text."""
         parts = [f"{self.title}\n{'=' * len(self.title)}"]
-        parts += [f"{b.heading}\n\n{aligned(b.columns, b.rows)}" for b in self.blocks]
+        parts += [f"{b.heading}\n\n{align_columns(b.columns, b.rows)}" for b in self.page_tables]
         parts += ["\n".join(self.notes)] if self.notes else []
         return "\n\n".join(parts) + "\n"
 
-    def save(self, directory: Path, stem: str) -> list[Path]:
+    def save_files(self, directory: Path, stem: str) -> list[Path]:
         """Write the page as `stem`.txt and `stem`.csv."""
         directory.mkdir(parents=True, exist_ok=True)
-        text, table = directory / f"{stem}.txt", directory / f"{stem}.csv"
-        text.write_text(self.text(), encoding="utf-8")
+        text_path, csv_path = directory / f"{stem}.txt", directory / f"{stem}.csv"
+        text_path.write_text(self.to_text(), encoding="utf-8")
         frame = pandas.DataFrame(self.records)
-        frame.to_csv(table, index=False, na_rep="nan", lineterminator="\r\n")
-        return [text, table]
+        frame.to_csv(csv_path, index=False, na_rep="nan", lineterminator="\r\n")
+        return [text_path, csv_path]
 
 
-def written(cell: Cell) -> str:
+def format_cell(cell: Cell) -> str:
     """Return a cell's text; nothing for nan."""
     if isinstance(cell, float):
         return "-" if math.isnan(cell) else f"{cell:.5g}"
     return str(cell)
 
 
-def aligned(columns: Sequence[str], rows: Sequence[Sequence[Cell]]) -> str:
+def align_columns(columns: Sequence[str], rows: Sequence[Sequence[Cell]]) -> str:
     """Columns side by side: text to the left, numbers to the right."""
-    cells = [list(columns), *([written(cell) for cell in row] for row in rows)]
+    cells = [list(columns), *([format_cell(cell) for cell in row] for row in rows)]
     widths = [max(len(row[i]) for row in cells) for i in range(len(columns))]
-    to_left = [not any(_numeric(row[i]) for row in rows) for i in range(len(columns))]
+    is_left_aligned = [not any(_is_numeric(row[i]) for row in rows) for i in range(len(columns))]
     lines = [
         "  ".join(
-            text.ljust(width) if left else text.rjust(width)
-            for text, width, left in zip(row, widths, to_left, strict=True)
+            cell_text.ljust(width) if is_left else cell_text.rjust(width)
+            for cell_text, width, is_left in zip(row, widths, is_left_aligned, strict=True)
         ).rstrip()
         for row in cells
     ]
     return "\n".join([lines[0], "-" * sum((*widths, 2 * len(widths) - 2)), *lines[1:]])
 
 
-def _numeric(cell: Cell) -> bool:
+def _is_numeric(cell: Cell) -> bool:
     """Tell whether a cell holds a number, as such or as text."""
     try:
         float(str(cell).removesuffix(" %").replace(",", ""))
@@ -103,61 +103,94 @@ def _numeric(cell: Cell) -> bool:
     return True
 
 
-def mean_page(found: Points, spec: Spec, asked: Asked, units: str, title: str) -> Page:
+def mean_table_page(
+    points: PointSelection, spec: GridSpec, table_spec: TableSpec, units: str, title: str
+) -> TablePage:
     """Return a variable's mean and median over all but rows and columns."""
-    found = confined(found, spec, asked.where)
-    if asked.minimum_range:
-        found = beyond(found, spec, f"{asked.minimum_range!r} m", included=True)
-    columns = found.distinct(asked.columns) if asked.columns else [None]
-    named = [
-        (row, column, of_row.where(asked.columns, [column]) if asked.columns else of_row)
-        for row, of_row in found.apart(asked.rows)
-        for column in columns
+    points = select_where(points, spec, table_spec.where)
+    if table_spec.minimum_range:
+        points = select_beyond(points, spec, f"{table_spec.minimum_range!r} m", inclusive=True)
+    column_values = points.unique_values(table_spec.columns) if table_spec.columns else [None]
+    cells = [
+        (
+            row,
+            column,
+            row_points.sel(table_spec.columns, [column]) if table_spec.columns else row_points,
+        )
+        for row, row_points in points.group_by(table_spec.rows)
+        for column in column_values
     ]
-    figures = statistics([part for *_, part in named], asked.variable)
+    cell_statistics = compute_statistics(
+        [cell_points for *_, cell_points in cells], table_spec.variable
+    )
     records: list[dict[str, Cell]] = []
-    for k, ((row, column, _), own) in enumerate(zip(named, figures, strict=True)):
-        printed = _published(asked.printed, *divmod(k, len(columns)))
+    for k, ((row, column, _), statistic) in enumerate(zip(cells, cell_statistics, strict=True)):
+        printed_value = _printed_value(table_spec.printed, *divmod(k, len(column_values)))
         records.append(
             {
-                "row": labels.quantity(row, found.units(asked.rows)),
-                "column": labels.valued(asked.columns, column, found.units(asked.columns))
-                if asked.columns else "all",
-                "points": own.number, "mean": own.mean, "median": own.median,
-                "lowest": own.least, "highest": own.largest, "printed": printed,
-                "printed_over_mean": printed / own.mean if own.mean else math.nan,
+                "row": labels.format_quantity(row, points.coordinate_units(table_spec.rows)),
+                "column": labels.format_coordinate_value(
+                    table_spec.columns, column, points.coordinate_units(table_spec.columns)
+                )
+                if table_spec.columns
+                else "all",
+                "points": statistic.n_finite,
+                "mean": statistic.mean,
+                "median": statistic.median,
+                "lowest": statistic.minimum,
+                "highest": statistic.maximum,
+                "printed": printed_value,
+                "printed_over_mean": printed_value / statistic.mean if statistic.mean else math.nan,
             }
-        )  # fmt: skip
-    names = list(dict.fromkeys(str(r["column"]) for r in records))
-    of = f"of {labels.with_brackets(asked.variable, units)}"
-    blocks = [
-        _matrix(f"{heading} {of}", labels.coordinate(asked.rows), key, records, names)
-        for key, heading in (("mean", "Mean"), ("median", "Median"), ("printed", "Printed value"),
-                             ("printed_over_mean", "Printed over mean"))
+        )
+    column_names = list(dict.fromkeys(str(r["column"]) for r in records))
+    variable_phrase = f"of {labels.column_label(table_spec.variable, units)}"
+    page_tables = [
+        _cross_table(
+            f"{heading} {variable_phrase}",
+            labels.coordinate_label(table_spec.rows),
+            key,
+            records,
+            column_names,
+        )
+        for key, heading in (
+            ("mean", "Mean"),
+            ("median", "Median"),
+            ("printed", "Printed value"),
+            ("printed_over_mean", "Printed over mean"),
+        )
         if any(r[key] == r[key] for r in records)
-    ]  # fmt: skip
-    return Page(title, blocks, [], records)
+    ]
+    return TablePage(title, page_tables, [], records)
 
 
-def _published(printed: Any, row: int, column: int) -> float:
+def _printed_value(printed_rows: Any, row: int, column: int) -> float:
     """Return the printed figure of a row and column; of one row of numbers, that of the row."""
-    if row >= len(printed):
+    if row >= len(printed_rows):
         return math.nan
-    values = printed[row] if isinstance(printed[row], tuple | list) else (printed[row],)
-    return float(values[column]) if column < len(values) else math.nan
+    row_values = (
+        printed_rows[row] if isinstance(printed_rows[row], tuple | list) else (printed_rows[row],)
+    )
+    return float(row_values[column]) if column < len(row_values) else math.nan
 
 
-def _matrix(
-    heading: str, corner: str, key: str, records: list[dict[str, Cell]], names: list[str]
-) -> Block:
+def _cross_table(
+    heading: str,
+    corner: str,
+    record_key: str,
+    records: list[dict[str, Cell]],
+    column_names: list[str],
+) -> PageTable:
     """One figure of every record, rows down and columns across."""
     rows: dict[str, list[Cell]] = {}
     for record in records:
-        rows.setdefault(str(record["row"]), []).append(record[key])
-    return Block(heading, (corner, *names), [(name, *cells) for name, cells in rows.items()])
+        rows.setdefault(str(record["row"]), []).append(record[record_key])
+    return PageTable(
+        heading, (corner, *column_names), [(name, *cells) for name, cells in rows.items()]
+    )
 
 
-def outputs_page(dataset: xr.Dataset) -> Page:
+def outputs_page(dataset: xr.Dataset) -> TablePage:
     """Every variable of a study of a single point."""
     records: list[dict[str, Cell]] = [
         {
@@ -169,106 +202,127 @@ def outputs_page(dataset: xr.Dataset) -> Page:
         for name, array in sorted(dataset.data_vars.items())
     ]
     columns = ("variable", "value", "units", "meaning")
-    block = Block("Outputs of the point", columns, [tuple(r.values()) for r in records])
-    return Page(str(dataset.attrs.get("title", "")), [block], [], records)
+    outputs_table = PageTable("Outputs of the point", columns, [tuple(r.values()) for r in records])
+    return TablePage(str(dataset.attrs.get("title", "")), [outputs_table], [], records)
 
 
-MOST_ROWS = 100
+TABLE_ROWS_MAX = 100
 
 
-def leakage(groups: Sequence[Points]) -> list[dict[str, Cell]]:
+def leakage_records(groups: Sequence[PointSelection]) -> list[dict[str, Cell]]:
     """Mean and median of the leakage of points, and of noise or leakage in both chirps."""
     dataset = groups[0].dataset
-    with_shot = dataset.assign(shot_with_leakage=of_a_shot(dataset, leakage=True))
-    groups = [replace(group, dataset=with_shot) for group in groups]
-    found: list[dict[str, Cell]] = [{} for _ in groups]
+    dataset_with_shot = dataset.assign(
+        shot_with_leakage=false_alarms_per_shot(dataset, leakage=True)
+    )
+    groups = [replace(group, dataset=dataset_with_shot) for group in groups]
+    records: list[dict[str, Cell]] = [{} for _ in groups]
     for name in ("p_leakage_up", "p_leakage_down", "shot_with_leakage"):
-        for record, own in zip(found, statistics(groups, name), strict=True):
-            record |= {f"{name}_mean": own.mean, f"{name}_median": own.median}
-    return found
+        for record, group_statistics in zip(records, compute_statistics(groups, name), strict=True):
+            record |= {
+                f"{name}_mean": group_statistics.mean,
+                f"{name}_median": group_statistics.median,
+            }
+    return records
 
 
-def reference(spec: Spec, setting: dict[str, Any]) -> tuple[dict[str, Cell], float]:
+def noise_only_reference(
+    spec: GridSpec, setting_parameters: dict[str, Any]
+) -> tuple[dict[str, Cell], float]:
     """Noise alone, in closed form and by the model with a target that reflects nothing.
 
     Of a shot at a setting of the instrument, a part of a record; and of a bin, by the model.
     """
-    first = parameters_at(spec, dict.fromkeys((axis.name for axis in spec.axes), 0))
-    parameters = first | setting | {"target.reflectance": 0.0}
+    first_parameters = parameters_at(spec, dict.fromkeys((axis.name for axis in spec.axes), 0))
+    parameters = first_parameters | setting_parameters | {"target.reflectance": 0.0}
     tnr = float(tnr_of(parameters))
-    in_a_bin = noise_only.bin_probability(tnr, Looks.of(parameters))
-    both = [noise_only.bins_counted(parameters, in_a_bin, s) for s in ("up", "down")]
-    closed_form = noise_only.segment_probability(np.asarray(in_a_bin), both).prod()
-    found = evaluate(parameters)
+    pfa_bin = noise_only.bin_probability(tnr, Looks.of(parameters))
+    n_bins = [noise_only.bins_counted(parameters, pfa_bin, s) for s in ("up", "down")]
+    closed_form = noise_only.segment_probability(np.asarray(pfa_bin), n_bins).prod()
+    outputs = evaluate(parameters)
     return {
         "tnr": tnr,
-        "bins": float(both[0]),
+        "bins": float(n_bins[0]),
         "closed_form": float(closed_form),
-        "noise_only": float(found["pfa_both_chirps"].item()),
-    }, float(found["pfa_bin"].item())
+        "noise_only": float(outputs["pfa_both_chirps"].item()),
+    }, float(outputs["pfa_bin"].item())
 
 
-def settings(found: Points, spec: Spec, by: str) -> list[tuple[str, dict[str, Any], Points]]:
+def split_by_setting(
+    points: PointSelection, spec: GridSpec, by: str
+) -> list[tuple[str, dict[str, Any], PointSelection]]:
     """Points apart by `by` and what else varies but range and angle: name, SI values, points."""
-    cut_names = {name for cut in cuts(spec) for name in (cut.along, cut.held)}
-    names = [by, *(n for n in found.varying() if n != by and n not in cut_names)]
-    paths = [spec.member(name).path for name in names]
-    parts, _ = split(found, names, MOST_ROWS)
-    values = [parameters_at(spec, part.first()) for _, part in parts]
+    cut_names = {name for cut in study_cuts(spec) for name in (cut.varying_name, cut.fixed_name)}
+    names = [by, *(n for n in points.varying_coordinates() if n != by and n not in cut_names)]
+    paths = [spec.axis_parameter(name).path for name in names]
+    parts, _ = split_by_coordinates(points, names, TABLE_ROWS_MAX)
+    parameters_of_parts = [parameters_at(spec, part.first_indices()) for _, part in parts]
     return [
-        (name, {path: own[path] for path in paths}, part)
-        for (name, part), own in zip(parts, values, strict=True)
+        (name, {path: parameters[path] for path in paths}, part)
+        for (name, part), parameters in zip(parts, parameters_of_parts, strict=True)
     ]
 
 
-def false_alarms(
-    found: Points, spec: Spec, *, by: str, printed: Sequence[Sequence[float]] = ()
+def false_alarm_records(
+    grid_points: PointSelection, spec: GridSpec, *, by: str, printed: Sequence[Sequence[float]] = ()
 ) -> list[dict[str, Cell]]:
     """Make a record of false alarms of each setting of the instrument in each cut."""
-    settled = settings(found, spec, by)
-    alone = [reference(spec, setting)[0] for _, setting, _ in settled]
-    groups = [
-        (i, j, cut.name, beyond(cut.of(part), spec, NEAREST))
-        for i, (_, _, part) in enumerate(settled)
-        for j, cut in enumerate(cuts(spec))
+    setting_parts = split_by_setting(grid_points, spec, by)
+    noise_references = [noise_only_reference(spec, setting)[0] for _, setting, _ in setting_parts]
+    cut_groups = [
+        (i, j, cut.name, select_beyond(cut.select_from(setting_points), spec, MEAN_RANGE_MIN))
+        for i, (_, _, setting_points) in enumerate(setting_parts)
+        for j, cut in enumerate(study_cuts(spec))
     ]
-    alarms = statistics([points for *_, points in groups], "pfa_both_chirps")
-    leaked = leakage([points for *_, points in groups])
+    pfa_statistics = compute_statistics(
+        [cut_points for *_, cut_points in cut_groups], "pfa_both_chirps"
+    )
+    leakage_rows = leakage_records([cut_points for *_, cut_points in cut_groups])
     records: list[dict[str, Cell]] = []
-    for (i, j, cut, points), both, leak in zip(groups, alarms, leaked, strict=True):
-        noise, figure = alone[i], _published(printed, i, j)
-        mean_excess, excess = (
-            noise_only.variance_excess_of_shot(p, float(noise["tnr"]), float(noise["bins"]))
-            for p in (both.mean, figure)
+    for (i, j, cut, cut_points), pfa_statistic, leakage_row in zip(
+        cut_groups, pfa_statistics, leakage_rows, strict=True
+    ):
+        noise_reference, printed_value = noise_references[i], _printed_value(printed, i, j)
+        mean_excess, printed_excess = (
+            noise_only.variance_excess_of_shot(
+                p, float(noise_reference["tnr"]), float(noise_reference["bins"])
+            )
+            for p in (pfa_statistic.mean, printed_value)
         )
         records.append(
             {
-                "setting": settled[i][0], "cut": cut, "points": points.size, **noise,
-                "study_mean": both.mean, "study_variance_excess": mean_excess,
-                "printed": figure, "printed_over_closed_form": figure / float(noise["closed_form"]),
-                "printed_variance_excess": excess, **leak,
+                "setting": setting_parts[i][0],
+                "cut": cut,
+                "points": cut_points.size,
+                **noise_reference,
+                "study_mean": pfa_statistic.mean,
+                "study_variance_excess": mean_excess,
+                "printed": printed_value,
+                "printed_over_closed_form": printed_value / float(noise_reference["closed_form"]),
+                "printed_variance_excess": printed_excess,
+                **leakage_row,
             }
-        )  # fmt: skip
+        )
     return records
 
 
-_FALSE_ALARMS = {
+_FALSE_ALARM_COLUMNS = {
     "setting": ("setting", ""), "cut": ("cut", ""), "points": ("points", ""),
     "closed form": ("closed_form", ".6e"), "noise only": ("noise_only", ".6e"),
     "study's mean": ("study_mean", ".6e"), "excess of mean": ("study_variance_excess", ".1e%"),
 }  # fmt: skip
-_PRINTED = {
+_PRINTED_COLUMNS = {
     "printed": ("printed", ".3e"), "printed/closed": ("printed_over_closed_form", ".3f"),
     "excess of printed": ("printed_variance_excess", ".4f%"),
 }  # fmt: skip
-_LEAKAGE = {
+_LEAKAGE_COLUMNS = {
     "setting": ("setting", ""), "cut": ("cut", ""),
     "up: mean": ("p_leakage_up_mean", ".3e"), "up: median": ("p_leakage_up_median", ".3e"),
     "down: mean": ("p_leakage_down_mean", ".3e"), "down: median": ("p_leakage_down_median", ".3e"),
     "shot: mean": ("shot_with_leakage_mean", ".3e"),
     "shot: median": ("shot_with_leakage_median", ".3e"),
 }  # fmt: skip
-_THRESHOLDS = {
+_THRESHOLD_COLUMNS = {
     "setting": ("setting", ""), "closed form": ("closed_form", ".6e"),
     "noise only": ("noise_only", ".6e"), "study's mean": ("study_mean", ".6e"),
     "printed": ("printed", ".3g"), "printed/closed": ("printed_over_closed_form", ".3f"),
@@ -277,75 +331,87 @@ _THRESHOLDS = {
 """Columns of tables: the figure of a record in each, and its format."""
 
 
-def false_alarm_page(found: Points, spec: Spec, *, by: str, printed: Any = (), title: str) -> Page:
+def false_alarm_page(
+    points: PointSelection, spec: GridSpec, *, by: str, printed: Any = (), title: str
+) -> TablePage:
     """Tables 4.3 to 4.5: false alarms of a shot, a row for each value of a coordinate."""
-    records = false_alarms(found, spec, by=by, printed=printed)
-    published = any(record["printed"] == record["printed"] for record in records)
-    blocks = [
-        _block(
+    records = false_alarm_records(points, spec, by=by, printed=printed)
+    has_printed = any(record["printed"] == record["printed"] for record in records)
+    page_tables = [
+        _record_table(
             "Probability of a false alarm in both chirp segments, from noise",
-            _FALSE_ALARMS | (_PRINTED if published else {}), records,
+            _FALSE_ALARM_COLUMNS | (_PRINTED_COLUMNS if has_printed else {}), records,
         ),
-        _block(
-            "Leakage: extra groups raised by the signal's own sidelobes", _LEAKAGE, records
+        _record_table(
+            "Leakage: extra groups raised by the signal's own sidelobes", _LEAKAGE_COLUMNS, records
         ),
     ]  # fmt: skip
-    bins = ", ".join(labels.number(n) for n in sorted({float(r["bins"]) for r in records}))
+    bins_text = ", ".join(
+        labels.format_number(n) for n in sorted({float(r["bins"]) for r in records})
+    )
     notes = [
-        f"closed form: (1 - (1 - p)^N)^2, p = exp(-(4 - pi)/4 TNR^2), N = {bins}.",
+        f"closed form: (1 - (1 - p)^N)^2, p = exp(-(4 - pi)/4 TNR^2), N = {bins_text}.",
         *_COMMON_NOTES,
         "With bins_counted 'half' the model leaves out the bins of the detection, the closed form",
         "  none. Shot (leakage): noise or leakage raises an extra group in both chirp segments.",
     ]
-    return Page(title, blocks, notes, records)
+    return TablePage(title, page_tables, notes, records)
 
 
-def threshold_page(found: Points, spec: Spec, *, by: str, printed: Any = (), title: str) -> Page:
+def threshold_page(
+    points: PointSelection, spec: GridSpec, *, by: str, printed: Any = (), title: str
+) -> TablePage:
     """Table 4.2: false alarms of a bin, a row for each threshold."""
     records: list[dict[str, Cell]] = []
-    settled = settings(found, spec, by)
-    means = statistics([beyond(part, spec, NEAREST) for _, _, part in settled], "pfa_bin")
-    for i, (name, setting, _) in enumerate(settled):
-        noise, of_bin = reference(spec, setting)
-        tnr = float(noise["tnr"])
-        closed = noise_only.bin_probability(tnr)
-        published = _published(printed, i, 0)
+    setting_parts = split_by_setting(points, spec, by)
+    pfa_statistics = compute_statistics(
+        [select_beyond(part, spec, MEAN_RANGE_MIN) for _, _, part in setting_parts], "pfa_bin"
+    )
+    for i, (name, setting, _) in enumerate(setting_parts):
+        noise_reference, pfa_bin = noise_only_reference(spec, setting)
+        tnr = float(noise_reference["tnr"])
+        closed_form = noise_only.bin_probability(tnr)
+        printed_value = _printed_value(printed, i, 0)
         records.append(
             {
                 "setting": name,
                 "tnr": tnr,
-                "closed_form": closed,
-                "noise_only": of_bin,
-                "study_mean": means[i].mean,
-                "printed": published,
-                "printed_over_closed_form": published / closed,
-                "printed_variance_excess": noise_only.variance_excess_of_bin(published, tnr),
+                "closed_form": closed_form,
+                "noise_only": pfa_bin,
+                "study_mean": pfa_statistics[i].mean,
+                "printed": printed_value,
+                "printed_over_closed_form": printed_value / closed_form,
+                "printed_variance_excess": noise_only.variance_excess_of_bin(printed_value, tnr),
             }
         )
     heading = "Probability that a bin of noise crosses the threshold"
     notes = ["closed form: exp(-(4 - pi)/4 TNR^2)", *_COMMON_NOTES]
-    return Page(title, [_block(heading, _THRESHOLDS, records)], notes, records)
+    return TablePage(title, [_record_table(heading, _THRESHOLD_COLUMNS, records)], notes, records)
 
 
 _COMMON_NOTES = (
     "noise only: the model with a reflectance of 0.",
-    f"study's mean: over points beyond {NEAREST} of range, the echo's own shot noise included.",
+    f"study's mean: over points beyond {MEAN_RANGE_MIN} of range, the echo's own shot noise "
+    "included.",
     "excess: noise variance above the one that sets the threshold, as a figure implies.",
     "  Nothing is tuned to the printed figures.",
 )
 
 
-def _block(
+def _record_table(
     heading: str, columns: Mapping[str, tuple[str, str]], records: Sequence[dict[str, Cell]]
-) -> Block:
+) -> PageTable:
     """Return a table of some figures of each record."""
-    rows = [[_written(record[key], form) for key, form in columns.values()] for record in records]
-    return Block(heading, tuple(columns), rows)
+    rows = [
+        [_format_value(record[key], number_format) for key, number_format in columns.values()]
+        for record in records
+    ]
+    return PageTable(heading, tuple(columns), rows)
 
 
-def _written(value: Cell, form: str) -> Cell:
-    if not form:
+def _format_value(value: Cell, number_format: str) -> Cell:
+    if not number_format:
         return value
-    if form.endswith("%"):
-        return percent(float(value), form[:-1]) if value == value else "-"
-    return format(value, form) if value == value else "-"
+    if number_format.endswith("%"):
+        return percent(float(value), number_format[:-1]) if value == value else "-"
+    return format(value, number_format) if value == value else "-"

@@ -13,47 +13,47 @@ from typing import Any
 import click
 
 from sweep.cli.terminal import (
-    ALLOW_CODE,
-    FORMAT,
-    INCOMPLETE,
-    MISTAKE,
-    OVERWRITE,
-    SPEC,
-    STORE,
-    WORKERS,
-    LocalPath,
-    StorePath,
-    alarms_told,
-    ask_before,
-    assignments,
-    at,
-    computing,
-    conclude,
-    conclude_accuracy,
-    effects_of,
-    folded,
-    folder,
-    plan_lines,
-    shown,
-    tell,
-    tell_effects,
-    tell_inconsistencies,
-    warn_of,
-    warn_of_echoes,
+    ALLOW_CODE_OPTION,
+    EXIT_INCOMPLETE,
+    EXIT_MISTAKE,
+    FORMAT_OPTION,
+    OVERWRITE_OPTION,
+    SPEC_ARGUMENT,
+    STORE_ARGUMENT,
+    WORKERS_OPTION,
+    LocalPathType,
+    StoreLocationType,
+    at_option,
+    confirm_large_study,
+    echo_wrapped,
+    false_alarm_text,
+    output_dir_option,
+    parse_assignments,
+    plan_rows,
+    print_accuracy_measurement,
+    print_echo_warnings,
+    print_effects,
+    print_inconsistencies,
+    print_outcome_and_exit,
+    print_spec_warnings,
+    run_options,
+    shorten_path,
+    study_effects_table,
+    wrap_text,
 )
-from sweep.messages import PrintableStream, as_command
+from sweep.messages import PrintableStream, suggest_shell_commands
 from sweep.storage.locations import Location
-from sweep.tasks.streams import forgiving_output
+from sweep.tasks.engine.text_streams import forgiving_output
 
 #: Errors of a file or folder that is not to be used: no permission, no room, something in the way.
-UNUSABLE = {
+UNUSABLE_PATH_ERRNOS = {
     errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.ENOTDIR, errno.EEXIST,
     errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP,
 }  # fmt: skip
 
 
 #: Errors of a disk that takes no more.
-FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+DISK_FULL_ERRNOS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 
 def _make_output_printable() -> None:
@@ -103,7 +103,7 @@ def _show_log(ctx: click.Context, _: click.Parameter, verbosity: int) -> None:
     ctx.call_on_close(restore)
 
 
-class Commands(click.Group):
+class CommandGroup(click.Group):
     """Commands whose users' mistakes end in plain words and exit code 2."""
 
     def add_command(self, cmd: click.Command, name: str | None = None) -> None:
@@ -129,7 +129,7 @@ class Commands(click.Group):
         try:
             with forgiving_output():
                 _make_output_printable()
-                with as_command():
+                with suggest_shell_commands():
                     return super().main(*args, **options)
         finally:
             _make_output_printable()
@@ -140,53 +140,55 @@ class Commands(click.Group):
             Path.cwd()
         except FileNotFoundError:
             click.echo("the current folder was removed: go to another", err=True)
-            ctx.exit(MISTAKE)
+            ctx.exit(EXIT_MISTAKE)
         try:
             return super().invoke(ctx)
         except (click.exceptions.Exit, click.ClickException, click.Abort):
             raise
         except Exception as error:
-            from sweep.extras import remedy
+            from sweep.extras import install_hint
             from sweep.model.unsupported import UnsupportedShot
-            from sweep.plain_files import UnfitFileError
-            from sweep.scenes.files import SceneError
+            from sweep.regular_files import RefusedFileError
+            from sweep.scenes.scene_files import SceneError
             from sweep.spec import SpecError
-            from sweep.storage.locations import ObjectStoreError, worded
-            from sweep.storage.opening import ReplacedError
-            from sweep.storage.sound import DamagedChunkError
-            from sweep.tasks.progress import StoreError, TaskError
+            from sweep.storage.locations import ObjectStoreError, to_readable_error
+            from sweep.storage.store_format import StoreReplacedError
+            from sweep.storage.verified_store import DamagedChunkError
+            from sweep.tasks.engine.progress import StoreError, TaskError
 
-            told = (
-                DamagedChunkError, ObjectStoreError, ReplacedError, SceneError, SpecError,
-                StoreError, TaskError, UnfitFileError, UnsupportedShot,
+            user_error_types = (
+                DamagedChunkError, ObjectStoreError, StoreReplacedError, SceneError, SpecError,
+                StoreError, TaskError, RefusedFileError, UnsupportedShot,
             )  # fmt: skip
-            said = worded(error)
-            if line := remedy(said):
-                tell(line, err=True)
-            elif isinstance(said, told):
-                tell(str(said), err=True)
-            elif isinstance(said, OSError) and (line := _unusable(said)):
-                tell(line, err=True)
+            readable_error = to_readable_error(error)
+            if message := install_hint(readable_error):
+                echo_wrapped(message, err=True)
+            elif isinstance(readable_error, user_error_types):
+                echo_wrapped(str(readable_error), err=True)
+            elif isinstance(readable_error, OSError) and (
+                message := _unusable_path_message(readable_error)
+            ):
+                echo_wrapped(message, err=True)
             else:
                 raise
-            ctx.exit(MISTAKE)
+            ctx.exit(EXIT_MISTAKE)
 
 
-def _unusable(error: OSError) -> str:
+def _unusable_path_message(error: OSError) -> str:
     """Words for a file, folder or disk that is not to be used; empty for any other error."""
-    from sweep.storage.locations import reason
+    from sweep.storage.locations import os_error_reason
 
     if error.errno in (errno.EMFILE, errno.ENFILE):
         return f"{error.strerror}: raise their limit, `ulimit -n`, and try again"
-    if error.filename and error.errno in UNUSABLE:
-        why = reason(error, Path(os.fsdecode(error.filename)))
-        return f"{os.fsdecode(error.filename)}: {why}: mend that, or name another place"
-    if error.errno in FULL:  # writing, which names no file
+    if error.filename and error.errno in UNUSABLE_PATH_ERRNOS:
+        cause = os_error_reason(error, Path(os.fsdecode(error.filename)))
+        return f"{os.fsdecode(error.filename)}: {cause}: mend that, or name another place"
+    if error.errno in DISK_FULL_ERRNOS:  # writing, which names no file
         return f"{error.strerror}: make room where the output goes, or name another place"
     return ""
 
 
-@click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(cls=CommandGroup, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="sweep")
 def main() -> None:
     """Sweep an FMCW Doppler lidar's parameters and store how well it detects.
@@ -217,10 +219,10 @@ def main() -> None:
 
 
 @main.command()
-@SPEC
+@SPEC_ARGUMENT
 @click.option(
     "--store",
-    type=StorePath(),
+    type=StoreLocationType(),
     help="Store to write, on disk or s3://bucket/name.zarr [results/<name of the spec>.zarr].",
 )
 @click.option(
@@ -236,9 +238,9 @@ def main() -> None:
     "however often it is started.",
 )
 @click.option("--yes", is_flag=True, help="Start a very large study without asking.")
-@computing
+@run_options
 def run(
-    spec: Path, store: Location | None, overwrite: bool, resuming: bool, yes: bool, **how: Any
+    spec: Path, store: Location | None, overwrite: bool, resuming: bool, yes: bool, **options: Any
 ) -> None:
     """Compute the study SPEC into a Zarr store.
 
@@ -261,11 +263,11 @@ def run(
 
     if overwrite and resuming:
         raise click.UsageError("--overwrite begins anew, and --resume goes on: give one of them")
-    study, path = load(spec), store or _default_store(spec)
+    study_spec, path = load(spec), store or _default_store(spec)
     if is_free(path) or not resuming:  # else it was asked as it was begun
-        ask_before(study, path, yes=yes)
-    outcome = driver.run(study, store=path, overwrite=overwrite, resume=resuming, **how)
-    conclude(outcome, shown(path))
+        confirm_large_study(study_spec, path, yes=yes)
+    outcome = driver.run(study_spec, store=path, overwrite=overwrite, resume=resuming, **options)
+    print_outcome_and_exit(outcome, shorten_path(path))
 
 
 def _default_store(spec: Path) -> Path:
@@ -273,15 +275,15 @@ def _default_store(spec: Path) -> Path:
 
 
 @main.command()
-@STORE
+@STORE_ARGUMENT
 @click.option(
     "--spec",
-    type=LocalPath(exists=True, dir_okay=False),
+    type=LocalPathType(exists=True, dir_okay=False),
     help="Resume only if the store holds this study.",
 )
 @click.option("--retry-failed", is_flag=True, help="Compute again the blocks that failed before.")
-@computing
-def resume(store: Location, spec: Path | None, retry_failed: bool, **how: Any) -> None:
+@run_options
+def resume(store: Location, spec: Path | None, retry_failed: bool, **options: Any) -> None:
     """Compute the missing and damaged blocks of STORE.
 
     Blocks that failed twice are skipped unless --retry-failed is given, because they might kill a
@@ -294,14 +296,16 @@ def resume(store: Location, spec: Path | None, retry_failed: bool, **how: Any) -
     from sweep.spec import load
     from sweep.tasks import driver
 
-    asked = load(spec) if spec else None
-    conclude(driver.resume(store, spec=asked, retry_failed=retry_failed, **how), store)
+    expected_spec = load(spec) if spec else None
+    print_outcome_and_exit(
+        driver.resume(store, spec=expected_spec, retry_failed=retry_failed, **options), store
+    )
 
 
 @main.command()
-@SPEC
-@WORKERS
-@ALLOW_CODE
+@SPEC_ARGUMENT
+@WORKERS_OPTION
+@ALLOW_CODE_OPTION
 def plan(spec: Path, workers: int | None) -> None:
     """Print the size and time of SPEC, and the effects it simulates. Nothing is written.
 
@@ -309,33 +313,33 @@ def plan(spec: Path, workers: int | None) -> None:
     the points at which it is simulated, a bound on its change of pd, log10 pfa or magnitude, and
     its share of a point's time.
     """
-    from sweep.tasks.progress import working
+    from sweep.tasks.engine.progress import show_activity
 
-    with working("planning"):
+    with show_activity("planning"):
         from sweep.spec import load
 
-        study = load(spec)
-        lines = list(plan_lines(study, _default_store(spec), workers))
-        effects = effects_of(study, _default_store(spec))
-    if alarms := alarms_told(study):
-        lines.append(("false alarms", alarms))
+        study_spec = load(spec)
+        rows = list(plan_rows(study_spec, _default_store(spec), workers))
+        effects = study_effects_table(study_spec, _default_store(spec))
+    if alarms := false_alarm_text(study_spec):
+        rows.append(("false alarms", alarms))
     # Nothing is printed before all is known: any of it may find a point that can't be simulated.
-    for name, text in lines:
-        click.echo(folded(f"{name:>12}  {text}", 2 + len(name)))
-    tell_effects(effects)
-    warn_of(study)
-    warn_of_echoes(study, _default_store(spec))
+    for name, value in rows:
+        click.echo(wrap_text(f"{name:>12}  {value}", 2 + len(name)))
+    print_effects(effects)
+    print_spec_warnings(study_spec)
+    print_echo_warnings(study_spec, _default_store(spec))
 
 
 @main.command()
-@SPEC
-@at("Value of a parameter; can be repeated.")
+@SPEC_ARGUMENT
+@at_option("Value of a parameter; can be repeated.")
 @click.option(
     "--noise/--no-noise", default=True, help="Add the noise of one draw [default], or not."
 )
 @click.option("--seed", type=click.IntRange(min=0), help="Seed of the noise [the spec's].")
-@folder("Directory of the figure [results/<name of the spec>].")
-@FORMAT
+@output_dir_option("Directory of the figure [results/<name of the spec>].")
+@FORMAT_OPTION
 def shot(
     spec: Path, at: tuple[str, ...], noise: bool, seed: int | None, output: Path | None, form: str
 ) -> None:
@@ -345,38 +349,38 @@ def shot(
       sweep shot experiments/single_shot_2000m.yaml
       sweep shot experiments/range_angle.yaml --at range=2km --at grazing_angle=45deg
     """  # noqa: D301
-    from sweep.analysis.shot_figure import report
+    from sweep.analysis.shot_spectra import write_shot_report
     from sweep.spec import SceneSpec, load
-    from sweep.tasks.progress import working
+    from sweep.tasks.engine.progress import show_activity
 
-    study = load(spec)
-    if isinstance(study, SceneSpec):
+    study_spec = load(spec)
+    if isinstance(study_spec, SceneSpec):
         raise click.UsageError(
             f"{spec} is a study of a scene: run it, and ask for a figure of the kind shot_spectra"
         )
-    with working("simulating and drawing"):
-        text, files = report(
-            study,
-            at=assignments(at),
+    with show_activity("simulating and drawing"):
+        report_text, files = write_shot_report(
+            study_spec,
+            coordinate_values=parse_assignments(at),
             directory=output or Path("results") / spec.stem,
-            noise=noise,
-            seed=study.seed if seed is None else seed,
-            form=form,
+            draws_noise=noise,
+            seed=study_spec.seed if seed is None else seed,
+            picture_format=form,
         )
-    click.echo(text)
-    _list(files)
+    click.echo(report_text)
+    _print_paths(files)
 
 
-def _list(files: Sequence[Location]) -> None:
+def _print_paths(files: Sequence[Location]) -> None:
     for file in files:
-        click.echo(shown(file))
+        click.echo(shorten_path(file))
 
 
 @main.command()
-@SPEC
+@SPEC_ARGUMENT
 @click.option(
     "--store",
-    type=StorePath(),
+    type=StoreLocationType(),
     help="Store to write [results/<name of the spec>_accuracy.zarr].",
 )
 @click.option(
@@ -389,7 +393,7 @@ def _list(files: Sequence[Location]) -> None:
     metavar="SECONDS",
     help="Approximate limit of the time [60].",
 )
-@OVERWRITE
+@OVERWRITE_OPTION
 def accuracy(
     spec: Path, store: Location | None, points: int, time_limit: float, overwrite: bool
 ) -> None:
@@ -414,36 +418,36 @@ def accuracy(
       sweep accuracy experiments/square_high_descent.yaml --overwrite
     """  # noqa: D301
     from sweep.spec import load
-    from sweep.tasks.accuracy.measure import measure
+    from sweep.tasks.accuracy.measurement import measure_accuracy
 
     path = store or Path("results") / f"{spec.stem}_accuracy.zarr"
-    measured = measure(
-        load(spec), store_path=path, points=points, time_limit=time_limit, overwrite=overwrite
+    has_results = measure_accuracy(
+        load(spec), store_path=path, n_points=points, time_limit=time_limit, overwrite=overwrite
     )
-    files, whole = conclude_accuracy(path, measured=measured)
-    _list(files)
-    if not whole:
-        sys.exit(INCOMPLETE)
+    files, is_complete = print_accuracy_measurement(path, has_results=has_results)
+    _print_paths(files)
+    if not is_complete:
+        sys.exit(EXIT_INCOMPLETE)
 
 
 @main.command()
-@STORE
-@folder("Directory of the figures [NAME-figures next to NAME.zarr].")
-@FORMAT
+@STORE_ARGUMENT
+@output_dir_option("Directory of the figures [NAME-figures next to NAME.zarr].")
+@FORMAT_OPTION
 def figures(store: Location, output: Path | None, form: str) -> None:
     """Draw the figures and tables of the study in STORE."""
-    from sweep.tasks.progress import working
+    from sweep.tasks.engine.progress import show_activity
 
-    with working("drawing"):
-        from sweep.analysis.figures import draw
+    with show_activity("drawing"):
+        from sweep.analysis.study_figures import draw_figures
 
-        files = draw(store, output, form)
-    _list(files)
+        files = draw_figures(store, output, form)
+    _print_paths(files)
 
 
 @main.command()
-@STORE
-@click.argument("file", type=LocalPath(dir_okay=False))
+@STORE_ARGUMENT
+@click.argument("file", type=LocalPathType(dir_okay=False))
 @click.option("--scanner", help="Scanner of the points, if the study has several.")
 @click.option("--draw", type=click.IntRange(min=0), default=0, help="Number of the draw [0].")
 @click.option(
@@ -451,7 +455,7 @@ def figures(store: Location, output: Path | None, form: str) -> None:
     default="interpolated",
     help="Ranges and velocities: interpolated between bins [default], or quantised to bins.",
 )
-@at("Value of a coordinate, if the study has axes; can be repeated.")
+@at_option("Value of a coordinate, if the study has axes; can be repeated.")
 @click.option(
     "--as",
     "form",
@@ -467,7 +471,7 @@ def figures(store: Location, output: Path | None, form: str) -> None:
 )
 def export(
     store: Location, file: Path, at: tuple[str, ...], form: str, interface: tuple[str, ...],
-    **how: Any,
+    **options: Any,
 ) -> None:  # fmt: skip
     """Write the point cloud in STORE to FILE: .ply, .las, .laz or .csv.
 
@@ -482,27 +486,27 @@ def export(
       sweep export results/descent.zarr reports.csv --as reports \\
           --interface rate=10Hz --interface "range_quantum=2 mm"
     """  # noqa: D301
-    from sweep.tasks.progress import working
+    from sweep.tasks.engine.progress import show_activity
 
-    how["where"] = assignments(at)
+    options["where"] = parse_assignments(at)
     if interface and form != "reports":
         raise click.UsageError("--interface is of reports: add --as reports, or leave it out")
-    with working(f"writing {form}"):
+    with show_activity(f"writing {form}"):
         if form == "reports":
-            from sweep.analysis.reports import reports
+            from sweep.analysis.scene_results.interface_reports import reports
 
-            set_anew = assignments(interface, "--interface", "rate=10Hz")
-            number = reports(store, file, interface=set_anew, **how).sizes["report"]
+            interface_changes = parse_assignments(interface, "--interface", "rate=10Hz")
+            count = reports(store, file, interface=interface_changes, **options).sizes["report"]
         else:
-            from sweep.analysis.export import export as write
+            from sweep.analysis.scene_results.point_export import export as write_point_cloud
 
-            number = write(store, file, **how)
-    click.echo(f"{shown(file.absolute())}: {number:,} {form}")
-    tell_inconsistencies(store, how["scanner"])
+            count = write_point_cloud(store, file, **options)
+    click.echo(f"{shorten_path(file.absolute())}: {count:,} {form}")
+    print_inconsistencies(store, options["scanner"])
 
 
 @main.command()
-@click.argument("directory", type=LocalPath(file_okay=False))
+@click.argument("directory", type=LocalPathType(file_okay=False))
 def certificates(directory: Path) -> None:
     """Make certificates for a cluster in DIRECTORY: ca.pem, certificate.pem and key.pem.
 
@@ -510,7 +514,7 @@ def certificates(directory: Path) -> None:
     connections without such a certificate. All machines of the cluster must see the directory, and
     nobody else may read it. The certificates are valid for a year.
     """
-    from sweep.tasks.clusters.machines import make_certificates
+    from sweep.tasks.engine.deploy.local_ssh import make_certificates
 
     files = make_certificates(directory.absolute())
     click.echo("security:")
@@ -539,16 +543,22 @@ def instruments(name: str | None) -> None:
       sweep instruments lander_ndl > own.yaml
     """  # noqa: D301
     from sweep.cli.terminal import instrument_lines
-    from sweep.spec.reading import library, read_document
-    from sweep.spec.rules import near_miss
+    from sweep.spec.rules import suggest_similar_name
+    from sweep.spec.yaml_document import library_instruments, read_document
 
-    known = library()
-    if name is not None and name not in known:
-        close = near_miss(name, known, otherwise=f"the library has {', '.join(known)}")
-        raise click.UsageError(f"{name!r} is no instrument of the library; {close}")
-    for each in [name] if name else known:
-        own = read_document(known[each]).value
-        lines = instrument_lines(own) if name else [folded(f"{each:<24} {own['title']}", 25)]
+    library_files = library_instruments()
+    if name is not None and name not in library_files:
+        hint = suggest_similar_name(
+            name, library_files, fallback=f"the library has {', '.join(library_files)}"
+        )
+        raise click.UsageError(f"{name!r} is no instrument of the library; {hint}")
+    for instrument_name in [name] if name else library_files:
+        instrument_file = read_document(library_files[instrument_name]).content
+        lines = (
+            instrument_lines(instrument_file)
+            if name
+            else [wrap_text(f"{instrument_name:<24} {instrument_file['title']}", 25)]
+        )
         click.echo("\n".join(lines))
 
 
@@ -563,8 +573,8 @@ def schema() -> None:
 
 
 @main.command()
-@click.argument("store", type=StorePath())
-@click.argument("spec", type=LocalPath(exists=True, dir_okay=False), required=False)
+@click.argument("store", type=StoreLocationType())
+@click.argument("spec", type=LocalPathType(exists=True, dir_okay=False), required=False)
 @click.option(
     "--set",
     "fields",
@@ -575,7 +585,7 @@ def schema() -> None:
 @click.option(
     "--store",
     "to",
-    type=StorePath(),
+    type=StoreLocationType(),
     help="Path of the larger store; the old store is then kept [replace STORE].",
 )
 @click.option(
@@ -583,14 +593,14 @@ def schema() -> None:
     is_flag=True,
     help="Discard an unfinished extension; with --store, replace an existing store.",
 )
-@computing
+@run_options
 def extend(
     store: Location,
     spec: Path | None,
     fields: tuple[str, ...],
     to: Location | None,
     overwrite: bool,
-    **how: Any,
+    **options: Any,
 ) -> None:
     """Extend STORE to a larger study, and compute only the new points and draws.
 
@@ -610,7 +620,7 @@ def extend(
       sweep extend s3://bucket/a.zarr larger.yaml --store s3://bucket/b.zarr
     """  # noqa: D301
     from sweep.spec import load
-    from sweep.spec.study import written
+    from sweep.spec.specs import parse_field_values
     from sweep.tasks import driver
 
     if spec is None and not fields:
@@ -618,27 +628,29 @@ def extend(
     outcome = driver.extend(
         store,
         load(spec) if spec else None,
-        changes=written(assignments(fields, "--set", "draws.limit=1e6")) if fields else None,
+        changes=parse_field_values(parse_assignments(fields, "--set", "draws.limit=1e6"))
+        if fields
+        else None,
         to=to,
         overwrite=overwrite,
-        **how,
+        **options,
     )
-    conclude(outcome, shown(to or store))
+    print_outcome_and_exit(outcome, shorten_path(to or store))
 
 
 @main.command()
-@click.argument("study", type=StorePath())
-@at("Value of a parameter; can be repeated. Other axes take their first value.")
+@click.argument("study", type=StoreLocationType())
+@at_option("Value of a parameter; can be repeated. Other axes take their first value.")
 @click.option("--draws", type=click.IntRange(min=1), default=1, help="Number of draws [1].")
 @click.option("--first", type=click.IntRange(min=0), default=0, help="First draw [0].")
 @click.option(
     "-o",
     "--output",
-    type=LocalPath(),
+    type=LocalPathType(),
     required=True,
     help="File to write: .zarr (opens with xarray) or .npz (with numpy).",
 )
-@OVERWRITE
+@OVERWRITE_OPTION
 def spectra(
     study: Location, at: tuple[str, ...], draws: int, first: int, output: Path, overwrite: bool
 ) -> None:
@@ -653,20 +665,20 @@ def spectra(
       sweep spectra results/cfar.zarr --at range=2km --at window=hann -o spectra.zarr
       sweep spectra s3://bucket/cfar.zarr --at range=2km -o spectra.npz
     """  # noqa: D301
-    from sweep.analysis.shot_figure import chosen
-    from sweep.spec import Spec, load
-    from sweep.tasks.progress import working
-    from sweep.tasks.spectra_export import spectra as drawn
-    from sweep.tasks.spectra_export import write
-    from sweep.tasks.studies import read
+    from sweep.analysis.shot_spectra import select_shot_parameters
+    from sweep.spec import GridSpec, load
+    from sweep.tasks.engine.progress import show_activity
+    from sweep.tasks.studies.spectra_export import point_spectra as draw_spectra
+    from sweep.tasks.studies.spectra_export import write_spectra
+    from sweep.tasks.studies.study_loading import read_study
 
     is_file = isinstance(study, Path) and not study.is_dir()
-    spec = load(str(study)) if is_file else read(study)[1].spec
-    if not isinstance(spec, Spec):
+    spec = load(str(study)) if is_file else read_study(study)[1].spec
+    if not isinstance(spec, GridSpec):
         raise click.UsageError(f"{study} is a study of a scene: spectra are those of a flat target")
-    _, parameters = chosen(spec, assignments(at))[0]
-    with working("drawing spectra"):
-        dataset = drawn(spec, parameters, draws=draws, first=first)
-        write(dataset, output, overwrite=overwrite)
+    _, parameters = select_shot_parameters(spec, parse_assignments(at))[0]
+    with show_activity("drawing spectra"):
+        dataset = draw_spectra(spec, parameters, n_draws=draws, first_draw=first)
+        write_spectra(dataset, output, overwrite=overwrite)
     sizes = ", ".join(f"{size:,} {name}" for name, size in dataset.spectrum.sizes.items())
     click.echo(f"{output}: {sizes}")

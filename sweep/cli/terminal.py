@@ -16,64 +16,76 @@ import click
 from click.shell_completion import CompletionItem
 from rich.filesize import decimal
 
-from sweep.messages import INCOMPLETE, MISTAKE, command_line, one_line, printable
-from sweep.storage.locations import Location, located
-from sweep.tasks.streams import is_terminal
+from sweep.messages import (
+    EXIT_INCOMPLETE,
+    EXIT_MISTAKE,
+    escape_to_one_line,
+    escape_unprintable,
+    shell_command,
+)
+from sweep.storage.locations import Location, parse_location
+from sweep.tasks.engine.text_streams import is_terminal
 from sweep.units import number_text, percent
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from sweep.spec import SceneSpec, Spec
-    from sweep.tasks.plan import EffectRow, EffectsTable, Plan
-    from sweep.tasks.session import Outcome
+    from sweep.spec import GridSpec, SceneSpec
+    from sweep.tasks.engine.session import Outcome
+    from sweep.tasks.studies.study_plan import EffectRow, EffectsTable, StudyPlan
 
-MOST_POINTS, MOST_BYTES, MOST_SECONDS = 10**9, 10**12, 30 * 86400.0
+ASK_ABOVE_POINTS, ASK_ABOVE_BYTES, ASK_ABOVE_CPU_SECONDS = 10**9, 10**12, 30 * 86400.0
 """Size of a study, and its time on one core [s], beyond which a run asks before it begins."""
 
-MEASURED = 10**7
+MEASURE_TIME_ABOVE_POINT_DRAWS = 10**7
 """Points times draws beyond which a run measures the time that it takes, before it begins."""
 
-LEAST_WORDS, BETWEEN, MOST_WHOLE = 14, 3, 36
+SENTENCE_COLUMN_WIDTH_MIN, COLUMN_GAP, UNBROKEN_CELL_WIDTH_MAX = 14, 3, 36
 """Characters of a table: least column of sentences, between columns, most of an unbroken cell."""
 
 
-class LocalPath(click.Path):
+class LocalPathType(click.Path):
     """A path here, in which ~ stands for the user's own folder, after `--output=` too."""
 
-    def __init__(self, **rules: Any) -> None:
-        super().__init__(path_type=Path, **rules)
+    def __init__(self, **options: Any) -> None:
+        super().__init__(path_type=Path, **options)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Return the path, as click checks it; for one that is not there, say what is near it."""
         path = Path(os.path.expanduser(value))
         if self.exists and not path.exists():
-            self.fail(f"{self.name.capitalize()} '{path}' does not exist{_near(path)}", param, ctx)
+            self.fail(
+                f"{self.name.capitalize()} '{path}' does not exist{_missing_file_hint(path)}",
+                param,
+                ctx,
+            )
         if self.exists and not self.dir_okay and (path / "zarr.json").is_file():
-            hint = f"{command_line('resume', value)} goes on with it"
+            hint = f"{shell_command('resume', value)} goes on with it"
             self.fail(f"'{path}' is a store, and a file is needed: {hint}", param, ctx)
         return super().convert(str(path), param, ctx)
 
 
-def _near(path: Path) -> str:
+def _missing_file_hint(path: Path) -> str:
     """Remark on a file whose name is like that of a missing one, or on the YAML files beside it.
 
     A link that leads nowhere is there, and has no near one.
     """
-    from sweep.spec.reading import similar_file
+    from sweep.spec.yaml_document import suggest_similar_file
 
     if path.is_symlink():
         return f": it is a link to '{os.readlink(path)}', which leads nowhere"
     try:
-        names = [other.name for other in path.parent.iterdir() if other.suffix in (".yaml", ".yml")]
+        names = [
+            sibling.name for sibling in path.parent.iterdir() if sibling.suffix in (".yaml", ".yml")
+        ]
     except OSError:
         return f": there is no folder '{path.parent}'"
-    others = f"there is: {', '.join(sorted(names)[:5])}" if names else ""
-    near = similar_file(path, otherwise=others)
-    return f"; {near}" if near else ""
+    siblings_text = f"there is: {', '.join(sorted(names)[:5])}" if names else ""
+    suggestion_text = suggest_similar_file(path, fallback=siblings_text)
+    return f"; {suggestion_text}" if suggestion_text else ""
 
 
-class StorePath(click.ParamType):
+class StoreLocationType(click.ParamType):
     """A path, or an address in an object store."""
 
     name = "path"
@@ -82,7 +94,7 @@ class StorePath(click.ParamType):
         self, value: object, param: click.Parameter | None, ctx: click.Context | None
     ) -> Location:
         """Return the place that is meant."""
-        return located(str(value))
+        return parse_location(str(value))
 
     def shell_complete(
         self, ctx: click.Context, param: click.Parameter, incomplete: str
@@ -91,78 +103,78 @@ class StorePath(click.ParamType):
         return [CompletionItem(incomplete, type="file")]
 
 
-def shown(path: Location) -> Location:
+def shorten_path(path: Location) -> Location:
     """Return a place as short as it can be written from here."""
     try:
-        here = Path.cwd()
+        current_dir = Path.cwd()
     except OSError:  # removed meanwhile
         return path
-    if isinstance(path, Path) and path.is_relative_to(here):
-        return path.relative_to(here)
+    if isinstance(path, Path) and path.is_relative_to(current_dir):
+        return path.relative_to(current_dir)
     return path
 
 
-def assignments(
-    texts: tuple[str, ...], option: str = "--at", example: str = "range=2km"
+def parse_assignments(
+    assignment_texts: tuple[str, ...], option: str = "--at", example: str = "range=2km"
 ) -> dict[str, str]:
     """Values by name, as written after an option; refused where one is not NAME=VALUE."""
-    found = {}
-    for text in texts:
-        name, equals, value = text.partition("=")
-        if not (name.strip() and equals and value.strip()):
+    values = {}
+    for text in assignment_texts:
+        name, separator, value = text.partition("=")
+        if not (name.strip() and separator and value.strip()):
             raise click.BadParameter(
                 f"{text!r} is not NAME=VALUE, as in {example}", param_hint=option
             )
-        if name.strip() in found:
+        if name.strip() in values:
             raise click.BadParameter(f"{name.strip()!r} is given twice", param_hint=option)
-        found[name.strip()] = value.strip()
-    return found
+        values[name.strip()] = value.strip()
+    return values
 
 
-SPEC = click.argument("spec", type=LocalPath(exists=True, dir_okay=False))
-STORE = click.argument("store", type=StorePath())
+SPEC_ARGUMENT = click.argument("spec", type=LocalPathType(exists=True, dir_okay=False))
+STORE_ARGUMENT = click.argument("store", type=StoreLocationType())
 
-WORKERS = click.option(
+WORKERS_OPTION = click.option(
     "--workers",
     type=click.IntRange(min=1),
     help="Workers to start [all cores, none for little work, or as --cluster says].",
 )
-SCHEDULER = click.option(
+SCHEDULER_OPTION = click.option(
     "--scheduler",
     metavar="ADDRESS|none",
     help="Address of a Dask scheduler; none: a plain loop without Dask.",
 )
-CLUSTER = click.option(
+CLUSTER_OPTION = click.option(
     "--cluster",
-    type=LocalPath(exists=True, dir_okay=False),
+    type=LocalPathType(exists=True, dir_okay=False),
     help="File that describes a cluster; deploy/ has examples.",
 )
-BLOCK_TIMEOUT = click.option(
+BLOCK_TIMEOUT_OPTION = click.option(
     "--block-timeout",
     type=click.FloatRange(min=0, min_open=True),
     metavar="SECONDS",
     help="Give up a block that takes longer than this twice [none].",
 )
-PERFORMANCE_REPORT = click.option(
+PERFORMANCE_REPORT_OPTION = click.option(
     "--performance-report",
-    type=LocalPath(dir_okay=False),
+    type=LocalPathType(dir_okay=False),
     metavar="FILE.html",
     help="Write Dask's own report of the run.",
 )
-DASHBOARD = click.option(
+DASHBOARD_OPTION = click.option(
     "--dashboard",
     is_flag=True,
     help="Serve Dask's dashboard to all users of this machine, on its loopback address.",
 )
-DURABLE = click.option(
+DURABLE_OPTION = click.option(
     "--durable",
     is_flag=True,
     help="Commit blocks only once they are on the disk, against power loss.",
 )
 
-OVERWRITE = click.option("--overwrite", is_flag=True, help="Replace an existing result.")
+OVERWRITE_OPTION = click.option("--overwrite", is_flag=True, help="Replace an existing result.")
 
-FORMAT = click.option(
+FORMAT_OPTION = click.option(
     "--format",
     "form",
     type=click.Choice(["png", "pdf", "svg"]),
@@ -171,208 +183,240 @@ FORMAT = click.option(
 )
 
 
-def at(help: str) -> Callable[..., Any]:
-    """Option of values by name; :func:`assignments` reads them."""
+def at_option(help: str) -> Callable[..., Any]:
+    """Option of values by name; :func:`parse_assignments` reads them."""
     return click.option("--at", "at", multiple=True, metavar="NAME=VALUE", help=help)
 
 
-def folder(help: str) -> Callable[..., Any]:
+def output_dir_option(help: str) -> Callable[..., Any]:
     """Option of the folder that files are put into."""
-    return click.option("--output", type=LocalPath(file_okay=False), help=help)
+    return click.option("--output", type=LocalPathType(file_okay=False), help=help)
 
 
-def _allow(context: click.Context, parameter: click.Parameter, modules: tuple[str, ...]) -> None:
+def _allow_modules(
+    context: click.Context, parameter: click.Parameter, modules: tuple[str, ...]
+) -> None:
     if modules:
-        from sweep.tasks.user_code import allow
+        from sweep.tasks.studies.user_functions import allow_modules
 
-        allow(modules)
+        allow_modules(modules)
 
 
-ALLOW_CODE = click.option(
+ALLOW_CODE_OPTION = click.option(
     "--allow-code",
     multiple=True,
     metavar="MODULE",
     expose_value=False,
-    callback=_allow,
+    callback=_allow_modules,
     help="Let the study run detectors and estimators of this Python module; can be repeated.",
 )
 
 
-def computing(command: Callable[..., Any]) -> Callable[..., Any]:
+def run_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Give a command the options of all that compute, which it hands on as they are."""
     options = (
-        WORKERS, SCHEDULER, CLUSTER, ALLOW_CODE, BLOCK_TIMEOUT, DURABLE, PERFORMANCE_REPORT,
-        DASHBOARD,
-    )  # fmt: skip
+        WORKERS_OPTION,
+        SCHEDULER_OPTION,
+        CLUSTER_OPTION,
+        ALLOW_CODE_OPTION,
+        BLOCK_TIMEOUT_OPTION,
+        DURABLE_OPTION,
+        PERFORMANCE_REPORT_OPTION,
+        DASHBOARD_OPTION,
+    )
     for option in reversed(options):
         command = option(command)
     return command
 
 
-def folded(text: str, hanging: int = 2, *, err: bool = False, narrower: int = 0) -> str:
+def wrap_text(text: str, hanging_indent: int = 2, *, err: bool = False, margin: int = 0) -> str:
     """Text in lines of the terminal's width, or so much narrower; unchanged for no terminal.
 
     Lines break between words, and commands in backquotes, which are copied, stay whole.
     """
     if not is_terminal(sys.stderr if err else sys.stdout):
         return text
-    width = max(shutil.get_terminal_size().columns - narrower, 1)
-    whole = re.sub(r"`[^`]*`", lambda found: found[0].replace(" ", "\xa0"), text)
+    width = max(shutil.get_terminal_size().columns - margin, 1)
+    protected_text = re.sub(r"`[^`]*`", lambda match: match[0].replace(" ", "\xa0"), text)
     lines = (
         textwrap.fill(
-            line, width, subsequent_indent=" " * (hanging + len(line) - len(line.lstrip())),
+            line, width, subsequent_indent=" " * (hanging_indent + len(line) - len(line.lstrip())),
             break_long_words=False, break_on_hyphens=False,
         )
-        for line in whole.splitlines()
+        for line in protected_text.splitlines()
     )  # fmt: skip
     return "\n".join(lines).replace("\xa0", " ")
 
 
-def tell(text: str, *, err: bool = False) -> None:
+def echo_wrapped(text: str, *, err: bool = False) -> None:
     """Print sentences, folded to the terminal's width."""
-    click.echo(folded(text, err=err), err=err)
+    click.echo(wrap_text(text, err=err), err=err)
 
 
-def instrument_lines(own: Mapping[str, Any]) -> Iterator[str]:
+def instrument_lines(instrument_file: Mapping[str, Any]) -> Iterator[str]:
     """Yield what the file of an instrument of the library says, as a file that a spec may name.
 
     Words are comments of its YAML.
     """
     import yaml
 
-    words = [
-        own["title"],
-        own["source"] + (f", https://doi.org/{own['doi']}" if own["doi"] else ""),
+    comments = [
+        instrument_file["title"],
+        instrument_file["source"]
+        + (f", https://doi.org/{instrument_file['doi']}" if instrument_file["doi"] else ""),
     ]
-    for what in ("published", "assumed"):
-        words += ["", f"{what}:", *(f"- {each}" for each in own[what] or ["nothing"])]
-    words += ["", "must reproduce (docs/instruments.md has what is simulated):"]
-    for number in own["numbers"].values():
-        in_words = isinstance(number["published"], str)  # which have their unit
-        unit = "" if in_words else f" {number['unit']}"
-        words.append(f"- {number['about']}: {number['published']}{unit}".rstrip())
-    for text in words:
-        yield from (f"# {line}".rstrip() for line in (folded(text, narrower=2) or " ").splitlines())
-    sections = {name: own[name] for name in ("error_floor", "instrument") if name in own}
+    for heading in ("published", "assumed"):
+        comments += [
+            "",
+            f"{heading}:",
+            *(f"- {item}" for item in instrument_file[heading] or ["nothing"]),
+        ]
+    comments += ["", "must reproduce (docs/instruments.md has what is simulated):"]
+    for published_number in instrument_file["numbers"].values():
+        is_text = isinstance(published_number["published"], str)  # which have their unit
+        unit = "" if is_text else f" {published_number['unit']}"
+        comments.append(
+            f"- {published_number['about']}: {published_number['published']}{unit}".rstrip()
+        )
+    for comment in comments:
+        yield from (
+            f"# {line}".rstrip() for line in (wrap_text(comment, margin=2) or " ").splitlines()
+        )
+    sections = {
+        name: instrument_file[name]
+        for name in ("error_floor", "instrument")
+        if name in instrument_file
+    }
     yield "\n" + yaml.safe_dump(sections, sort_keys=False).rstrip()
 
 
-def conclude(outcome: Outcome, store: Location) -> None:
+def print_outcome_and_exit(outcome: Outcome, store: Location) -> None:
     """Say what a run has come to, and leave with its exit code.
 
     The store is the one that the user named: one that is being extended lies next to it.
     """
-    from sweep.tasks.progress import duration
+    from sweep.tasks.engine.progress import duration_text
 
     if outcome.blocks_done and (outcome.store / "zarr.json").exists():
         try:
             _print_summary(outcome.store)
-            tell_accuracy(outcome.store)
-            tell_inconsistencies(outcome.store)
+            print_accuracy(outcome.store)
+            print_inconsistencies(outcome.store)
         except Exception as error:  # the study is computed all the same
-            tell(f"no table of the results: {_described(error)}", err=True)
+            echo_wrapped(f"no table of the results: {_error_text(error)}", err=True)
     for scanner, rays in outcome.rays.items():
-        told = f"{rays:,} rays cast" if rays else "eyepoints were there, no ray cast"
-        click.echo(f"{scanner}: {told}")
-    tell(
+        rays_text = f"{rays:,} rays cast" if rays else "eyepoints were there, no ray cast"
+        click.echo(f"{scanner}: {rays_text}")
+    echo_wrapped(
         f"{store}: {outcome.points_done:,} of {outcome.points:,} {outcome.unit}, "
         f"computed {outcome.blocks_computed:,} of {outcome.blocks:,} blocks "
-        f"in {duration(outcome.seconds)}"
+        f"in {duration_text(outcome.seconds)}"
     )
     if outcome.complete:
         if not outcome.blocks_computed:
-            tell(f"{store} was complete already: nothing was left to compute.")
-        click.echo(f"{command_line('figures', store)}  draws it.")
+            echo_wrapped(f"{store} was complete already: nothing was left to compute.")
+        click.echo(f"{shell_command('figures', store)}  draws it.")
         return
     for failure in outcome.failures[:5]:
-        tell(f"block {failure.block} failed: {failure.error}", err=True)
-    left = outcome.blocks - outcome.blocks_done
-    failed = len(outcome.failures) + outcome.left_out
-    why = outcome.stopped or f"{failed:,} failed; {command_line('status', store)}  tells why"
-    click.echo(f"Incomplete, {left:,} of {outcome.blocks:,} blocks left: {why}.", err=True)
-    if left > failed:
-        click.echo(f"{command_line('resume', store)}  goes on.", err=True)
-    if failed:
-        retry = command_line("resume", store, retry_failed=True)
-        click.echo(f"{retry}  tries failed blocks again.", err=True)
-    sys.exit(INCOMPLETE)
+        echo_wrapped(f"block {failure.block} failed: {failure.error}", err=True)
+    blocks_left = outcome.blocks - outcome.blocks_done
+    n_failed = len(outcome.failures) + outcome.left_out
+    reason = outcome.stopped or f"{n_failed:,} failed; {shell_command('status', store)}  tells why"
+    click.echo(
+        f"Incomplete, {blocks_left:,} of {outcome.blocks:,} blocks left: {reason}.", err=True
+    )
+    if blocks_left > n_failed:
+        click.echo(f"{shell_command('resume', store)}  goes on.", err=True)
+    if n_failed:
+        retry_command = shell_command("resume", store, retry_failed=True)
+        click.echo(f"{retry_command}  tries failed blocks again.", err=True)
+    sys.exit(EXIT_INCOMPLETE)
 
 
-def _described(error: Exception) -> str:
+def _error_text(error: Exception) -> str:
     """Text of an error, with its kind where that is no error of this program's."""
-    from sweep.storage.opening import StoreError
-    from sweep.storage.sound import DamagedChunkError
+    from sweep.storage.store_format import StoreError
+    from sweep.storage.verified_store import DamagedChunkError
 
-    is_told = isinstance(error, StoreError | DamagedChunkError)
-    return str(error) if is_told else f"{type(error).__name__}: {error}"
+    is_own_error = isinstance(error, StoreError | DamagedChunkError)
+    return str(error) if is_own_error else f"{type(error).__name__}: {error}"
 
 
 def _print_summary(store: Location) -> None:
-    from sweep.tasks import studies
+    from sweep.tasks.studies import study_loading
 
-    attributes, study = studies.read(store)
-    (_print_scene if attributes["kind"] == "scene" else _print_grid)(store)
-    if alarms := alarms_told(study.spec):
-        tell(f"False alarms of noise: {alarms}.")
+    attributes, study = study_loading.read_study(store)
+    (_print_scene_summary if attributes["kind"] == "scene" else _print_grid_summary)(store)
+    if alarms := false_alarm_text(study.spec):
+        echo_wrapped(f"False alarms of noise: {alarms}.")
 
 
-def _print_grid(store: Location) -> None:
-    from sweep.tasks.summary import DETECTED, summary
+def _print_grid_summary(store: Location) -> None:
+    from sweep.tasks.studies.store_summary import DETECTED_PD_MIN, detection_summary
 
-    part, rows, share = summary(store)
+    part_heading, rows, block_share = detection_summary(store)
     print_table(
-        "Probability of detection" + _looked_at(share),
-        [part, "points", f"pd_shot > {DETECTED}", "median pd_shot", "median pd_doppler"],
+        "Probability of detection" + _sampled_share_text(block_share),
+        [
+            part_heading,
+            "points",
+            f"pd_shot > {DETECTED_PD_MIN}",
+            "median pd_shot",
+            "median pd_doppler",
+        ],
         [
             [
-                row.part,
-                f"{row.points:,}",
-                percent(row.detected, ".1f"),
-                number_text(row.pd_shot),
-                f"{row.pd_doppler:.4g}" if row.pd_doppler == row.pd_doppler else "-",
+                row.label,
+                f"{row.n_points:,}",
+                percent(row.detected_fraction, ".1f"),
+                number_text(row.median_pd_shot),
+                f"{row.median_pd_doppler:.4g}"
+                if row.median_pd_doppler == row.median_pd_doppler
+                else "-",
             ]
             for row in rows
         ],
     )
 
 
-def _looked_at(share: float) -> str:
-    return f", by {100 * share:.2g} % of the blocks" if share < 1 else ""
+def _sampled_share_text(block_share: float) -> str:
+    return f", by {100 * block_share:.2g} % of the blocks" if block_share < 1 else ""
 
 
-def _print_scene(store: Location) -> None:
-    from sweep.tasks.summary import scene_summary
+def _print_scene_summary(store: Location) -> None:
+    from sweep.tasks.studies.store_summary import scene_summary
 
     print_table(
         "Shots and points by scanner",
         ["scanner", "shots", "mean pd", "true points", "false points", "velocity solved"],
         [
             [
-                row.part,
-                f"{row.shots:,}",
-                number_text(row.pd) if row.pd == row.pd else "no hit",
-                percent(row.true / row.shots, ".1f") if row.shots else "-",
-                f"{row.false:,}",
-                f"{100 * row.solved / row.cycles:.1f} %" if row.cycles else "-",
+                row.label,
+                f"{row.n_shots:,}",
+                number_text(row.mean_pd) if row.mean_pd == row.mean_pd else "no hit",
+                percent(row.shots_with_true_return / row.n_shots, ".1f") if row.n_shots else "-",
+                f"{row.false_points:,}",
+                f"{100 * row.solved_cycles / row.n_cycles:.1f} %" if row.n_cycles else "-",
             ]
             for row in scene_summary(store)
         ],
     )
 
 
-def unchecked_beamlets(study: Spec | SceneSpec) -> str:
+def unchecked_beamlets_reason(spec: GridSpec | SceneSpec) -> str:
     """Return what is not checked of the number of beamlets, and why; '' where it is estimated."""
     from sweep.model.resolution import BEAMLETS, is_open
 
-    parameters = study.parameters()
-    given = study.footprint.beamlets > 0
-    varied = any(member.path == BEAMLETS for axis in study.axes for member in axis.members)
-    if study.modes()["footprint"] == "off":
+    parameters = spec.parameters()
+    is_given = spec.footprint.beamlets > 0
+    is_varied = any(member.path == BEAMLETS for axis in spec.axes for member in axis.parameters)
+    if spec.effect_modes()["footprint"] == "off":
         return ""
-    if given or varied:
-        number = "several numbers" if varied else f"{study.footprint.beamlets:,}"
+    if is_given or is_varied:
+        given_text = "several numbers" if is_varied else f"{spec.footprint.beamlets:,}"
         return (
-            f"whether footprint.beamlets, given as {number}, keeps accuracy.tolerance; leave it "
+            f"whether footprint.beamlets, given as {given_text}, keeps accuracy.tolerance; leave "
+            "it "
             "out to have beamlets counted by the tolerance"
         )
     if not is_open(parameters):
@@ -383,61 +427,68 @@ def unchecked_beamlets(study: Spec | SceneSpec) -> str:
     return ""
 
 
-def tell_inconsistencies(store: Location, scanner: str | None = None) -> None:
+def print_inconsistencies(store: Location, scanner: str | None = None) -> None:
     """Print which quantities of a flight are off by far more than their standard errors."""
-    from sweep.tasks import studies
+    from sweep.tasks.studies import study_loading
 
-    if studies.read(store)[0]["kind"] != "scene":
+    if study_loading.read_study(store)[0]["kind"] != "scene":
         return
-    from sweep.analysis.consistency import inconsistencies
+    from sweep.analysis.scene_results.consistency import inconsistency_messages
 
-    for sentence in inconsistencies(store, scanner):
-        tell(f"warning: {sentence}", err=True)
+    for sentence in inconsistency_messages(store, scanner):
+        echo_wrapped(f"warning: {sentence}", err=True)
 
 
-def tell_accuracy(store: Location, done: np.ndarray | None = None) -> None:
+def print_accuracy(store: Location, done_blocks: np.ndarray | None = None) -> None:
     """Print how well what is drawn is known, what beamlets leave, and what is not known at all."""
-    from sweep.tasks import studies
-    from sweep.tasks.summary import accuracy_table, beyond_model, rays_table
+    from sweep.tasks.studies import study_loading
+    from sweep.tasks.studies.store_summary import (
+        count_unsupported_points,
+        draw_accuracy_rows,
+        ray_accuracy_rows,
+    )
 
-    number, why = beyond_model(store, done)
-    if number:
-        told = f"points beyond the model, which have no results: {number:,}; the first: {why}"
-        tell(f"warning: {told}", err=True)
-    if rows := accuracy_table(store, done):
+    n_unsupported, reason = count_unsupported_points(store, done_blocks)
+    if n_unsupported:
+        message = (
+            f"points beyond the model, which have no results: {n_unsupported:,}; the first: "
+            f"{reason}"
+        )
+        echo_wrapped(f"warning: {message}", err=True)
+    if rows := draw_accuracy_rows(store, done_blocks):
         print_table(
             "Half-widths of pd by its draws, and where accuracy.tolerance is met"
-            + _looked_at(rows[0].looked_at),
+            + _sampled_share_text(rows[0].block_fraction),
             ["", "met", "worst", "missed by", "draws", "needed", "at"],
             [
                 [
                     row.name,
-                    f"{row.met:,} of {row.points:,}",
-                    f"{row.error:.3g}",
-                    f"{row.missed:.2g}",
-                    f"{row.number:,}",
-                    f"{row.needed:,.0f}" if row.needed < float("inf") else "-",
-                    row.where,
+                    f"{row.n_met:,} of {row.n_points:,}",
+                    f"{row.worst_error:.3g}",
+                    f"{row.excess:.2g}",
+                    f"{row.samples_at_worst:,}",
+                    f"{row.draws_needed:,.0f}" if row.draws_needed < float("inf") else "-",
+                    row.worst_label,
                 ]
                 for row in rows
             ],
             "at",
         )
-    if why := unchecked_beamlets(studies.read(store)[1].spec):
-        tell(f"Not checked: {why}.")
-    if rays := rays_table(store, done):
-        kind, each = ("rays", "shot") if rays[0].name else ("beamlets", "point")
+    if reason := unchecked_beamlets_reason(study_loading.read_study(store)[1].spec):
+        echo_wrapped(f"Not checked: {reason}.")
+    if rays := ray_accuracy_rows(store, done_blocks):
+        ray_noun, unit_noun = ("rays", "shot") if rays[0].name else ("beamlets", "point")
         print_table(
-            f"What more {kind} may change{_looked_at(rays[0].looked_at)}",
-            ["", f"{kind} a {each}", "met", "worst", "missed by", "at"],
+            f"What more {ray_noun} may change{_sampled_share_text(rays[0].block_fraction)}",
+            ["", f"{ray_noun} a {unit_noun}", "met", "worst", "missed by", "at"],
             [
                 [
                     row.name,
-                    f"{row.mean:,.0f}, at most {row.most:,}",
-                    f"{row.met:,} of {row.points:,}",
-                    f"{row.error:.3g}",
-                    f"{row.missed:.2g}",
-                    row.where,
+                    f"{row.mean_samples:,.0f}, at most {row.samples_max:,}",
+                    f"{row.n_met:,} of {row.n_points:,}",
+                    f"{row.worst_error:.3g}",
+                    f"{row.excess:.2g}",
+                    row.worst_label,
                 ]
                 for row in rays
             ],
@@ -445,7 +496,9 @@ def tell_accuracy(store: Location, done: np.ndarray | None = None) -> None:
         )
 
 
-def print_table(title: str, headings: list[str], rows: list[list[str]], words: str = "") -> None:
+def print_table(
+    title: str, headings: list[str], rows: list[list[str]], sentence_heading: str = ""
+) -> None:
     """Print a table, folded to the terminal's width; nothing is folded where there is none.
 
     `words` names a column of sentences. No number is ever broken or cut: where a terminal is too
@@ -456,242 +509,291 @@ def print_table(title: str, headings: list[str], rows: list[list[str]], words: s
     from rich.markup import escape
     from rich.table import Table
 
-    title = printable(title)
-    rows = [[one_line(cell) for cell in row] for row in rows]
+    title = escape_unprintable(title)
+    rows = [[escape_to_one_line(cell) for cell in row] for row in rows]
     table, console = Table(title=title, title_justify="left", box=SIMPLE_HEAD), Console()
     columns = [[heading, *cells] for heading, *cells in zip(headings, *rows, strict=True)]
-    whole = [max(map(len, column)) for column in columns]
-    least = [_least(column, is_words=column[0] == words) for column in columns]
-    spare = console.width - sum(least) - BETWEEN * len(columns) - 1
+    full_widths = [max(map(len, column)) for column in columns]
+    min_widths = [
+        _column_width_min(column, is_sentences=column[0] == sentence_heading) for column in columns
+    ]
+    spare_width = console.width - sum(min_widths) - COLUMN_GAP * len(columns) - 1
     if not console.is_terminal:
-        spare = sum(whole)
-    elif spare < 0:
-        _print_lists(title, headings, rows)
+        spare_width = sum(full_widths)
+    elif spare_width < 0:
+        _print_rows_as_lists(title, headings, rows)
         return
-    for heading, most, width in zip(headings, whole, least, strict=True):  # words come last
-        spare, width = spare - min(most - width, spare), width + min(most - width, spare)
+    for heading, full_width, width in zip(
+        headings, full_widths, min_widths, strict=True
+    ):  # words come last
+        spare_width, width = (
+            spare_width - min(full_width - width, spare_width),
+            width + min(full_width - width, spare_width),
+        )
         table.add_column(
-            escape(heading), justify="left" if heading == words else "right", width=width
+            escape(heading), justify="left" if heading == sentence_heading else "right", width=width
         )
     for row in rows:
         table.add_row(*map(escape, row))
-    console.width = max(console.width, sum(whole) + BETWEEN * len(columns) + 1)
+    console.width = max(console.width, sum(full_widths) + COLUMN_GAP * len(columns) + 1)
     console.print(table)
 
 
-def _print_lists(title: str, headings: list[str], rows: list[list[str]]) -> None:
+def _print_rows_as_lists(title: str, headings: list[str], rows: list[list[str]]) -> None:
     """Print each row of a table as a list of its cells, as many to a line as it has room for."""
-    tell(title)
+    echo_wrapped(title)
     for row in rows:
-        told = (f"{head}: {cell}" for head, cell in zip(headings[1:], row[1:], strict=True))
-        cells = (f"`{each}`" if len(each) < MOST_WHOLE else each for each in told)
-        click.echo(f"{row[0]}\n{folded('  ' + '   '.join(cells), 0).replace('`', '')}")
+        labelled_cells = (
+            f"{heading}: {cell}" for heading, cell in zip(headings[1:], row[1:], strict=True)
+        )
+        cells = (
+            f"`{labelled_cell}`" if len(labelled_cell) < UNBROKEN_CELL_WIDTH_MAX else labelled_cell
+            for labelled_cell in labelled_cells
+        )
+        click.echo(f"{row[0]}\n{wrap_text('  ' + '   '.join(cells), 0).replace('`', '')}")
     click.echo()
 
 
-def _least(column: list[str], *, is_words: bool) -> int:
+def _column_width_min(column: list[str], *, is_sentences: bool) -> int:
     """Width of a column whose words, and where they are no sentences whose numbers, stay whole."""
     heading, *cells = column
-    numbers = [] if is_words else [c for c in cells if any(map(str.isdigit, c))]
+    numbers = [] if is_sentences else [cell for cell in cells if any(map(str.isdigit, cell))]
     longest = max(map(len, [*heading.split(), *" ".join(cells).split(), *numbers]), default=0)
-    return max(longest, min(LEAST_WORDS, max(map(len, column)))) if is_words else longest
+    return (
+        max(longest, min(SENTENCE_COLUMN_WIDTH_MIN, max(map(len, column))))
+        if is_sentences
+        else longest
+    )
 
 
-def plan_lines(
-    study: Spec | SceneSpec, store: Location, workers: int | None
+def plan_rows(
+    spec: GridSpec | SceneSpec, store: Location, workers: int | None
 ) -> Iterator[tuple[str, str]]:
     """Lines, with their headings, of what a study will take."""
-    from sweep.spec import SceneSpec, Spec
-    from sweep.tasks.coverage import refuse_blind
-    from sweep.tasks.plan import plan
-    from sweep.tasks.progress import duration
-    from sweep.tasks.session import RunOptions
+    from sweep.spec import GridSpec, SceneSpec
+    from sweep.tasks.engine.progress import duration_text
+    from sweep.tasks.engine.session import RunOptions
+    from sweep.tasks.studies.flight_coverage import refuse_flight_without_hits
+    from sweep.tasks.studies.study_plan import plan_study
 
-    if isinstance(study, SceneSpec):
-        refuse_blind(study)
-    p = plan(study, store=store, workers=workers)
-    if isinstance(study, Spec):
-        shape = " x ".join(f"{count} {name}" for name, count in p.block_shape.items())
-        yield "points", f"{p.points:,}"
-        yield "blocks", f"{p.blocks:,} of at most {shape or 'the point'}"
+    if isinstance(spec, SceneSpec):
+        refuse_flight_without_hits(spec)
+    study_plan = plan_study(spec, store_path=store, n_workers=workers)
+    if isinstance(spec, GridSpec):
+        block_shape_text = " x ".join(
+            f"{count} {name}" for name, count in study_plan.block_shape.items()
+        )
+        yield "points", f"{study_plan.n_points:,}"
+        yield "blocks", f"{study_plan.n_blocks:,} of at most {block_shape_text or 'the point'}"
     else:
-        yield from _scene_lines(study, p)
-        yield "blocks", f"{p.blocks:,}"
-    yield "chunks", f"{p.chunks:,} files"
-    yield "bytes", f"{decimal(p.bytes)} before compression"
-    if why := unchecked_beamlets(study):
-        yield "not checked", why
-    if not p.scanners:
-        yield "time a point", f"{1e6 * p.seconds_a_point:.3g} us on one core"
-    bound = "at most about" if getattr(study.draws, "adaptive", False) else "about"
-    if RunOptions(workers=workers).place(study) is None:
-        yield "time", f"{bound} {duration(p.work)}, at once, without workers"
+        yield from _scene_plan_rows(spec, study_plan)
+        yield "blocks", f"{study_plan.n_blocks:,}"
+    yield "chunks", f"{study_plan.n_chunks:,} files"
+    yield "bytes", f"{decimal(study_plan.nbytes)} before compression"
+    if reason := unchecked_beamlets_reason(spec):
+        yield "not checked", reason
+    if not study_plan.scanners:
+        yield "time a point", f"{1e6 * study_plan.seconds_per_point:.3g} us on one core"
+    bound_text = "at most about" if getattr(spec.draws, "is_adaptive", False) else "about"
+    if RunOptions(workers=workers).resolve_cluster(spec) is None:
+        yield (
+            "time",
+            f"{bound_text} {duration_text(study_plan.cpu_seconds)}, at once, without workers",
+        )
     else:
-        yield "time", f"{bound} {duration(p.seconds)} on {p.workers} workers"
-    yield "memory", f"about {decimal(p.worker_memory)} a worker"
-    if why := _excess(p.points, p.bytes, p.work):
-        yield "question", f"sweep run asks first, or takes --yes: {why}"
+        yield (
+            "time",
+            f"{bound_text} {duration_text(study_plan.wall_seconds)} on {study_plan.n_workers} "
+            "workers",
+        )
+    yield "memory", f"about {decimal(study_plan.worker_bytes)} a worker"
+    if reason := _excess_text(study_plan.n_points, study_plan.nbytes, study_plan.cpu_seconds):
+        yield "question", f"sweep run asks first, or takes --yes: {reason}"
 
 
-def _scene_lines(study: SceneSpec, plan: Plan) -> Iterator[tuple[str, str]]:
+def _scene_plan_rows(spec: SceneSpec, study_plan: StudyPlan) -> Iterator[tuple[str, str]]:
     from sweep.model.accuracy import Accuracy
     from sweep.model.resolution import BEAMLETS
-    from sweep.tasks.coverage import coverage
+    from sweep.tasks.studies.flight_coverage import sample_coverage
 
-    for report in plan.reports:
+    for report in study_plan.scene_reports:
         yield "scene", report
-    if study.rays_by_tolerance:
-        parameters = study.parameters()
-        rays, most = int(parameters[BEAMLETS]), Accuracy.of(parameters).rays[-1]
-        yield "beamlets", f"{rays:,} a shot, more where it needs them, at most {most:,}"
-    for s in plan.scanners:
-        yield s.name, f"{s.cycles:,} cycles, {s.shots:,} shots, " + (
-            "eyepoints are there already" if s.is_cast
-            else f"{s.rays:,} rays at {1e6 * s.seconds_a_ray:.3g} us on one core"
-        )  # fmt: skip
-        yield "", f"{1e6 * s.seconds_a_draw:,.0f} us a shot and draw on one core"
-    seen = coverage(study)
-    for scanner in seen.scanners:
-        yield "hits", f"{scanner.name}: {scanner.text()}"
-    yield "extents", seen.extents()
-    places = math.prod(int(axis.size) for axis in study.axes)
-    yield "draws", f"{study.draws.number:,}, at {places:,} place(s) along the axes"
+    if spec.is_ray_number_set_by_tolerance:
+        parameters = spec.parameters()
+        rays_min, rays_max = int(parameters[BEAMLETS]), Accuracy.of(parameters).rays[-1]
+        yield "beamlets", f"{rays_min:,} a shot, more where it needs them, at most {rays_max:,}"
+    for scanner_plan in study_plan.scanners:
+        yield (
+            scanner_plan.name,
+            f"{scanner_plan.n_cycles:,} cycles, {scanner_plan.n_shots:,} shots, "
+            + (
+                "eyepoints are there already"
+                if scanner_plan.is_cast
+                else f"{scanner_plan.n_rays:,} rays at "
+                f"{1e6 * scanner_plan.seconds_per_ray:.3g} us on one core"
+            ),
+        )
+        yield "", f"{1e6 * scanner_plan.seconds_per_draw:,.0f} us a shot and draw on one core"
+    scene_coverage = sample_coverage(spec)
+    for scanner in scene_coverage.scanners:
+        yield "hits", f"{scanner.name}: {scanner.hits_text()}"
+    yield "extents", scene_coverage.extents_text()
+    n_axis_points = math.prod(int(axis.size) for axis in spec.axes)
+    yield "draws", f"{spec.draws.number:,}, at {n_axis_points:,} place(s) along the axes"
 
 
-def tell_effects(table: EffectsTable) -> None:
+def print_effects(table: EffectsTable) -> None:
     """Print the effects that a study simulates, where, and their costs; warn of what is off."""
-    there = [row for row in table.rows if row.bound > 0 or row.share > 0]
+    active_rows = [row for row in table.rows if row.change_bound > 0 or row.simulated_fraction > 0]
     headings = ["effect", "points", "costs", "may change", "called for"]
-    print_table("Effects", headings, [_effect_cells(row) for row in there], "called for")
-    absent = [row.name for row in table.rows if row not in there]
-    if absent:
-        tell(f"Not in this study: {', '.join(absent).replace('_', ' ')}.")
-    tell(
-        f"What is left out may change pd, log10 pfa or |X| by {table.error:.2g} at the most; "
+    print_table("Effects", headings, [_effect_cells(row) for row in active_rows], "called for")
+    absent_effects = [row.name for row in table.rows if row not in active_rows]
+    if absent_effects:
+        echo_wrapped(f"Not in this study: {', '.join(absent_effects).replace('_', ' ')}.")
+    echo_wrapped(
+        f"What is left out may change pd, log10 pfa or |X| by {table.error_bound:.2g} at the most; "
         f"the tolerance is {table.tolerance:g}."
     )
-    warn(table)
+    print_effects_warnings(table)
 
 
-def ask_before(study: Spec | SceneSpec, store: Location, *, yes: bool) -> None:
+def confirm_large_study(spec: GridSpec | SceneSpec, store: Location, *, yes: bool) -> None:
     """Ask before a study begins that is larger than most; leave where that is declined."""
-    if yes or not (why := _excess(*_size(study, store))):
+    if yes or not (excess := _excess_text(*_study_size(spec, store))):
         return
     if not (is_terminal(sys.stdin) and is_terminal(sys.stderr)):
-        click.echo(f"This study takes {why}: say --yes to begin it.", err=True)
-        sys.exit(MISTAKE)
-    click.confirm(f"This study takes {why}. Begin it?", abort=True, err=True)
+        click.echo(f"This study takes {excess}: say --yes to begin it.", err=True)
+        sys.exit(EXIT_MISTAKE)
+    click.confirm(f"This study takes {excess}. Begin it?", abort=True, err=True)
 
 
-def _size(study: Spec | SceneSpec, store: Location) -> tuple[int, int, float]:
+def _study_size(spec: GridSpec | SceneSpec, store: Location) -> tuple[int, int, float]:
     """Points and bytes of a study, and its seconds on one core where it has many draws."""
-    from sweep.spec import Spec
-    from sweep.tasks.plan import plan
-    from sweep.tasks.studies import study_of
+    from sweep.spec import GridSpec
+    from sweep.tasks.studies.study_loading import make_study
+    from sweep.tasks.studies.study_plan import plan_study
 
-    sized = study_of(study, store.absolute())
-    points, size = sized.points, sized.bytes
-    draws = max(1, study.draws.number, study.draws.limit) if isinstance(study, Spec) else 1
-    if points * draws <= MEASURED or _excess(points, size, 0.0):
-        return points, size, 0.0
-    return points, size, plan(study, store=store).work
+    computed_study = make_study(spec, store.absolute())
+    points, size_bytes = computed_study.n_points, computed_study.nbytes
+    draws = max(1, spec.draws.number, spec.draws.limit) if isinstance(spec, GridSpec) else 1
+    if points * draws <= MEASURE_TIME_ABOVE_POINT_DRAWS or _excess_text(points, size_bytes, 0.0):
+        return points, size_bytes, 0.0
+    return points, size_bytes, plan_study(spec, store_path=store).cpu_seconds
 
 
-def _excess(points: int, size: int, seconds: float) -> str:
+def _excess_text(points: int, size_bytes: int, seconds: float) -> str:
     """Sizes of a study beyond the usual, in words."""
-    from sweep.tasks.progress import duration
+    from sweep.tasks.engine.progress import duration_text
 
-    told = [f"{points:,} points"] if points > MOST_POINTS else []
-    told += [decimal(size)] if size > MOST_BYTES else []
-    told += [f"about {duration(seconds)} of one core"] if seconds > MOST_SECONDS else []
-    return ", ".join(told)
-
-
-def alarms_told(study: Spec | SceneSpec) -> str:
-    """Probability of a false alarm in a shot, in words; empty where it is not known."""
-    from sweep.spec.noise_alarms import alarms_of_study
-
-    if not (found := alarms_of_study(study)):
-        return ""
-    any_, both = (
-        " to ".join(dict.fromkeys(f"{chance:.3g}" for chance in (min(each), max(each))))
-        for each in zip(*found, strict=True)
+    excess_parts = [f"{points:,} points"] if points > ASK_ABOVE_POINTS else []
+    excess_parts += [decimal(size_bytes)] if size_bytes > ASK_ABOVE_BYTES else []
+    excess_parts += (
+        [f"about {duration_text(seconds)} of one core"] if seconds > ASK_ABOVE_CPU_SECONDS else []
     )
-    return f"in either chirp with probability {any_}, in both chirps {both}"
+    return ", ".join(excess_parts)
 
 
-def warn_of(study: Spec | SceneSpec) -> None:
+def false_alarm_text(spec: GridSpec | SceneSpec) -> str:
+    """Probability of a false alarm in a shot, in words; empty where it is not known."""
+    from sweep.spec.noise_alarms import alarm_probabilities
+
+    if not (alarms := alarm_probabilities(spec)):
+        return ""
+    either_text, both_text = (
+        " to ".join(
+            dict.fromkeys(
+                f"{probability:.3g}" for probability in (min(probabilities), max(probabilities))
+            )
+        )
+        for probabilities in zip(*alarms, strict=True)
+    )
+    return f"in either chirp with probability {either_text}, in both chirps {both_text}"
+
+
+def print_spec_warnings(spec: GridSpec | SceneSpec) -> None:
     """Warn of a beam too narrow for its aperture, of a scene and a path, of many false alarms.
 
     SceneError for a flight that sees nothing.
     """
-    from sweep.tasks.doubts import doubts_of_spec
+    from sweep.tasks.studies.study_warnings import spec_warnings
 
-    for doubt in doubts_of_spec(study):
-        tell(f"warning: {doubt}", err=True)
-    for sentence in study.unstated_errors():
-        tell(f"note: {sentence}", err=True)
+    for warning in spec_warnings(spec):
+        echo_wrapped(f"warning: {warning}", err=True)
+    for sentence in spec.unstated_error_sentences():
+        echo_wrapped(f"note: {sentence}", err=True)
 
 
-def warn_of_echoes(study: Spec | SceneSpec, store: Location) -> None:
+def print_echo_warnings(spec: GridSpec | SceneSpec, store: Location) -> None:
     """Warn of echoes that arrive after their record, and of those that are read as others."""
-    from sweep.tasks.echoes import warnings_of
-    from sweep.tasks.studies import study_of
+    from sweep.tasks.studies.echo_warnings import echo_warnings
+    from sweep.tasks.studies.study_loading import make_study
 
-    for warning in warnings_of(study_of(study, store.absolute())):
-        tell(f"warning: {warning}", err=True)
+    for warning in echo_warnings(make_study(spec, store.absolute())):
+        echo_wrapped(f"warning: {warning}", err=True)
 
 
-def effects_of(study: Spec | SceneSpec, store: Location, *, costs: bool = True) -> EffectsTable:
+def study_effects_table(
+    spec: GridSpec | SceneSpec, store: Location, *, costs: bool = True
+) -> EffectsTable:
     """Table of the effects that a study simulates, where, and their costs if asked for."""
-    from sweep.tasks.plan import effects_table
-    from sweep.tasks.studies import study_of
+    from sweep.tasks.studies.study_loading import make_study
+    from sweep.tasks.studies.study_plan import effects_table
 
-    return effects_table(study_of(study, store.absolute()), costs=costs)
+    return effects_table(make_study(spec, store.absolute()), costs=costs)
 
 
-def warn(table: EffectsTable) -> None:
+def print_effects_warnings(table: EffectsTable) -> None:
     """Say which effects are forced off though they matter."""
     for warning in table.warnings():
-        tell(f"warning: {warning}", err=True)
+        echo_wrapped(f"warning: {warning}", err=True)
 
 
 def _effect_cells(row: EffectRow) -> list[str]:
-    cost, forced = row.cost, "" if row.mode == "auto" else f" ({row.mode})"
+    cost, mode_text = row.time_fraction, "" if row.mode == "auto" else f" ({row.mode})"
     return [
-        row.name.replace("_", " ") + forced,
-        percent(row.share),
-        percent(cost, ".2g") if cost == cost else "too short to measure" if row.share else "-",
-        f"{row.bound:.2g}",
+        row.name.replace("_", " ") + mode_text,
+        percent(row.simulated_fraction),
+        percent(cost, ".2g")
+        if cost == cost
+        else "too short to measure"
+        if row.simulated_fraction
+        else "-",
+        f"{row.change_bound:.2g}",
         "nowhere, but forced on"
-        if row.bound == 0 and row.mode == "on"
+        if row.change_bound == 0 and row.mode == "on"
         else "everywhere"
-        if row.share == 1
-        else row.where or f"nowhere; most at {row.at}",
+        if row.simulated_fraction == 1
+        else row.simulated_at or f"nowhere; most at {row.largest_change_at}",
     ]
 
 
-def conclude_accuracy(store: Location, *, measured: bool) -> tuple[list[Location], bool]:
+def print_accuracy_measurement(
+    store: Location, *, has_results: bool
+) -> tuple[list[Location], bool]:
     """Print what settings came to, and draw it: the files, and whether it was not interrupted.
 
     Leaves with the exit code of what is incomplete where nothing was measured.
     """
-    if not measured:
+    if not has_results:
         click.echo("Interrupted before any point was through: nothing is kept.", err=True)
-        sys.exit(INCOMPLETE)
-    from sweep.analysis import accuracy
+        sys.exit(EXIT_INCOMPLETE)
+    from sweep.analysis import accuracy_results
 
-    dataset, settings = accuracy.opened(store)
+    dataset, settings = accuracy_results.open_accuracy_store(store)
     print_table(
         "Time a point; errors of pd (at 90 %, largest), log10 pfa, peak magnitude; leakage",
-        list(accuracy.SHORT), accuracy.short_rows(settings), "setting",
-    )  # fmt: skip
+        list(accuracy_results.SHORT_SETTING_COLUMNS),
+        accuracy_results.short_setting_rows(settings),
+        "setting",
+    )
     print_table(
         "Cheapest setting for each error",
-        list(accuracy.CHEAPEST),
-        accuracy.cheapest_rows(settings),
+        list(accuracy_results.CHEAPEST_COLUMNS),
+        accuracy_results.cheapest_rows(settings),
         "cheapest setting",
     )
-    for sentence in accuracy.sentences(dataset, settings):
-        tell(sentence)
-    return [store, *accuracy.draw(store)], dataset.attrs["stopped"] != "interrupted"
+    for sentence in accuracy_results.conclusion_sentences(dataset, settings):
+        echo_wrapped(sentence)
+    return [store, *accuracy_results.write_sheet_and_tables(store)], dataset.attrs[
+        "stopped"
+    ] != "interrupted"

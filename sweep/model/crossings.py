@@ -21,7 +21,7 @@ between two echoes may join either.
 
 import math
 
-from sweep.kernels import njit
+from sweep.kernel_cache import njit
 from sweep.model.marcum import excess_crossing, marcum_q1_pair
 
 STRETCH = 256

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sweep.kernels import njit
+from sweep.kernel_cache import njit
 from sweep.model.hoyt import ANGLES, COSINES, bin_share, hoyt_pair
 from sweep.model.marcum import marcum_q1, marcum_q1_pair
 from sweep.model.speckle_modes import ModeTable, interpolated, lean_of, modes_of

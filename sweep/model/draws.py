@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sweep.kernels import njit
+from sweep.kernel_cache import njit
 from sweep.model import philox
 from sweep.model.alarms import TAPS, noise_filter
 from sweep.model.detection import levels_of, pedestal_of_bins

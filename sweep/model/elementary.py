@@ -6,7 +6,7 @@ cycles keeps its fraction only where the product that makes it is carried in two
 
 import math
 
-from sweep.kernels import njit
+from sweep.kernel_cache import njit
 
 _TAU = 2.0 * math.pi
 # Taylor coefficients of sin(2 pi r) / r and cos(2 pi r) in r^2; |r| <= 1/8 leaves 5e-17.

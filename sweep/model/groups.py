@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sweep.kernels import njit
+from sweep.kernel_cache import njit
 from sweep.model.detection import echo_of, found_pair, levels_of, speckle_of
 from sweep.model.preparation import Shots
 from sweep.model.segments import Runs, runs_of

@@ -16,7 +16,7 @@ import math
 
 import numpy as np
 
-from sweep.kernels import njit
+from sweep.kernel_cache import njit
 from sweep.model.marcum import marcum_q1_pair
 
 ANGLES = 8

@@ -37,7 +37,7 @@ import numpy as np
 from numpy.polynomial import Chebyshev
 from scipy.interpolate import RegularGridInterpolator
 
-from sweep.kernels import njit
+from sweep.kernel_cache import njit
 from sweep.model.window import Window, samples
 
 _STEPS = 2048

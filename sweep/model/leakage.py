@@ -28,7 +28,7 @@ import math
 
 import numpy as np
 
-from sweep.kernels import njit
+from sweep.kernel_cache import njit
 from sweep.model.crossings import (
     added_crossings,
     any_crossing,

@@ -41,7 +41,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sweep.kernels import njit
+from sweep.kernel_cache import njit
 from sweep.model import philox
 from sweep.model.crossings import edge_crossing, silence
 from sweep.model.draws import Seen, seen_spectra

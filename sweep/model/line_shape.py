@@ -41,7 +41,7 @@ import numpy as np
 from numpy.polynomial.chebyshev import cheb2poly, chebfit
 from scipy.special import i0
 
-from sweep.kernels import njit
+from sweep.kernel_cache import njit
 from sweep.model.elementary import sincos_cycles
 from sweep.model.window import COSINE_SUMS, Window, samples
 

@@ -14,7 +14,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.special import gammaln
 
-from sweep.kernels import njit
+from sweep.kernel_cache import njit
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.elementary import (
     fraction_of_cycle,

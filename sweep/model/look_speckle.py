@@ -39,7 +39,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sweep.kernels import njit
+from sweep.kernel_cache import njit
 from sweep.model.marcum import marcum_q1_pair
 
 MATRIX_LOOKS_MAX = 64

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sweep.kernels import njit
+from sweep.kernel_cache import njit
 from sweep.model.elementary import exact_product
 
 _LARGEST_SERIES_PRODUCT = 30.0

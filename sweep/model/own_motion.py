@@ -29,7 +29,7 @@ du/dg = -W_perp. A target's velocity w changes v - u by (z / d.z - d).w over lev
 nothing on a surface that faces the beam, and a by -w.d'. The standard errors of range and velocity
 have these deviations, times what range and velocity change by slip and acceleration, in quadrature.
 If the truth is outside the priors, its errors are not stated: a run, a report and an export compare
-errors with standard errors, and say so (:mod:`sweep.analysis.consistency`).
+errors with standard errors, and say so (:mod:`sweep.analysis.scene_results.consistency`).
 
 The slip v - u moves a range only because it is referred to the shot's start. Ground points of
 navigation are placed where the beam meets the ground as the beats tell its range, whatever its

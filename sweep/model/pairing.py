@@ -35,7 +35,7 @@ import math
 
 import numpy as np
 
-from sweep.kernels import njit
+from sweep.kernel_cache import njit
 from sweep.model.groups import FIRST, LAST
 from sweep.model.waveform import BELOW, FOLD_PENALTY, READINGS, SIGNED
 

@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from sweep.kernels import njit
+from sweep.kernel_cache import njit
 
 # Streams, one per physical cause; of those of a segment three: up, Doppler, down. The numbers are
 # part of every stored draw: add, never change.

@@ -33,7 +33,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sweep.kernels import njit
+from sweep.kernel_cache import njit
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.footprint import beamlets, lattice_radius
 from sweep.model.ground import Footprints

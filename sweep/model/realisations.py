@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sweep.kernels import njit
+from sweep.kernel_cache import njit
 from sweep.model.effects.catalogue import DEFAULTS, SHARED
 from sweep.model.effects.effect import Effect, Realisation, Scene
 from sweep.model.ground import Plane

@@ -45,7 +45,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sweep.kernels import njit
+from sweep.kernel_cache import njit
 from sweep.model import philox, waveform
 from sweep.model.alarms import TAPS, noise_filter
 from sweep.model.constants import SPEED_OF_LIGHT

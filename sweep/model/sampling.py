@@ -12,8 +12,8 @@ compared with known probabilities, pd is exact, and the counts sample it.
 
 Drawing until the promise is kept goes in rounds over all points that are still open. A test stops
 sooner, on the average, if the draws happen to vary little. This costs coverage and adds bias:
-:func:`looks` looks seldom enough for both to be small. ``benchmarks/stopping.py`` measures them.
-Looks come at the same numbers of draws for every point, and what a point has drawn depends on
+:func:`looks` looks seldom enough for both to be small. ``benchmarks/stopping_rule.py`` measures
+them. Looks come at the same numbers of draws for every point, and what a point has drawn depends on
 nothing but its own draws: other points, blocks and workers change no bit of it. A detector sees the
 draws of one point and segment together, in pieces that depend on the FFT size and on numbers of
 draws alone.

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from sweep.kernels import njit
+from sweep.kernel_cache import njit
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.crossings import any_crossing, leave_out_joined
 from sweep.model.detection import echo_of, found_pair, levels_of, speckle_of

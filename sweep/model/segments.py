@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sweep.kernels import njit
+from sweep.kernel_cache import njit
 from sweep.model import line_shape
 from sweep.model.crossings import MOST_TERMS, any_crossing, crossing_series, leave_out_joined
 from sweep.model.detection import (

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from sweep.kernels import njit
+from sweep.kernel_cache import njit
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

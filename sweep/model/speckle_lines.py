@@ -41,7 +41,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy import special
 
-from sweep.kernels import njit
+from sweep.kernel_cache import njit
 from sweep.model import philox
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.footprint import gaussian_rule

@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sweep.kernels import njit
+from sweep.kernel_cache import njit
 from sweep.model.detectors import main_lobe
 from sweep.model.speckle_correlation import window_transform
 from sweep.model.window import COSINE_SUMS, Window, window

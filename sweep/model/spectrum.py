@@ -17,7 +17,7 @@ import math
 
 import numpy as np
 
-from sweep.kernels import njit
+from sweep.kernel_cache import njit
 from sweep.model.detection import mark
 from sweep.model.elementary import sincos_cycles
 from sweep.model.line_shape import CELLS, KERNEL_BASIS, KERNEL_DEGREE, POINTS, SPARE_CELLS

@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from sweep.kernels import njit
+from sweep.kernel_cache import njit
 from sweep.model import alarms, waveform
 from sweep.model.detection import BinLevels, found_pair, levels_of, speckle_of
 from sweep.model.marcum import marcum_q1_pair

@@ -9,7 +9,7 @@ import numpy as np
 from sweep.model.eyepoints import Eyepoints
 from sweep.model.outputs import BEAMLETS, SHOTS
 
-_FIELDS = {
+_FIELD_OF_ARRAY = {
     "time": "time",
     "beam": "beam",
     "shot_cycle": "cycle",
@@ -28,29 +28,29 @@ _FIELDS = {
 """Field of :class:`Eyepoints` that each array holds."""
 
 
-def to_arrays(eyepoints: Eyepoints) -> dict[str, np.ndarray]:
+def eyepoints_to_arrays(eyepoints: Eyepoints) -> dict[str, np.ndarray]:
     """Arrays SHOTS and BEAMLETS of n shots of b beamlets, in the types of the store."""
-    stored = {**SHOTS, **BEAMLETS}
+    outputs = {**SHOTS, **BEAMLETS}
     arrays = {
-        name: np.asarray(getattr(eyepoints, field), stored[name].dtype)
-        for name, field in _FIELDS.items()
+        name: np.asarray(getattr(eyepoints, field), outputs[name].dtype)
+        for name, field in _FIELD_OF_ARRAY.items()
     }
     shots = np.arange(len(eyepoints.time))
     arrays["beam_surface"] = arrays["surface"][shots, eyepoints.reference]
     return arrays
 
 
-def from_arrays(arrays: Mapping[str, np.ndarray], weight: np.ndarray) -> Eyepoints:
+def eyepoints_from_arrays(arrays: Mapping[str, np.ndarray], weight: np.ndarray) -> Eyepoints:
     """Eyepoints of stored arrays and power fractions (b,); ValueError for unlike shapes."""
-    if missing := sorted(_FIELDS.keys() - arrays.keys()):
+    if missing := sorted(_FIELD_OF_ARRAY.keys() - arrays.keys()):
         raise ValueError(f"eyepoints lack {', '.join(missing)}")
-    fields = {field: np.asarray(arrays[name]) for name, field in _FIELDS.items()}
+    fields = {field: np.asarray(arrays[name]) for name, field in _FIELD_OF_ARRAY.items()}
     fields["beam"] = fields["beam"].astype(np.int64)
     fields["cycle"] = fields["cycle"].astype(np.int64)
     weight = np.asarray(weight, float)
-    for name, field in _FIELDS.items():
-        trailing = {1: (), 2: (3,)}[len(SHOTS[name].dims)] if name in SHOTS else weight.shape
-        expected = (fields["time"].size, *trailing)
-        if fields[field].shape != expected:
-            raise ValueError(f"{name} has shape {fields[field].shape}, not {expected}")
+    for name, field in _FIELD_OF_ARRAY.items():
+        trailing_shape = {1: (), 2: (3,)}[len(SHOTS[name].dims)] if name in SHOTS else weight.shape
+        expected_shape = (fields["time"].size, *trailing_shape)
+        if fields[field].shape != expected_shape:
+            raise ValueError(f"{name} has shape {fields[field].shape}, not {expected_shape}")
     return Eyepoints(**fields, weight=weight)

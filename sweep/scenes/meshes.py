@@ -17,14 +17,14 @@ from numpy.typing import ArrayLike
 
 from sweep.model.geometry.mesh import Mesh, normals, require_shapes, round_centre
 from sweep.model.geometry.quaternion import about, rotate
-from sweep.scenes.files import SceneError, existing, read_companion, require_memory
 from sweep.scenes.polygon_files import POLYGON_FORMATS, read_polygons
 from sweep.scenes.polygons import triangulate
+from sweep.scenes.scene_files import SceneError, read_companion, require_file, require_memory
 from sweep.units import QuantityError, read_unit
 
-UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+IDENTITY_QUATERNION = (1.0, 0.0, 0.0, 0.0)
 
-_CLEAR = 1e-12
+_AREA_ROUNDING = 1e-12
 """Normal over the product of two edges above which no rounding can have made it."""
 
 _Y_UP_FORMATS = {".glb", ".gltf"}
@@ -39,13 +39,13 @@ MESH_FORMATS = (".stl", ".obj", ".ply", ".off", ".gltf", ".glb")
 COORDINATE_MAX = 1e9
 """Largest distance of a vertex from zero along any axis [m]; beyond, squares overflow."""
 
-_PACKAGES = {"mapbox_earcut", "plyfile", "trimesh"}
+_MESH_PACKAGES = {"mapbox_earcut", "plyfile", "trimesh"}
 """Packages of the extra `scenes` that reading a mesh takes."""
 
 FACES_MAX = 100_000_000
 """Most triangles of one mesh file."""
 
-_MEMORY_FACTOR = {".obj": 40, ".off": 40, ".ply": 20, ".stl": 8, ".gltf": 20, ".glb": 20}
+_MEMORY_PER_FILE_BYTE = {".obj": 40, ".off": 40, ".ply": 20, ".stl": 8, ".gltf": 20, ".glb": 20}
 """Memory that reading and preparing a mesh takes at most, over the size of its file."""
 
 
@@ -68,7 +68,7 @@ class Facets:
     is_grid: bool = False
 
     @classmethod
-    def of(
+    def on_one_surface(
         cls,
         vertices: np.ndarray,
         faces: np.ndarray,
@@ -85,45 +85,51 @@ class Facets:
             np.asarray(origin, float),
         )
 
-    def placed(
-        self, *, rotation: Sequence[float] | np.ndarray = UPRIGHT, scale: float = 1.0
+    def transform(
+        self, *, rotation: Sequence[float] | np.ndarray = IDENTITY_QUATERNION, scale: float = 1.0
     ) -> Facets:
         """Facets scaled, then turned about their origin by a unit quaternion (w, x, y, z)."""
         return replace(self, vertices=rotate(np.asarray(rotation, float), self.vertices * scale))
 
-    def mesh(self) -> tuple[Mesh, Report]:
+    def to_mesh(self) -> tuple[Mesh, MeshReport]:
         """Mesh fit to be cast at, in the world frame, and what was done to make it so."""
         with np.errstate(invalid="ignore"):
-            far = np.abs(self.vertices) > COORDINATE_MAX
-        if far.any():
-            place = self.vertices[far][0]
+            is_too_far = np.abs(self.vertices) > COORDINATE_MAX
+        if is_too_far.any():
+            far_vertex = self.vertices[is_too_far][0]
             raise ValueError(
-                f"a vertex lies at {place:.3g} m, farther than {COORDINATE_MAX:.0e} m from zero"
+                f"a vertex lies at {far_vertex:.3g} m, farther than {COORDINATE_MAX:.0e} m from "
+                "zero"
             )
         if self.is_grid:
             _require_faces(len(self.faces), len(self.faces))
             centre = round_centre(self.vertices)
             mesh = Mesh(self.vertices - centre, self.faces, self.surface, centre + self.origin)
-            return mesh, Report(len(self.vertices), len(self.faces), notes=self.notes)
-        mesh, report = clean(self.vertices, self.faces, self.surface)
+            return mesh, MeshReport(len(self.vertices), len(self.faces), notes=self.notes)
+        mesh, report = clean_mesh(self.vertices, self.faces, self.surface)
         report = replace(report, notes=self.notes)
         return replace(mesh, origin=mesh.origin + self.origin), report
 
 
-def join(parts: Sequence[Facets]) -> Facets:
+def join_facets(facets_list: Sequence[Facets]) -> Facets:
     """All parts, one at least, as one, relative to the first one's origin."""
-    origin = parts[0].origin
-    shifts = np.cumsum([0, *(len(part.vertices) for part in parts)])[:-1]
+    origin = facets_list[0].origin
+    index_shifts = np.cumsum([0, *(len(facets.vertices) for facets in facets_list)])[:-1]
     return Facets(
-        np.concatenate([part.vertices + (part.origin - origin) for part in parts]),
-        np.concatenate([part.faces + shift for part, shift in zip(parts, shifts, strict=True)]),
-        np.concatenate([part.surface for part in parts]),
+        np.concatenate([facets.vertices + (facets.origin - origin) for facets in facets_list]),
+        np.concatenate(
+            [
+                facets.faces + index_shift
+                for facets, index_shift in zip(facets_list, index_shifts, strict=True)
+            ]
+        ),
+        np.concatenate([facets.surface for facets in facets_list]),
         origin,
-        tuple(note for part in parts for note in part.notes),
+        tuple(note for facets in facets_list for note in facets.notes),
     )
 
 
-_MENDED = {
+_REPAIR_TEXTS = {
     "non_finite": "{} faces without data dropped",
     "degenerate": "{} faces without area dropped",
     "duplicate": "{} duplicate faces dropped",
@@ -134,11 +140,11 @@ _MENDED = {
 
 
 @dataclass(frozen=True)
-class Report:
+class MeshReport:
     """Counts of facets that `clean` was given, found and mended."""
 
-    vertices: int
-    faces: int
+    n_vertices: int
+    n_faces: int
     non_finite: int = 0
     degenerate: int = 0  # corners that are one, or in line
     duplicate: int = 0  # in whatever winding
@@ -146,15 +152,17 @@ class Report:
     unreferenced: int = 0
     notes: tuple[str, ...] = ()  # what was done as they were read
 
-    def text(self) -> str:
+    def summary(self) -> str:
         """One line for people: what was given, and of the rest what is not zero."""
-        counts = [(words, getattr(self, name)) for name, words in _MENDED.items()]
-        said = [words.format(count) for words, count in counts if count]
-        given = f"{self.faces:,} faces on {self.vertices:,} vertices"
-        return "; ".join([given, *self.notes, *(said or ["nothing to mend"])])
+        counts = [(template, getattr(self, name)) for name, template in _REPAIR_TEXTS.items()]
+        repairs = [template.format(count) for template, count in counts if count]
+        input_text = f"{self.n_faces:,} faces on {self.n_vertices:,} vertices"
+        return "; ".join([input_text, *self.notes, *(repairs or ["nothing to mend"])])
 
 
-def clean(vertices: ArrayLike, faces: ArrayLike, surface: ArrayLike) -> tuple[Mesh, Report]:
+def clean_mesh(
+    vertices: ArrayLike, faces: ArrayLike, surface: ArrayLike
+) -> tuple[Mesh, MeshReport]:
     """Mesh fit to be cast at, and what was done to make it so.
 
     Faces without data, without area or given twice are dropped, coincident vertices merged,
@@ -165,50 +173,58 @@ def clean(vertices: ArrayLike, faces: ArrayLike, surface: ArrayLike) -> tuple[Me
     ValueError where the arrays' shapes do not fit, a face names a vertex that does not exist,
     or no face is left.
     """
-    points, corners = np.array(vertices, dtype=np.float64), np.asarray(faces)
-    kinds = np.full(len(corners), surface) if np.ndim(surface) == 0 else np.asarray(surface)
-    require_shapes(points, corners, kinds)
-    n_vertices, n_faces = len(points), len(corners)
-    has_data = np.isfinite(points)[corners].all(axis=(1, 2))
-    corners, kinds = corners[has_data], kinds[has_data]
-    _require_faces(len(corners), len(has_data))
-    used = np.unique(corners)
-    points = points[used] + 0.0  # -0 and 0 are one place
-    kept, place = _distinct(points)
-    corners, merged = place[np.searchsorted(used, corners)], len(used) - len(kept)
-    points = points[kept]
-    origin = round_centre(points)
-    points -= origin
-    has_area = np.flatnonzero(_have_area(points, corners))
-    first = has_area[_distinct(np.sort(corners[has_area], axis=1))[0]]
-    _require_faces(len(first), len(has_data))
-    kept = np.unique(corners[first])
-    mesh = Mesh(points[kept], np.searchsorted(kept, corners[first]), kinds[first], origin)
-    return mesh, Report(
-        vertices=n_vertices,
-        faces=n_faces,
+    positions, face_corners = np.array(vertices, dtype=np.float64), np.asarray(faces)
+    surfaces = np.full(len(face_corners), surface) if np.ndim(surface) == 0 else np.asarray(surface)
+    require_shapes(positions, face_corners, surfaces)
+    n_vertices, n_faces = len(positions), len(face_corners)
+    has_data = np.isfinite(positions)[face_corners].all(axis=(1, 2))
+    face_corners, surfaces = face_corners[has_data], surfaces[has_data]
+    _require_faces(len(face_corners), len(has_data))
+    used = np.unique(face_corners)
+    positions = positions[used] + 0.0  # -0 and 0 are one place
+    kept_vertices, index_in_kept = _distinct_rows(positions)
+    face_corners, merged = (
+        index_in_kept[np.searchsorted(used, face_corners)],
+        len(used) - len(kept_vertices),
+    )
+    positions = positions[kept_vertices]
+    origin = round_centre(positions)
+    positions -= origin
+    has_area = np.flatnonzero(_have_area(positions, face_corners))
+    kept_faces = has_area[_distinct_rows(np.sort(face_corners[has_area], axis=1))[0]]
+    _require_faces(len(kept_faces), len(has_data))
+    kept_vertices = np.unique(face_corners[kept_faces])
+    mesh = Mesh(
+        positions[kept_vertices],
+        np.searchsorted(kept_vertices, face_corners[kept_faces]),
+        surfaces[kept_faces],
+        origin,
+    )
+    return mesh, MeshReport(
+        n_vertices=n_vertices,
+        n_faces=n_faces,
         non_finite=int((~has_data).sum()),
-        degenerate=len(corners) - len(has_area),
-        duplicate=len(has_area) - len(first),
+        degenerate=len(face_corners) - len(has_area),
+        duplicate=len(has_area) - len(kept_faces),
         merged=merged,
-        unreferenced=n_vertices - merged - len(kept),
+        unreferenced=n_vertices - merged - len(kept_vertices),
     )
 
 
-def _require_faces(left: int, given: int) -> None:
-    if left == 0:
-        raise ValueError(f"of {given} faces none is left that a ray could hit")
+def _require_faces(n_left: int, n_given: int) -> None:
+    if n_left == 0:
+        raise ValueError(f"of {n_given} faces none is left that a ray could hit")
 
 
-def _distinct(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _distinct_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rows that repeat no earlier one, by index, rising; and the place of every row among them."""
     order = np.lexsort(rows.T)  # stable: the first of those alike is the first given
     is_new = np.ones(len(rows), dtype=bool)
     is_new[1:] = (np.diff(rows[order], axis=0) != 0).any(axis=1)
     kept = np.sort(order[is_new])
-    place = np.empty(len(rows), dtype=np.int64)
-    place[order] = np.searchsorted(kept, order[is_new])[np.cumsum(is_new) - 1]
-    return kept, place
+    index_in_kept = np.empty(len(rows), dtype=np.int64)
+    index_in_kept[order] = np.searchsorted(kept, order[is_new])[np.cumsum(is_new) - 1]
+    return kept, index_in_kept
 
 
 def _have_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -216,10 +232,10 @@ def _have_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     b, c = b - a, c - a
     longest = np.abs(b).max(axis=1) * np.abs(c).max(axis=1)
-    has_area = np.asarray(np.abs(np.cross(b, c)).max(axis=1) > _CLEAR * longest)
-    doubtful = np.flatnonzero(~has_area)
-    exact, _ = normals(vertices[faces[doubtful]].transpose(1, 2, 0))
-    has_area[doubtful] = exact.any(axis=0)
+    has_area = np.asarray(np.abs(np.cross(b, c)).max(axis=1) > _AREA_ROUNDING * longest)
+    doubtful_faces = np.flatnonzero(~has_area)
+    exact_normals, _ = normals(vertices[faces[doubtful_faces]].transpose(1, 2, 0))
+    has_area[doubtful_faces] = exact_normals.any(axis=0)
     return has_area
 
 
@@ -233,40 +249,47 @@ def read_mesh(
     others. SceneError for a file that is missing, can not be loaded or holds no triangles, a
     polygon without a surface of its own, or an unknown unit.
     """
-    path = existing(path)
+    path = require_file(path)
     suffix = path.suffix.lower()
     if suffix not in MESH_FORMATS:
         formats = ", ".join(MESH_FORMATS)
         raise SceneError(path, f"is no mesh of a format that is read ({formats})", "export to one")
-    needed = _MEMORY_FACTOR[suffix] * path.stat().st_size
-    require_memory(path, needed, "reduce the mesh, or cut a part out of it")
+    bytes_needed = _MEMORY_PER_FILE_BYTE[suffix] * path.stat().st_size
+    require_memory(path, bytes_needed, "reduce the mesh, or cut a part out of it")
     try:
         reader = _read_polygon_file if suffix in POLYGON_FORMATS else _read_triangle_file
-        parts, stated = reader(path)
+        parts, file_unit = reader(path)
     except SceneError:
         raise
     except ImportError as error:
-        if (error.name or "").partition(".")[0] in _PACKAGES:
+        if (error.name or "").partition(".")[0] in _MESH_PACKAGES:
             raise
         remedy = "install what it asks for, or export to OBJ, PLY, STL or plain glTF"
         raise SceneError(path, f"needs another package ({error})", remedy) from None
     except Exception as error:  # parsers of several formats fail in as many ways
-        rule, remedy = f"is no mesh that can be read ({error})", "check it, or export it again"
-        raise SceneError(path, rule, remedy) from None
+        problem, remedy = f"is no mesh that can be read ({error})", "check it, or export it again"
+        raise SceneError(path, problem, remedy) from None
     if not parts:
         raise SceneError(path, "holds no triangles", "export a triangle mesh, not points or curves")
-    y_up = suffix in _Y_UP_FORMATS if up is None else up == "y"
-    rotation = about(0, math.pi / 2) if y_up else UPRIGHT
-    return join(parts).placed(rotation=rotation, scale=scale * _metres(path, unit or stated))
+    is_y_up = suffix in _Y_UP_FORMATS if up is None else up == "y"
+    rotation = about(0, math.pi / 2) if is_y_up else IDENTITY_QUATERNION
+    return join_facets(parts).transform(
+        rotation=rotation, scale=scale * _metres_per_unit(path, unit or file_unit)
+    )
 
 
 def _read_polygon_file(path: Path) -> tuple[list[Facets], str | None]:
     """Facets of a file of polygons, in the file's frame and unit, which it does not state."""
     polygons = read_polygons(path)
-    cut = triangulate(polygons)
-    if not len(cut.faces):
+    triangulation = triangulate(polygons)
+    if not len(triangulation.faces):
         return [], None
-    return [replace(Facets.of(polygons.vertices, cut.faces), notes=cut.notes())], None
+    return [
+        replace(
+            Facets.on_one_surface(polygons.vertices, triangulation.faces),
+            notes=triangulation.notes(),
+        )
+    ], None
 
 
 def _read_triangle_file(path: Path) -> tuple[list[Facets], str | None]:
@@ -281,23 +304,23 @@ def _read_triangle_file(path: Path) -> tuple[list[Facets], str | None]:
         scene: Any = trimesh.load_scene(
             file,
             file_type=path.suffix.lower()[1:],
-            resolver=_companions_of(path),
+            resolver=_companion_resolver(path),
             process=False,
             skip_materials=True,  # nothing is seen of textures, which can be of any size
         )
     nodes = sorted(scene.graph.nodes_geometry)
     faces = [len(getattr(scene.geometry[scene.graph[node][1]], "faces", ())) for node in nodes]
     if sum(faces) > FACES_MAX:
-        rule = f"places its meshes so often that they make {sum(faces):,} triangles"
-        raise SceneError(path, rule, f"keep it below {FACES_MAX:.0e}")
-    return [part for node in nodes for part in _parts(scene, node)], scene.units
+        problem = f"places its meshes so often that they make {sum(faces):,} triangles"
+        raise SceneError(path, problem, f"keep it below {FACES_MAX:.0e}")
+    return [part for node in nodes for part in _iter_node_facets(scene, node)], scene.units
 
 
-def _companions_of(path: Path) -> Any:
+def _companion_resolver(path: Path) -> Any:
     """Trimesh's resolver of the names in a file, which serves plain files beside it alone."""
     from trimesh.resolvers import Resolver
 
-    class PlainFiles(Resolver):  # type: ignore[misc]
+    class CompanionResolver(Resolver):  # type: ignore[misc]
         """Files that a mesh names."""
 
         def __init__(self) -> None:
@@ -311,7 +334,7 @@ def _companions_of(path: Path) -> Any:
             """Refuse to write: the files that a mesh names are read alone."""
             raise PermissionError(f"{name}: a mesh's files are not written")
 
-        def namespaced(self, namespace: str) -> PlainFiles:
+        def namespaced(self, namespace: str) -> CompanionResolver:
             """Return the same resolver, for names below a folder are none of a glTF's."""
             return self
 
@@ -319,35 +342,35 @@ def _companions_of(path: Path) -> Any:
             """Names that are listed: none."""
             return []
 
-    return PlainFiles()
+    return CompanionResolver()
 
 
 _STL_HEADER = struct.Struct("<80sI")
 _STL_TRIANGLE_BYTES = 50
-_TEXT_BYTES = 1000
+_STL_PROBE_BYTES = 1000
 """Bytes at the beginning of an STL that tell text from numbers."""
 
 
 def _check_stl(path: Path) -> None:
     """Refuse a binary STL whose size is not that of its triangles; text has no zero bytes."""
     with path.open("rb") as file:
-        start = file.read(_TEXT_BYTES)
-    if b"\0" not in start and re.search(rb"^\W*solid|\bfacet\b", start, re.I):
+        first_bytes = file.read(_STL_PROBE_BYTES)
+    if b"\0" not in first_bytes and re.search(rb"^\W*solid|\bfacet\b", first_bytes, re.I):
         return
-    head = start[: _STL_HEADER.size]
-    if len(head) < _STL_HEADER.size:
-        raise ValueError(f"it has {len(head)} bytes, and a binary STL has 84 or more")
-    count, size = _STL_HEADER.unpack(head)[1], path.stat().st_size
-    needed = _STL_HEADER.size + _STL_TRIANGLE_BYTES * count
-    if size != needed:
+    header = first_bytes[: _STL_HEADER.size]
+    if len(header) < _STL_HEADER.size:
+        raise ValueError(f"it has {len(header)} bytes, and a binary STL has 84 or more")
+    count, size = _STL_HEADER.unpack(header)[1], path.stat().st_size
+    bytes_needed = _STL_HEADER.size + _STL_TRIANGLE_BYTES * count
+    if size != bytes_needed:
         raise ValueError(
-            f"its header counts {count:,} triangles, which take {needed:,} bytes, and it has "
-            f"{size:,}{': it is cut off' if size < needed else ''}"
+            f"its header counts {count:,} triangles, which take {bytes_needed:,} bytes, and it has "
+            f"{size:,}{': it is cut off' if size < bytes_needed else ''}"
         )
 
 
 _GLB_HEADER = struct.Struct("<4sIIII")
-_ACCESSOR_BYTES = 64
+_ACCESSOR_ELEMENT_BYTES_MAX = 64
 """Most bytes of an element of an accessor: a matrix of 16 floats."""
 
 
@@ -365,18 +388,18 @@ def _check_gltf(path: Path) -> None:
     accessors = document.get("accessors", []) if isinstance(document, dict) else None
     if accessors is None:
         raise ValueError("it is no JSON object")
-    buffers = sum(int(buffer["byteLength"]) for buffer in document.get("buffers", []))
+    buffer_bytes = sum(int(buffer["byteLength"]) for buffer in document.get("buffers", []))
     counts = [int(accessor["count"]) for accessor in accessors]
     if min(counts, default=0) < 0:
         raise ValueError(f"it declares an array of {min(counts):,} elements")
-    elements = sum(counts)
-    if elements > max(buffers, 1):
-        raise ValueError(f"its arrays have {elements:,} elements in {buffers:,} bytes")
+    n_elements = sum(counts)
+    if n_elements > max(buffer_bytes, 1):
+        raise ValueError(f"its arrays have {n_elements:,} elements in {buffer_bytes:,} bytes")
     remedy = "reduce the mesh, or cut a part out of it"
-    require_memory(path, elements * _ACCESSOR_BYTES + buffers, remedy)
+    require_memory(path, n_elements * _ACCESSOR_ELEMENT_BYTES_MAX + buffer_bytes, remedy)
 
 
-def _parts(scene: Any, node: str) -> Iterator[Facets]:
+def _iter_node_facets(scene: Any, node: str) -> Iterator[Facets]:
     """Facets of one mesh of a file, in the file's frame; none of points and curves."""
     matrix, name = scene.graph[node]
     mesh = scene.geometry[name]
@@ -386,10 +409,10 @@ def _parts(scene: Any, node: str) -> Iterator[Facets]:
     faces = np.asarray(mesh.faces, np.int64)
     if np.linalg.det(matrix[:3, :3]) < 0:
         faces = faces[:, ::-1]  # a mirrored part is inside out
-    yield Facets.of(vertices, faces)
+    yield Facets.on_one_surface(vertices, faces)
 
 
-def _metres(path: Path, unit: str | None) -> float:
+def _metres_per_unit(path: Path, unit: str | None) -> float:
     """Metres of a unit of length; 1 where none is stated."""
     if unit is None:
         return 1.0
@@ -399,15 +422,15 @@ def _metres(path: Path, unit: str | None) -> float:
         raise SceneError(path, f"has lengths in '{unit}' ({error})", "state a unit") from None
 
 
-def sphere(*, radius: float, subdivisions: int) -> Facets:
+def sphere_facets(*, radius: float, subdivisions: int) -> Facets:
     """Return a refined icosahedron of 20 * 4^subdivisions faces, with its corners on the sphere."""
     import trimesh
 
-    ball = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
-    return Facets.of(np.asarray(ball.vertices), np.asarray(ball.faces))
+    icosphere = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
+    return Facets.on_one_surface(np.asarray(icosphere.vertices), np.asarray(icosphere.faces))
 
 
-def box(*, size: Sequence[float]) -> Facets:
+def box_facets(*, size: Sequence[float]) -> Facets:
     """Return a box of 12 facets, facing outwards, of these lengths along x, y and z [m]."""
     corners = np.array(list(itertools.product((-0.5, 0.5), repeat=3))) * size
     faces = []
@@ -416,4 +439,4 @@ def box(*, size: Sequence[float]) -> Facets:
         first = (4 >> axis) * side
         a, b, c, d = first, first + far, first + far + near, first + near
         faces += [(a, b, c), (a, c, d)] if side else [(a, c, b), (a, d, c)]
-    return Facets.of(corners, np.array(faces))
+    return Facets.on_one_surface(corners, np.array(faces))

@@ -11,7 +11,7 @@ import numpy as np
 
 from sweep.scenes.polygons import Polygons
 
-_INDICES = ("vertex_indices", "vertex_index")
+_INDEX_PROPERTIES = ("vertex_indices", "vertex_index")
 """Names that writers of PLY give to the corners of a face."""
 
 
@@ -20,7 +20,7 @@ def read_polygons(path: Path) -> Polygons:
     return _READERS[path.suffix.lower()](path)
 
 
-def _polygons(vertices: Any, faces: list[list[int]]) -> Polygons:
+def _make_polygons(vertices: Any, faces: list[list[int]]) -> Polygons:
     counts = np.array([len(face) for face in faces], np.int64)
     corners = np.array([corner for face in faces for corner in face], np.int64)
     return Polygons(np.asarray(vertices, float).reshape(-1, 3), corners, counts)
@@ -30,25 +30,25 @@ def _read_obj(path: Path) -> Polygons:
     """Polygons of a Wavefront OBJ. Materials and textures are not looked for."""
     vertices: list[list[float]] = []
     faces: list[list[int]] = []
-    for number, words in _lines(path, continued="\\"):
+    for number, words in _iter_lines(path, continuation_mark="\\"):
         try:
             if words[0] == "v":
                 x, y, z = words[1:4]
                 vertices.append([float(x), float(y), float(z)])
             elif words[0] == "f":
-                at = [int(word.partition("/")[0]) for word in words[1:]]
-                if not at or 0 in at:
+                indices = [int(word.partition("/")[0]) for word in words[1:]]
+                if not indices or 0 in indices:
                     raise ValueError("a face names vertices from 1")
                 # Below 0 an index counts back from the last vertex so far.
-                faces.append([k - 1 if k > 0 else len(vertices) + k for k in at])
+                faces.append([k - 1 if k > 0 else len(vertices) + k for k in indices])
         except ValueError as error:
             raise ValueError(f"line {number}: {error}") from None
-    return _polygons(vertices, faces)
+    return _make_polygons(vertices, faces)
 
 
 def _read_off(path: Path) -> Polygons:
     """Polygons of an OFF file; colours, normals and texture coordinates are passed over."""
-    lines = _lines(path)
+    lines = _iter_lines(path)
     number, words = next(lines, (1, [""]))
     heading = words[0].upper()
     if not heading.endswith("OFF") or heading.startswith(("4", "N4")) or "BINARY" in words:
@@ -60,10 +60,11 @@ def _read_off(path: Path) -> Polygons:
             raise ValueError(f"it declares {n_vertices:,} vertices and {n_faces:,} faces")
         # Normals and colours follow the position; texture coordinates too, in most files.
         vertices = [
-            [float(word) for word in line[:3]] for _, line in _next(lines, n_vertices, "vertices")
+            [float(word) for word in line[:3]]
+            for _, line in _take_lines(lines, n_vertices, "vertices")
         ]
         faces = []
-        for _, line in _next(lines, n_faces, "faces"):
+        for _, line in _take_lines(lines, n_faces, "faces"):
             count = int(line[0])
             corners = [int(word) for word in line[1 : 1 + count]]
             if count < 1 or len(corners) < count:
@@ -73,30 +74,30 @@ def _read_off(path: Path) -> Polygons:
             raise ValueError("a vertex has fewer than three coordinates")
     except IndexError:
         raise ValueError("its numbers of vertices and faces are missing") from None
-    return _polygons(vertices, faces)
+    return _make_polygons(vertices, faces)
 
 
-def _next(
-    lines: Iterator[tuple[int, list[str]]], number: int, kind: str
+def _take_lines(
+    lines: Iterator[tuple[int, list[str]]], number: int, element_name: str
 ) -> Iterator[tuple[int, list[str]]]:
     """So many further lines."""
     for k in range(number):
         line = next(lines, None)
         if line is None:
-            raise ValueError(f"it ends after {k:,} of {number:,} {kind}")
+            raise ValueError(f"it ends after {k:,} of {number:,} {element_name}")
         yield line
 
 
-def _lines(path: Path, continued: str = "") -> Iterator[tuple[int, list[str]]]:
+def _iter_lines(path: Path, continuation_mark: str = "") -> Iterator[tuple[int, list[str]]]:
     """Words of the lines that say something, with their numbers; '#' begins a comment."""
-    whole = ""
+    continued_text = ""
     with path.open(encoding="utf-8", errors="replace") as file:
         for number, line in enumerate(file, 1):
-            text = whole + line.partition("#")[0].rstrip()
-            if continued and text.endswith(continued):
-                whole = text[:-1] + " "
+            text = continued_text + line.partition("#")[0].rstrip()
+            if continuation_mark and text.endswith(continuation_mark):
+                continued_text = text[:-1] + " "
                 continue
-            whole = ""
+            continued_text = ""
             if words := text.split():
                 yield number, words
 
@@ -105,10 +106,10 @@ def _read_ply(path: Path) -> Polygons:
     """Polygons of a PLY file, ASCII or binary of either byte order."""
     from plyfile import PlyData, PlyElementParseError
 
-    _require_rows(path)
+    _check_ply_row_counts(path)
     data: Any
     try:  # faces that are all of three corners are read many times faster
-        triangles = {"face": dict.fromkeys(_INDICES, 3)}
+        triangles = {"face": dict.fromkeys(_INDEX_PROPERTIES, 3)}
         data = PlyData.read(str(path), mmap="c", known_list_len=triangles)
     except PlyElementParseError:
         data = PlyData.read(str(path), mmap="c")
@@ -116,11 +117,11 @@ def _read_ply(path: Path) -> Polygons:
     if "vertex" not in names:
         raise ValueError("it has no element 'vertex'")
     if "face" not in names:
-        return _polygons([], [])
-    lists = [p.name for p in data["face"].properties if p.name in _INDICES]
-    if not lists:
-        raise ValueError(f"its faces have none of the properties {', '.join(_INDICES)}")
-    vertex, indices = data["vertex"], data["face"].data[lists[0]]
+        return _make_polygons([], [])
+    index_properties = [p.name for p in data["face"].properties if p.name in _INDEX_PROPERTIES]
+    if not index_properties:
+        raise ValueError(f"its faces have none of the properties {', '.join(_INDEX_PROPERTIES)}")
+    vertex, indices = data["vertex"], data["face"].data[index_properties[0]]
     vertices = np.stack([np.asarray(vertex[axis], float) for axis in "xyz"], axis=1)
     if indices.dtype != object:
         corners = np.array(indices, np.int64)
@@ -131,18 +132,22 @@ def _read_ply(path: Path) -> Polygons:
 
 
 _HEADER_BYTES_MAX = 1 << 20
-_WHOLE = re.compile(rb"[-+]?\d{1,4000}")
+_INTEGER_PATTERN = re.compile(rb"[-+]?\d{1,4000}")
 
 
-def _require_rows(path: Path) -> None:
+def _check_ply_row_counts(path: Path) -> None:
     """Refuse a header that declares fewer rows than none, or more than the file has bytes."""
     size = path.stat().st_size
     with path.open("rb") as file:
-        header, found, _ = file.read(_HEADER_BYTES_MAX).partition(b"end_header")
-    if not found:
+        header, end_mark, _ = file.read(_HEADER_BYTES_MAX).partition(b"end_header")
+    if not end_mark:
         raise ValueError("its header does not end")
     words = [line.split() for line in header.splitlines() if line.startswith(b"element")]
-    counts = [(w[1], int(w[2])) for w in words if len(w) == 3 and _WHOLE.fullmatch(w[2])]
+    counts = [
+        (element_words[1], int(element_words[2]))
+        for element_words in words
+        if len(element_words) == 3 and _INTEGER_PATTERN.fullmatch(element_words[2])
+    ]
     for name, count in counts:
         if count < 0:
             raise ValueError(

@@ -18,16 +18,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import fft
 
-from sweep.scenes.maps import MapFrame
+from sweep.scenes.map_frames import MapFrame
 from sweep.scenes.meshes import Facets
 
-_NEGLIGIBLE = 1e-6
+_NEGATIVE_VARIANCE_MAX = 1e-6
 """Share of the variance that may be missing where rounding makes a spectrum negative."""
 
-_AT_ONCE = 1 << 20
+_NODES_PER_BATCH = 1 << 20
 """Nodes whose covariance is worked out at a time."""
 
-Bounds = tuple[float, float, float, float]
+AreaBounds = tuple[float, float, float, float]
 """World (x least, y least, x largest, y largest) [m]."""
 
 
@@ -53,7 +53,7 @@ class Terrain:
             raise ValueError(f"the grid's steps must be finite and other than 0, not {spacing}")
 
     @property
-    def bounds(self) -> Bounds:
+    def bounds(self) -> AreaBounds:
         """Edges of the grid."""
         rows, columns = self.heights.shape
         x = sorted((0.0, (columns - 1) * self.spacing[0]))
@@ -72,13 +72,13 @@ class Terrain:
         """World height of the ground at world (x, y) [m], on its triangles; NaN where none is."""
         column = (np.asarray(x, float) - self.origin[0]) / self.spacing[0]
         row = (np.asarray(y, float) - self.origin[1]) / self.spacing[1]
-        return np.asarray(_on_triangles(self.heights, row, column) + self.origin[2])
+        return np.asarray(_interpolate_on_triangles(self.heights, row, column) + self.origin[2])
 
-    def facets(self) -> Facets:
+    def to_facets(self) -> Facets:
         """Triangles of the ground, facing upwards, and the nodes that they use."""
         z, (dx, dy) = self.heights, self.spacing
-        present = np.isfinite(z)
-        faces = _triangles(present)
+        has_height = np.isfinite(z)
+        faces = _grid_triangles(has_height)
         if dx * dy < 0:
             faces = faces[:, ::-1]
         rows, columns = z.shape
@@ -88,40 +88,40 @@ class Terrain:
         vertices[..., 2] = z
         vertices += 0.0  # never -0.0
         nodes = vertices.reshape(-1, 3)
-        if not present.all():
+        if not has_height.all():
             used = np.zeros(z.size, bool)
             used[faces] = True
-            number = np.cumsum(used, dtype=np.int32) - 1
-            faces, nodes = number[faces], nodes[used]
+            new_number = np.cumsum(used, dtype=np.int32) - 1
+            faces, nodes = new_number[faces], nodes[used]
         surface = np.zeros(len(faces), np.int16)
         return Facets(nodes, faces, surface, self.origin, is_grid=True)
 
 
-def _triangles(present: np.ndarray) -> np.ndarray:
+def _grid_triangles(has_height: np.ndarray) -> np.ndarray:
     """Triangles of all cells, counter-clockwise where rows and columns both increase, (m, 3) int32.
 
     Whole cells are cut along the diagonal from node (i, j) to (i+1, j+1). First come the lower
     triangles of all cells, then the upper ones.
     """
-    node = np.arange(present.size, dtype=np.int32).reshape(present.shape)
+    node = np.arange(has_height.size, dtype=np.int32).reshape(has_height.shape)
     # Corners of each cell, counter-clockwise from (i, j).
     a, b, c, d = node[:-1, :-1], node[:-1, 1:], node[1:, 1:], node[1:, :-1]
-    if present.all():
+    if has_height.all():
         faces = np.empty((2, *a.shape, 3), np.int32)
         for k, corner in enumerate((a, b, c)):
             faces[0, ..., k] = corner
         for k, corner in enumerate((a, c, d)):
             faces[1, ..., k] = corner
         return faces.reshape(-1, 3)
-    here = present.ravel()
-    missing = [~here[corner] for corner in (a, b, c, d)]
-    lacks = sum(gap.astype(np.int8) for gap in missing)
-    lower = np.where(missing[0], d, a), b, c
-    upper = a, np.where(missing[2], b, c), d
+    node_has_height = has_height.ravel()
+    is_missing = [~node_has_height[corner] for corner in (a, b, c, d)]
+    n_missing = sum(is_gap.astype(np.int8) for is_gap in is_missing)
+    lower = np.where(is_missing[0], d, a), b, c
+    upper = a, np.where(is_missing[2], b, c), d
     # One gap at b spoils the lower triangle, one at d the upper; gaps at a and c are bridged above
     # by the other diagonal, which makes one triangle and leaves the other to be dropped.
-    keep_lower = (lacks == 0) | ((lacks == 1) & (missing[0] | missing[3]))
-    keep_upper = (lacks == 0) | ((lacks == 1) & (missing[1] | missing[2]))
+    keep_lower = (n_missing == 0) | ((n_missing == 1) & (is_missing[0] | is_missing[3]))
+    keep_upper = (n_missing == 0) | ((n_missing == 1) & (is_missing[1] | is_missing[2]))
     return np.concatenate(
         [
             np.stack([corner[keep] for corner in corners], axis=1)
@@ -130,13 +130,15 @@ def _triangles(present: np.ndarray) -> np.ndarray:
     )
 
 
-def _on_triangles(z: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+def _interpolate_on_triangles(
+    heights: np.ndarray, row: np.ndarray, column: np.ndarray
+) -> np.ndarray:
     """Height of the triangulated grid at fractional rows and columns; NaN where it has none."""
-    rows, columns = z.shape
+    rows, columns = heights.shape
     i = np.clip(np.floor(row), 0, rows - 2).astype(np.int64)
     j = np.clip(np.floor(column), 0, columns - 2).astype(np.int64)
     v, u = row - i, column - j
-    a, b, c, d = z[i, j], z[i, j + 1], z[i + 1, j + 1], z[i + 1, j]
+    a, b, c, d = heights[i, j], heights[i, j + 1], heights[i + 1, j + 1], heights[i + 1, j]
     lower = a + u * (b - a) + v * (c - b)
     upper = a + u * (c - d) + v * (d - a)
     value = np.where(u >= v, lower, upper)
@@ -160,22 +162,26 @@ def refine(terrain: Terrain, *, factor: int) -> Terrain:
     rows, columns = terrain.heights.shape
     if factor < 1 or min(rows, columns) < 4:
         raise ValueError("refining needs a factor of at least 1 and a grid of 4 x 4 nodes or more")
-    z, holes = terrain.heights, ~np.isfinite(terrain.heights)
+    heights, holes = terrain.heights, ~np.isfinite(terrain.heights)
     if holes.all():
         raise ValueError("the terrain has no heights at all")
     if holes.any():  # each is given the height of the nearest node that has one
-        z = z[tuple(distance_transform_edt(holes, return_distances=False, return_indices=True))]
+        heights = heights[
+            tuple(distance_transform_edt(holes, return_distances=False, return_indices=True))
+        ]
     fine_rows = np.arange((rows - 1) * factor + 1)
     fine_columns = np.arange((columns - 1) * factor + 1)
-    spline = RectBivariateSpline(range(rows), range(columns), z)
-    fine = spline(fine_rows / factor, fine_columns / factor)
-    near = holes[fine_rows // factor] | holes[-(-fine_rows // factor)]
-    fine[near[:, fine_columns // factor] | near[:, -(-fine_columns // factor)]] = np.nan
+    spline = RectBivariateSpline(range(rows), range(columns), heights)
+    fine_heights = spline(fine_rows / factor, fine_columns / factor)
+    is_near_hole = holes[fine_rows // factor] | holes[-(-fine_rows // factor)]
+    fine_heights[
+        is_near_hole[:, fine_columns // factor] | is_near_hole[:, -(-fine_columns // factor)]
+    ] = np.nan
     spacing = terrain.spacing[0] / factor, terrain.spacing[1] / factor
-    return replace(terrain, heights=fine, spacing=spacing)
+    return replace(terrain, heights=fine_heights, spacing=spacing)
 
 
-def smooth(terrain: Terrain, *, width: float) -> Terrain:
+def smooth(terrain: Terrain, *, standard_deviation: float) -> Terrain:
     """Terrain blurred by a Gaussian of that standard deviation [m]; holes stay holes.
 
     ValueError for a negative width, or one beyond the ground's longer side: its memory goes by
@@ -185,51 +191,55 @@ def smooth(terrain: Terrain, *, width: float) -> Terrain:
 
     west, south, east, north = terrain.bounds
     side = max(east - west, north - south)
-    if not 0 <= width <= side:
-        raise ValueError(f"the smoothing width must be 0 m to the ground's {side:g} m, not {width}")
-    there = np.isfinite(terrain.heights)
-    sigma = [width / abs(step) for step in reversed(terrain.spacing)]
-    kept = np.where(there, terrain.heights, 0.0)
-    blurred = gaussian_filter(kept, sigma, mode="nearest")
-    weight = gaussian_filter(there.astype(float), sigma, mode="nearest")
-    smoothed = np.divide(blurred, weight, where=there, out=np.full_like(kept, np.nan))
+    if not 0 <= standard_deviation <= side:
+        raise ValueError(
+            f"the smoothing width must be 0 m to the ground's {side:g} m, not {standard_deviation}"
+        )
+    has_height = np.isfinite(terrain.heights)
+    sigma = [standard_deviation / abs(step) for step in reversed(terrain.spacing)]
+    filled_heights = np.where(has_height, terrain.heights, 0.0)
+    blurred = gaussian_filter(filled_heights, sigma, mode="nearest")
+    weight = gaussian_filter(has_height.astype(float), sigma, mode="nearest")
+    smoothed = np.divide(
+        blurred, weight, where=has_height, out=np.full_like(filled_heights, np.nan)
+    )
     return replace(terrain, heights=smoothed)
 
 
-def piece(terrain: Terrain, *, centre: Sequence[float], size: float) -> Terrain:
+def cut_square(terrain: Terrain, *, centre: Sequence[float], size: float) -> Terrain:
     """Cut out a square of a terrain about (x, y) [m]; ValueError where it holds no cell."""
-    cuts, corner = [], terrain.origin.copy()
+    node_ranges, corner = [], terrain.origin.copy()
     for axis in (1, 0):
         step, number = terrain.spacing[axis], terrain.heights.shape[1 - axis]
         middle = (centre[axis] - terrain.origin[axis]) / step
-        reach = size / 2 / abs(step)
+        half_width = size / 2 / abs(step)
         # A hair past a node is that node: positions come from sums that were rounded.
-        first = max(math.floor(middle - reach + 1e-9), 0)
-        last = min(math.ceil(middle + reach - 1e-9), number - 1)
+        first = max(math.floor(middle - half_width + 1e-9), 0)
+        last = min(math.ceil(middle + half_width - 1e-9), number - 1)
         if last <= first:
-            raise _no_ground(centre, size)
+            raise _no_ground_error(centre, size)
         corner[axis] += first * step
-        cuts.append(slice(first, last + 1))
-    return replace(terrain, heights=terrain.heights[cuts[0], cuts[1]], origin=corner)
+        node_ranges.append(slice(first, last + 1))
+    return replace(terrain, heights=terrain.heights[node_ranges[0], node_ranges[1]], origin=corner)
 
 
-def square(terrain: Terrain, *, centre: Sequence[float], size: float) -> Bounds:
+def square_bounds(terrain: Terrain, *, centre: Sequence[float], size: float) -> AreaBounds:
     """Bounds of a square about (x, y) [m], as far as there is ground; ValueError for none."""
     west, south, east, north = terrain.bounds
     (x, y), half = centre[:2], size / 2
     bounds = max(x - half, west), max(y - half, south), min(x + half, east), min(y + half, north)
     if not (bounds[0] < bounds[2] and bounds[1] < bounds[3]):
-        raise _no_ground(centre, size)
+        raise _no_ground_error(centre, size)
     return bounds
 
 
-def _no_ground(centre: Sequence[float], size: float) -> ValueError:
+def _no_ground_error(centre: Sequence[float], size: float) -> ValueError:
     return ValueError(
         f"there is no ground within {size / 2:g} m of ({centre[0]:g}, {centre[1]:g}) m"
     )
 
 
-def fractal(
+def draw_fractal_relief(
     generator: np.random.Generator,
     *,
     shape: tuple[int, int],
@@ -251,39 +261,47 @@ def fractal(
     (Rosenburg et al., J. Geophys. Res. 116, E02001, 2011).
     """
     steps = abs(spacing[1]), abs(spacing[0])
-    span = math.hypot(*((n - 1) * step for n, step in zip(shape, steps, strict=True)))
+    diagonal = math.hypot(*((n - 1) * step for n, step in zip(shape, steps, strict=True)))
     # In units of the grid's diagonal, the longest distance that must be right is 1.
-    period, parabola, covariance = _stein(2 * hurst)
-    unit = [step / span for step in steps]
-    stationary = _field(generator, shape, unit, covariance, period)
-    tilt = generator.standard_normal(2) * math.sqrt(2 * parabola)
-    rows, columns = (np.arange(n) * step for n, step in zip(shape, unit, strict=True))
-    z = stationary + (tilt[0] * rows)[:, None] + tilt[1] * columns
+    period, paraboloid, covariance = _stein_covariance(2 * hurst)
+    relative_steps = [step / diagonal for step in steps]
+    stationary = _draw_gaussian_field(generator, shape, relative_steps, covariance, period)
+    plane_slopes = generator.standard_normal(2) * math.sqrt(2 * paraboloid)
+    rows, columns = (np.arange(n) * step for n, step in zip(shape, relative_steps, strict=True))
+    relief = stationary + (plane_slopes[0] * rows)[:, None] + plane_slopes[1] * columns
     # The field's differences have the variance 2 r^(2H); the wanted one is per baseline.
-    scale = rms_slope * baseline * (span / baseline) ** hurst / math.sqrt(2)
-    return np.asarray((z - z[0, 0]) * scale)
+    scale = rms_slope * baseline * (diagonal / baseline) ** hurst / math.sqrt(2)
+    return np.asarray((relief - relief[0, 0]) * scale)
 
 
-def _stein(alpha: float):  # type: ignore[no-untyped-def]  # returns a function with the constants
+def _stein_covariance(alpha: float):  # type: ignore[no-untyped-def]  # returns a function with the constants
     """Torus period, coefficient of the paraboloid and the covariance on the torus."""
     if alpha <= 1.5:
-        reach, far, parabola = 1.0, 0.0, alpha / 2
+        torus_half_period, tail_coefficient, paraboloid = 1.0, 0.0, alpha / 2
         constant = 1 - alpha / 2
     else:
-        reach = 2.0
-        far = alpha * (2 - alpha) / (3 * reach * (reach**2 - 1))
-        parabola = (alpha - far * (reach - 1) ** 2 * (reach + 2)) / 2
-        constant = far * (reach - 1) ** 3 + 1 - parabola
+        torus_half_period = 2.0
+        tail_coefficient = (
+            alpha * (2 - alpha) / (3 * torus_half_period * (torus_half_period**2 - 1))
+        )
+        paraboloid = (
+            alpha - tail_coefficient * (torus_half_period - 1) ** 2 * (torus_half_period + 2)
+        ) / 2
+        constant = tail_coefficient * (torus_half_period - 1) ** 3 + 1 - paraboloid
 
-    def covariance(r: np.ndarray) -> np.ndarray:
-        near = constant - r**alpha + parabola * r**2
-        beyond = far * np.maximum(reach - r, 0.0) ** 3 / np.maximum(r, 1.0)
-        return np.where(r <= 1, near, beyond)
+    def covariance(distance: np.ndarray) -> np.ndarray:
+        within_diagonal = constant - distance**alpha + paraboloid * distance**2
+        beyond_diagonal = (
+            tail_coefficient
+            * np.maximum(torus_half_period - distance, 0.0) ** 3
+            / np.maximum(distance, 1.0)
+        )
+        return np.where(distance <= 1, within_diagonal, beyond_diagonal)
 
-    return 2 * reach, parabola, covariance
+    return 2 * torus_half_period, paraboloid, covariance
 
 
-def hills(
+def draw_hills(
     generator: np.random.Generator,
     *,
     shape: tuple[int, int],
@@ -298,31 +316,43 @@ def hills(
     third of the correlation length.
     """
     steps = abs(spacing[1]), abs(spacing[0])
-    unit = [step / correlation_length for step in steps]
+    relative_steps = [step / correlation_length for step in steps]
     # Beyond 6 correlation lengths the covariance is 2e-16: the two ends of the torus are apart.
-    longest = max((n - 1) * step for n, step in zip(shape, unit, strict=True))
-    field = _field(generator, shape, unit, lambda r: np.exp(-(r**2)), longest + 6.0)
+    longest_side = max((n - 1) * step for n, step in zip(shape, relative_steps, strict=True))
+    field = _draw_gaussian_field(
+        generator, shape, relative_steps, lambda r: np.exp(-(r**2)), longest_side + 6.0
+    )
     return np.asarray(field * rms_height)
 
 
-def _field(generator, shape, steps, covariance, period):  # type: ignore[no-untyped-def]
+def _draw_gaussian_field(generator, shape, steps, covariance, period):  # type: ignore[no-untyped-def]
     """Stationary Gaussian field of a function of distance, on a torus of at least a period."""
-    size = [fft.next_fast_len(math.ceil(period / step), real=True) for step in steps]
-    if math.prod(size) > 2e8:
-        raise ValueError(f"relief on {shape} nodes needs a torus of {size}; use a coarser grid")
-    squares = [
+    torus_shape = [fft.next_fast_len(math.ceil(period / step), real=True) for step in steps]
+    if math.prod(torus_shape) > 2e8:
+        raise ValueError(
+            f"relief on {shape} nodes needs a torus of {torus_shape}; use a coarser grid"
+        )
+    squared_distances = [
         (np.minimum(np.arange(n), n - np.arange(n)) * step) ** 2
-        for n, step in zip(size, steps, strict=True)
+        for n, step in zip(torus_shape, steps, strict=True)
     ]
-    covariances = np.empty(size)  # a torus may be large; what makes it need not be
-    rows = max(_AT_ONCE // size[1], 1)
-    for part in (slice(first, first + rows) for first in range(0, size[0], rows)):
-        covariances[part] = covariance(np.sqrt(squares[0][part, None] + squares[1]))
-    power = fft.rfft2(covariances, overwrite_x=True).real.copy()
+    covariances = np.empty(torus_shape)  # a torus may be large; what makes it need not be
+    batch_rows = max(_NODES_PER_BATCH // torus_shape[1], 1)
+    for row_range in (
+        slice(first, first + batch_rows) for first in range(0, torus_shape[0], batch_rows)
+    ):
+        covariances[row_range] = covariance(
+            np.sqrt(squared_distances[0][row_range, None] + squared_distances[1])
+        )
+    power_spectrum = fft.rfft2(covariances, overwrite_x=True).real.copy()
     del covariances
-    negative = -power[power < 0].sum() / power[power > 0].sum()
-    if negative > _NEGLIGIBLE:
-        raise ArithmeticError(f"{negative:.1e} of the relief's variance is negative on this grid")
-    noise = fft.rfft2(generator.standard_normal(size), overwrite_x=True)
-    noise *= np.sqrt(np.maximum(power, 0.0, out=power), out=power)
-    return fft.irfft2(noise, s=size, overwrite_x=True)[: shape[0], : shape[1]]
+    negative_fraction = (
+        -power_spectrum[power_spectrum < 0].sum() / power_spectrum[power_spectrum > 0].sum()
+    )
+    if negative_fraction > _NEGATIVE_VARIANCE_MAX:
+        raise ArithmeticError(
+            f"{negative_fraction:.1e} of the relief's variance is negative on this grid"
+        )
+    noise = fft.rfft2(generator.standard_normal(torus_shape), overwrite_x=True)
+    noise *= np.sqrt(np.maximum(power_spectrum, 0.0, out=power_spectrum), out=power_spectrum)
+    return fft.irfft2(noise, s=torus_shape, overwrite_x=True)[: shape[0], : shape[1]]

@@ -21,10 +21,10 @@ import numpy as np
 
 from sweep.scenes.terrain import Terrain
 
-_ALIGNED = 1e-3
+_ALIGNMENT_TOLERANCE_CELLS = 1e-3
 """Distance from whole cells, in cells, up to which two grids are one."""
 
-_NEAR = 2.0
+_TOUCHING_GAP_MAX_CELLS = 2.0
 """Gap between two grids, in the larger one's cells, up to which they are taken to touch."""
 
 
@@ -35,10 +35,10 @@ def join_tiles(tiles: Mapping[str, Terrain]) -> tuple[dict[str, Terrain], list[s
     warnings = []
     for name in names:
         others = [tiles[other] for other in names if other != name]
-        joined[name] = _continued(tiles[name], others)
+        joined[name] = _extend_tile(tiles[name], others)
     for k, name in enumerate(names):
         for other in names[:k]:
-            width = _gap(tiles[name], tiles[other])
+            width = _gap_width(tiles[name], tiles[other])
             if width:
                 warnings.append(
                     f"scene.objects.{name}: between it and {other} lies a gap of {width:.3g} m "
@@ -47,35 +47,35 @@ def join_tiles(tiles: Mapping[str, Terrain]) -> tuple[dict[str, Terrain], list[s
     return joined, warnings
 
 
-def _offset(tile: Terrain, other: Terrain) -> tuple[int, int] | None:
+def _grid_offset(tile: Terrain, other: Terrain) -> tuple[int, int] | None:
     """Row and column of the other's first node on a tile's grid; None if the grids differ."""
     (dx, dy), (rows, columns) = tile.spacing, other.heights.shape
     for step, other_step, number in ((dx, other.spacing[0], columns), (dy, other.spacing[1], rows)):
-        if not abs(other_step - step) * number <= _ALIGNED * abs(step):
+        if not abs(other_step - step) * number <= _ALIGNMENT_TOLERANCE_CELLS * abs(step):
             return None
-    shift = other.origin - tile.origin
-    column, row = shift[0] / dx, shift[1] / dy
-    if max(abs(column - round(column)), abs(row - round(row))) > _ALIGNED:
+    origin_shift = other.origin - tile.origin
+    column, row = origin_shift[0] / dx, origin_shift[1] / dy
+    if max(abs(column - round(column)), abs(row - round(row))) > _ALIGNMENT_TOLERANCE_CELLS:
         return None
     return round(row), round(column)
 
 
-def _continued(tile: Terrain, others: list[Terrain]) -> Terrain:
+def _extend_tile(tile: Terrain, others: list[Terrain]) -> Terrain:
     """Tile with one more row and column, as far as its neighbours have nodes there."""
     rows, columns = tile.heights.shape
     heights = np.full((rows + 1, columns + 1), np.nan)
     heights[:rows, :columns] = tile.heights
     for other in others:
-        place = _offset(tile, other)
+        offset = _grid_offset(tile, other)
         # One that overlaps the tile covers the ground between them itself.
-        if place is None or not (place[0] == rows or place[1] == columns):
+        if offset is None or not (offset[0] == rows or offset[1] == columns):
             continue
-        row, column = place
+        row, column = offset
         first, last = max(row, 0), min(row + other.heights.shape[0], rows + 1)
         left, right = max(column, 0), min(column + other.heights.shape[1], columns + 1)
         if first < last and left < right:
-            part = other.heights[first - row : last - row, left - column : right - column]
-            heights[first:last, left:right] = part
+            overlap = other.heights[first - row : last - row, left - column : right - column]
+            heights[first:last, left:right] = overlap
     new_rows = rows + int(np.isfinite(heights[rows]).any())
     new_columns = columns + int(np.isfinite(heights[:, columns]).any())
     if (new_rows, new_columns) == (rows, columns):
@@ -83,14 +83,22 @@ def _continued(tile: Terrain, others: list[Terrain]) -> Terrain:
     return replace(tile, heights=heights[:new_rows, :new_columns])
 
 
-def _gap(one: Terrain, other: Terrain) -> float:
+def _gap_width(tile: Terrain, other: Terrain) -> float:
     """Width of the gap between grids that touch and are no tiles of one grid [m]; 0 for none."""
-    if _offset(one, other) is not None:
+    if _grid_offset(tile, other) is not None:
         return 0.0
-    a, b = np.array(one.bounds).reshape(2, 2), np.array(other.bounds).reshape(2, 2)
-    between = np.maximum(a[0], b[0]) - np.minimum(a[1], b[1])  # below 0 where they overlap
-    cell = np.maximum(np.abs(one.spacing), np.abs(other.spacing))
+    tile_bounds, other_bounds = (
+        np.array(tile.bounds).reshape(2, 2),
+        np.array(other.bounds).reshape(2, 2),
+    )
+    separation = np.maximum(tile_bounds[0], other_bounds[0]) - np.minimum(
+        tile_bounds[1], other_bounds[1]
+    )  # below 0 where they overlap
+    cell_size = np.maximum(np.abs(tile.spacing), np.abs(other.spacing))
     for axis in (0, 1):
-        if 0 < between[axis] < _NEAR * cell[axis] and between[1 - axis] < 0:
-            return float(between[axis])
+        if (
+            0 < separation[axis] < _TOUCHING_GAP_MAX_CELLS * cell_size[axis]
+            and separation[1 - axis] < 0
+        ):
+            return float(separation[axis])
     return 0.0

@@ -20,45 +20,45 @@ from sweep.model.outputs import GRID_VARIABLES
 from sweep.spec.rules import (
     Finding,
     Findings,
+    FrequencyErrorTableRule,
     Location,
-    Numeric,
+    NumericRule,
     Rule,
-    SweepError,
-    near_miss,
-    rejected,
+    findings_error,
+    suggest_similar_name,
 )
 from sweep.spec.sections import (
-    AXES_TAKE,
-    NOT_ON_AXES,
-    SECTIONS,
+    AXES_REMEDY,
+    MODEL_BY_SECTION,
+    SECTIONS_NOT_ON_AXES,
     parameter_rules,
-    parameter_suggestion,
     short_name,
+    suggest_parameter,
 )
 from sweep.units import QuantityError, Unit
 
-RESERVED = ("batch", "draw", "point", "spec", "study_id")
+RESERVED_DIMENSIONS = ("batch", "draw", "point", "spec", "study_id")
 """Names of dimensions that a store may have besides its axes."""
 
-_MARKER = re.compile("study_[0-9a-f]{16}")
+_MARKER_PATTERN = re.compile("study_[0-9a-f]{16}")
 """Names of the coordinate that marks a study's points, in the dataset that its store opens as."""
 
-_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,60}")
-_LISTED = 64
+_AXIS_NAME_PATTERN = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,60}")
+_LISTED_VALUES_MAX = 64
 """Values of an axis that its identity lists at most."""
-_REMEDY = "take a word such as 'cut'"
+_NAME_REMEDY = "take a word such as 'cut'"
 
 
 @dataclass(frozen=True, eq=False)
-class Member:
+class AxisParameter:
     """One parameter along an axis."""
 
     path: str
-    name: str
+    coordinate: str
     """Name of its coordinate."""
     values: np.ndarray | tuple[str, ...]
     """SI values (n,), float64 or int64; words of a parameter that takes words."""
-    display: np.ndarray
+    display_values: np.ndarray
     """The same in `units`."""
     units: str
     """The unit that the user wrote; empty where there is none."""
@@ -69,71 +69,78 @@ class Axis:
     """One dimension of a study's grid."""
 
     name: str
-    members: tuple[Member, ...]
+    parameters: tuple[AxisParameter, ...]
     """The parameters along it: one, or several that vary together."""
 
     @property
     def size(self) -> int:
         """Number of values."""
-        return len(self.members[0].values)
+        return len(self.parameters[0].values)
 
     @property
-    def zipped(self) -> bool:
+    def is_zipped(self) -> bool:
         """True if the dimension has a name of its own."""
-        return len(self.members) > 1 or self.members[0].name != self.name
+        return len(self.parameters) > 1 or self.parameters[0].coordinate != self.name
 
 
 def axis_identity(axis: Axis) -> dict[str, Any]:
     """Content of an axis: its values where they are few, else their number, ends and digest."""
-    return {"name": axis.name, "members": {m.path: _member_identity(m) for m in axis.members}}
+    return {
+        "name": axis.name,
+        "members": {
+            parameter.path: _parameter_identity(parameter) for parameter in axis.parameters
+        },
+    }
 
 
-def _member_identity(member: Member) -> dict[str, Any]:
+def _parameter_identity(parameter: AxisParameter) -> dict[str, Any]:
     """Content of one parameter along an axis."""
-    number, words = len(member.values), isinstance(member.values, tuple)
-    if number <= _LISTED:
-        return {"values": list(member.values) if words else np.asarray(member.values).tolist()}
-    if words:
-        content = "\0".join(map(str, member.values)).encode()
+    n_values, has_words = len(parameter.values), isinstance(parameter.values, tuple)
+    if n_values <= _LISTED_VALUES_MAX:
+        return {
+            "values": list(parameter.values) if has_words else np.asarray(parameter.values).tolist()
+        }
+    if has_words:
+        content = "\0".join(map(str, parameter.values)).encode()
     else:
-        content = (np.asarray(member.values, dtype="<f8") + 0.0).tobytes()  # no -0.0
-    first, last = np.asarray(member.values)[[0, -1]].tolist()
+        content = (np.asarray(parameter.values, dtype="<f8") + 0.0).tobytes()  # no -0.0
+    first, last = np.asarray(parameter.values)[[0, -1]].tolist()
     digest = hashlib.blake2b(content, digest_size=16).hexdigest()
-    return {"number": number, "first": first, "last": last, "digest": digest}
+    return {"number": n_values, "first": first, "last": last, "digest": digest}
 
 
-def place_on_grid(path: str, axes: tuple[Axis, ...]) -> Location:
+def parameter_location(path: str, axes: tuple[Axis, ...]) -> Location:
     """Location of the values of a parameter in a spec: on its axis, if it has one."""
     for axis in axes:
-        if any(member.path == path for member in axis.members):
-            return ("axes", axis.name if axis.zipped else path)
+        if any(parameter.path == path for parameter in axis.parameters):
+            return ("axes", axis.name if axis.is_zipped else path)
     return tuple(path.split("."))
 
 
-def read_axes(written: object) -> tuple[tuple[Axis, ...], list[Finding]]:
+def read_axes(raw_axes: object) -> tuple[tuple[Axis, ...], list[Finding]]:
     """Axes of a spec's ``axes`` section that can be read, and everything that is wrong with it."""
-    if not isinstance(written, dict):
+    if not isinstance(raw_axes, dict):
         remedy = "write e.g. 'target.range: [1 km, 2 km]' below it, or leave it out"
-        return (), [Finding(("axes",), "must be a mapping of paths to values", remedy, written)]
+        return (), [Finding(("axes",), "must be a mapping of paths to values", remedy, raw_axes)]
     axes: list[Axis] = []
     findings = Findings()
-    for key, value in written.items():
-        with findings.of():
+    for key, value in raw_axes.items():
+        with findings.collect():
             axes.append(_read_axis(str(key), value, ("axes", str(key))))
-    findings += _paths_set_twice(written)
-    return (tuple(_named(axes)), findings + _name_clashes(axes))
+    findings += _duplicate_path_findings(raw_axes)
+    return (tuple(_name_coordinates(axes)), findings + _name_clash_findings(axes))
 
 
-def paths_on_axes(written: object) -> dict[str, object]:
+def first_values_on_axes(raw_axes: object) -> dict[str, object]:
     """Parameters that a spec's ``axes`` section sets, each with its first value as written."""
-    first: dict[str, object] = {}
-    for key, value in written.items() if isinstance(written, dict) else ():
-        for path, values in _items(str(key), value):
-            first.setdefault(path, _first_written(values))
-    return {path: value for path, value in first.items() if path in parameter_rules()}
+    first_values: dict[str, object] = {}
+    for key, value in raw_axes.items() if isinstance(raw_axes, dict) else ():
+        for path, values in _paths_and_values(str(key), value):
+            first_values.setdefault(path, _first_raw_value(values))
+    return {path: value for path, value in first_values.items() if path in parameter_rules()}
 
 
-def without_fields_on_axes(written: Mapping[str, Any]) -> dict[str, Any]:
+def remove_fields_on_axes(raw_spec: Mapping[str, Any]) -> dict[str, Any]:
     """Copy of a written study in whose sections no field is that an axis of it sets.
 
     A field and its axis may not contradict each other: this gives a study of plain data an axis
@@ -143,187 +150,220 @@ def without_fields_on_axes(written: Mapping[str, Any]) -> dict[str, Any]:
     >>> without_fields_on_axes({**study, "axes": {"target.range": ["1 km", "3 km"]}})
     {'target': {'reflectance': 0.1}, 'axes': {'target.range': ['1 km', '3 km']}}
     """
-    copied = copy.deepcopy(dict(written))
-    for path in paths_on_axes(copied.get("axes")):
+    result = copy.deepcopy(dict(raw_spec))
+    for path in first_values_on_axes(result.get("axes")):
         *parents, name = path.split(".")
-        section: Any = copied
+        section: Any = result
         for parent in parents:
             section = section.get(parent) if isinstance(section, dict) else None
         if isinstance(section, dict):
             section.pop(name, None)
-    return copied
+    return result
 
 
-def _items(key: str, written: object) -> list[tuple[str, object]]:
+def _paths_and_values(key: str, raw_axis: object) -> list[tuple[str, object]]:
     """Paths and values of a written axis; of a zipped one, piece after piece."""
-    if not isinstance(written, dict) or "zip" not in written:
-        return [(key, written)]
-    pieces = written["zip"] if isinstance(written["zip"], list) else [written["zip"]]
+    if not isinstance(raw_axis, dict) or "zip" not in raw_axis:
+        return [(key, raw_axis)]
+    pieces = raw_axis["zip"] if isinstance(raw_axis["zip"], list) else [raw_axis["zip"]]
     mappings = [piece for piece in pieces if isinstance(piece, dict)]
     return [(str(path), value) for piece in mappings for path, value in piece.items()]
 
 
-def _first_written(values: object) -> object:
+def _first_raw_value(values: object) -> object:
     """First value of a written list or generator; None where it has none."""
     while isinstance(values, dict | list) and values:
         values = next(iter(values.values())) if isinstance(values, dict) else values[0]
     return None if isinstance(values, dict | list) else values
 
 
-def _read_axis(key: str, written: object, location: Location) -> Axis:
+def _read_axis(key: str, raw_axis: object, location: Location) -> Axis:
     """One axis, plain or zipped."""
-    if isinstance(written, dict) and "zip" in written:
-        return _read_zip(key, written, location)
-    if key in SECTIONS and isinstance(written, dict):
-        path, values = _first_path(key, written)
-        rule = "is a section, and an axis is named by the whole path of a field"
-        raise rejected(location, rule, f"write '{path}: {values}'")
-    member = _member(key, read_pieces(written, _rule_at(key, location), location), location)
-    _without_duplicates(member, location)
-    return Axis(member.name, (member,))
+    if isinstance(raw_axis, dict) and "zip" in raw_axis:
+        return _read_zip(key, raw_axis, location)
+    if key in MODEL_BY_SECTION and isinstance(raw_axis, dict):
+        path, values_hint = _describe_first_field(key, raw_axis)
+        problem = "is a section, and an axis is named by the whole path of a field"
+        raise findings_error(location, problem, f"write '{path}: {values_hint}'")
+    parameter = _make_axis_parameter(
+        key, read_pieces(raw_axis, _axis_rule(key, location), location), location
+    )
+    _check_duplicates(parameter, location)
+    return Axis(parameter.coordinate, (parameter,))
 
 
-def _first_path(path: str, written: object) -> tuple[str, str]:
+def _describe_first_field(path: str, raw_section: object) -> tuple[str, str]:
     """Dotted path of the first field within sections as written, and its values in short."""
-    while isinstance(written, dict) and written and not set(written) & set(_FORMS):
-        name = next(iter(written))
-        path, written = f"{path}.{name}", written[name]
-    return path, "[...]" if isinstance(written, list) else "{linear: [...], number: ...}"
+    while (
+        isinstance(raw_section, dict)
+        and raw_section
+        and not set(raw_section) & set(_GENERATOR_FORMS)
+    ):
+        name = next(iter(raw_section))
+        path, raw_section = f"{path}.{name}", raw_section[name]
+    return path, "[...]" if isinstance(raw_section, list) else "{linear: [...], number: ...}"
 
 
-def _rule_at(path: str, location: Location) -> Rule:
+def _axis_rule(path: str, location: Location) -> Rule:
     """Rule of the parameter at a path."""
     rule = parameter_rules().get(path)
     if rule is None:
-        raise rejected(location, *_why_no_axis(path))
-    if isinstance(rule, SweepError):
-        raise rejected(location, "is one table for a whole study", "put it into the instrument")
+        raise findings_error(location, *_axis_refusal(path))
+    if isinstance(rule, FrequencyErrorTableRule):
+        raise findings_error(
+            location, "is one table for a whole study", "put it into the instrument"
+        )
     return rule
 
 
-_WHOLE_STUDY = "is the same for a whole study"
+_FIXED_PROBLEM = "is the same for a whole study"
 
 
-def _why_no_axis(path: str) -> tuple[str, str]:
+def _axis_refusal(path: str) -> tuple[str, str]:
     """Rule and remedy for the path of what no axis may set."""
     section, _, name = path.partition(".")
     if path == "seed":
-        rule = f"{_WHOLE_STUDY}: each point and draw has random numbers of its own already"
-        return rule, "leave it out, or run a study for each seed"
+        problem = f"{_FIXED_PROBLEM}: each point and draw has random numbers of its own already"
+        return problem, "leave it out, or run a study for each seed"
     if section == "effects" and name:
-        return _WHOLE_STUDY, "run a study for each mode, and compare them with sweep compare"
+        return _FIXED_PROBLEM, "run a study for each mode, and compare them with sweep compare"
     if path in ("instrument", "instrument.like", "instrument.file"):
-        return _WHOLE_STUDY, "run a study for each, and compare them with sweep compare"
-    if section in NOT_ON_AXES:
-        return _WHOLE_STUDY, f"run a study for each value; {AXES_TAKE}"
-    return "is no parameter", parameter_suggestion(path)
+        return _FIXED_PROBLEM, "run a study for each, and compare them with sweep compare"
+    if section in SECTIONS_NOT_ON_AXES:
+        return _FIXED_PROBLEM, f"run a study for each value; {AXES_REMEDY}"
+    return "is no parameter", suggest_parameter(path)
 
 
-def _member(path: str, pieces: list[Values], location: Location) -> Member:
+def _make_axis_parameter(path: str, pieces: list[PieceValues], location: Location) -> AxisParameter:
     """Parameter along an axis, from pieces laid end to end."""
     name = short_name(path)
-    size = _length(pieces)
-    if size > MOST_VALUES:
-        raise rejected(location, f"has {size} values, and an axis takes at most {MOST_VALUES}")
+    n_values = _number_of_values(pieces)
+    if n_values > AXIS_VALUES_MAX:
+        raise findings_error(
+            location, f"has {n_values} values, and an axis takes at most {AXIS_VALUES_MAX}"
+        )
     # Not in decibels where some piece is not: those have no zero.
-    unit = next((piece.unit for piece in pieces if not piece.unit.decibel), pieces[0].unit)
-    values = np.concatenate([piece.si for piece in pieces])
+    unit = next((piece.unit for piece in pieces if not piece.unit.is_logarithmic), pieces[0].unit)
+    values = np.concatenate([piece.si_values for piece in pieces])
     if values.dtype.kind == "U":
-        return Member(path, name, tuple(values.tolist()), values, "")
-    display = np.concatenate([piece.displayed(unit) for piece in pieces])
-    if values.dtype == np.int64 and unit.text == "":
-        display = values.copy()
-    values.flags.writeable = display.flags.writeable = False
-    return Member(path, name, values, display, unit.text)
+        return AxisParameter(path, name, tuple(values.tolist()), values, "")
+    display_values = np.concatenate([piece.to_unit(unit) for piece in pieces])
+    if values.dtype == np.int64 and unit.symbol == "":
+        display_values = values.copy()
+    values.flags.writeable = display_values.flags.writeable = False
+    return AxisParameter(path, name, values, display_values, unit.symbol)
 
 
-def _without_duplicates(member: Member, location: Location) -> None:
+def _check_duplicates(parameter: AxisParameter, location: Location) -> None:
     """No value twice along an axis, or a finding that names one."""
-    values = np.asarray(member.values)
+    values = np.asarray(parameter.values)
     if values.dtype.kind != "U" and (
         np.all(values[1:] > values[:-1]) or np.all(values[1:] < values[:-1])
     ):
         return
     unique, counts = np.unique(values, return_counts=True)
     if counts.max(initial=1) > 1:
-        repeated = member.display[np.argmax(values == unique[np.argmax(counts > 1)])]
-        text = f"{repeated} {member.units}".strip()
-        raise rejected(location, f"holds {text} more than once", "list it once")
+        repeated_value = parameter.display_values[
+            np.argmax(values == unique[np.argmax(counts > 1)])
+        ]
+        value_text = f"{repeated_value} {parameter.units}".strip()
+        raise findings_error(location, f"holds {value_text} more than once", "list it once")
 
 
 # Zipped axes: several parameters that vary together, in pieces laid end to end
 
 
-def _read_zip(key: str, written: dict[str, Any], location: Location) -> Axis:
+def _read_zip(key: str, raw_axis: dict[str, Any], location: Location) -> Axis:
     """Zipped axis, each of whose pieces gives all of its parameters."""
     findings = Findings(
         Finding((*location, str(other)), "is no part of a zipped axis", "write {zip: [...]}")
-        for other in written
+        for other in raw_axis
         if other != "zip"
     )
-    if _NAME.fullmatch(key) is None or key in RESERVED or _MARKER.fullmatch(key):
-        findings.append(Finding(location, "is no name for an axis", _REMEDY))
-    pieces: dict[Location, object] = {(*location, "zip"): written["zip"]}
-    if written["zip"] in ([], {}, None):
+    if (
+        _AXIS_NAME_PATTERN.fullmatch(key) is None
+        or key in RESERVED_DIMENSIONS
+        or _MARKER_PATTERN.fullmatch(key)
+    ):
+        findings.append(Finding(location, "is no name for an axis", _NAME_REMEDY))
+    raw_pieces: dict[Location, object] = {(*location, "zip"): raw_axis["zip"]}
+    if raw_axis["zip"] in ([], {}, None):
         findings.append(Finding((*location, "zip"), "holds no piece", "list at least one"))
-        pieces = {}
-    elif isinstance(written["zip"], list):
-        pieces = {(*location, "zip", i): piece for i, piece in enumerate(written["zip"])}
-    read: list[dict[str, list[Values]]] = []
-    for at, piece in pieces.items():
-        with findings.of():
-            read.append(_read_piece(piece, at))
-            if unlike := ", ".join(sorted(set(read[0]) ^ set(read[-1]))):
-                rule = "must set the same parameters as the first piece"
-                raise rejected(at, rule, f"mind {unlike}")
-    findings.refuse_any()
-    laid = {path: [values for piece in read for values in piece[path]] for path in read[0]}
-    return Axis(key, tuple(_member(path, values, location) for path, values in laid.items()))
+        raw_pieces = {}
+    elif isinstance(raw_axis["zip"], list):
+        raw_pieces = {
+            (*location, "zip", i): raw_piece for i, raw_piece in enumerate(raw_axis["zip"])
+        }
+    piece_values: list[dict[str, list[PieceValues]]] = []
+    for piece_location, raw_piece in raw_pieces.items():
+        with findings.collect():
+            piece_values.append(_read_piece(raw_piece, piece_location))
+            if differing_paths := ", ".join(sorted(set(piece_values[0]) ^ set(piece_values[-1]))):
+                problem = "must set the same parameters as the first piece"
+                raise findings_error(piece_location, problem, f"mind {differing_paths}")
+    findings.raise_if_any()
+    joined_values = {
+        path: [values for raw_piece in piece_values for values in raw_piece[path]]
+        for path in piece_values[0]
+    }
+    return Axis(
+        key,
+        tuple(
+            _make_axis_parameter(path, values, location) for path, values in joined_values.items()
+        ),
+    )
 
 
-def _read_piece(piece: object, location: Location) -> dict[str, list[Values]]:
+def _read_piece(raw_piece: object, location: Location) -> dict[str, list[PieceValues]]:
     """Values of one piece by path, all of one length."""
-    if not isinstance(piece, dict) or not piece:
-        raise rejected(location, "must be a mapping of paths to values", "", piece)
+    if not isinstance(raw_piece, dict) or not raw_piece:
+        raise findings_error(location, "must be a mapping of paths to values", "", raw_piece)
     findings = Findings()
-    read: dict[str, list[Values]] = {}
-    for path, written in piece.items():
-        inside = (*location, str(path))
-        with findings.of():
-            rule = _rule_at(str(path), inside)
-            if isinstance(written, dict | list):
-                read[path] = read_pieces(written, rule, inside)
+    values_by_path: dict[str, list[PieceValues]] = {}
+    for path, raw_value in raw_piece.items():
+        value_location = (*location, str(path))
+        with findings.collect():
+            rule = _axis_rule(str(path), value_location)
+            if isinstance(raw_value, dict | list):
+                values_by_path[path] = read_pieces(raw_value, rule, value_location)
             else:
-                read[path] = [read_single(written, rule, inside)]
-    lengths = {path: _length(read[path]) for path in read if isinstance(piece[path], dict | list)}
+                values_by_path[path] = [read_single_value(raw_value, rule, value_location)]
+    lengths = {
+        path: _number_of_values(values_by_path[path])
+        for path in values_by_path
+        if isinstance(raw_piece[path], dict | list)
+    }
     if len(set(lengths.values())) > 1:
-        text = ", ".join(f"{path} has {n}" for path, n in lengths.items())
-        findings.append(Finding(location, f"must give as many values of each: {text}"))
-    findings.refuse_any()
+        lengths_text = ", ".join(f"{path} has {n}" for path, n in lengths.items())
+        findings.append(Finding(location, f"must give as many values of each: {lengths_text}"))
+    findings.raise_if_any()
     length = max(lengths.values(), default=1)
     return {
-        path: values if path in lengths else [values[0].repeated(length)]
-        for path, values in read.items()
+        path: values if path in lengths else [values[0].repeat(length)]
+        for path, values in values_by_path.items()
     }
 
 
-def _length(pieces: list[Values]) -> int:
+def _number_of_values(pieces: list[PieceValues]) -> int:
     """Count the values in pieces."""
-    return sum(len(piece.si) for piece in pieces)
+    return sum(len(piece.si_values) for piece in pieces)
 
 
 # Names
 
 
-def _named(axes: list[Axis]) -> list[Axis]:
+def _name_coordinates(axes: list[Axis]) -> list[Axis]:
     """Axes whose coordinates have the shortest names that tell them apart."""
-    paths = [member.path for axis in axes for member in axis.members]
-    named = []
+    paths = [parameter.path for axis in axes for parameter in axis.parameters]
+    named_axes = []
     for axis in axes:
-        members = tuple(replace(m, name=_coordinate_name(m.path, paths)) for m in axis.members)
-        plain = len(axis.members) == 1 and axis.name == axis.members[0].name
-        named.append(Axis(members[0].name if plain else axis.name, members))
-    return named
+        parameters = tuple(
+            replace(parameter, coordinate=_coordinate_name(parameter.path, paths))
+            for parameter in axis.parameters
+        )
+        is_plain = len(axis.parameters) == 1 and axis.name == axis.parameters[0].coordinate
+        named_axes.append(Axis(parameters[0].coordinate if is_plain else axis.name, parameters))
+    return named_axes
 
 
 def _coordinate_name(path: str, paths: list[str]) -> str:
@@ -331,39 +371,53 @@ def _coordinate_name(path: str, paths: list[str]) -> str:
 
     No other path ends with it, and no variable of a store is called so.
     """
-    own, *others = (p.removesuffix(".kind").split(".") for p in (path, *set(paths) - {path}))
-    for length in range(1, len(own) + 1):
-        name = "_".join(own[-length:])
-        is_shared = any(other[-length:] == own[-length:] for other in others)
+    keys, *other_keys = (
+        parameter_path.removesuffix(".kind").split(".")
+        for parameter_path in (path, *set(paths) - {path})
+    )
+    for length in range(1, len(keys) + 1):
+        name = "_".join(keys[-length:])
+        is_shared = any(other[-length:] == keys[-length:] for other in other_keys)
         if not is_shared and name not in GRID_VARIABLES:
             break
     return name
 
 
-def _paths_set_twice(written: dict[Any, Any]) -> list[Finding]:
+def _duplicate_path_findings(raw_axes: dict[Any, Any]) -> list[Finding]:
     """Parameters that two axes set."""
-    owners: dict[str, list[str]] = {}
-    for key, value in written.items():
-        for path in sorted({path for path, _ in _items(str(key), value)}):
-            owners.setdefault(path, []).append(str(key))
+    keys_by_path: dict[str, list[str]] = {}
+    for key, value in raw_axes.items():
+        for path in sorted({path for path, _ in _paths_and_values(str(key), value)}):
+            keys_by_path.setdefault(path, []).append(str(key))
     return [
         Finding(("axes", keys[1]), f"sets {path}, which the axis '{keys[0]}' sets too")
-        for path, keys in owners.items()
+        for path, keys in keys_by_path.items()
         if len(keys) > 1
     ]
 
 
-def _name_clashes(axes: list[Axis]) -> list[Finding]:
+def _name_clash_findings(axes: list[Axis]) -> list[Finding]:
     """List zipped axes that bear the name of another axis's coordinate, or of a variable."""
     findings = []
     for axis in axes:
-        others = {m.name for other in axes if other is not axis for m in other.members}
-        own = {m.name for m in axis.members} if len(axis.members) > 1 else set()
-        if axis.zipped and axis.name in others | own:
-            findings.append(Finding(("axes", axis.name), "bears the name of a coordinate", _REMEDY))
-        elif axis.zipped and axis.name in GRID_VARIABLES:
-            rule = "bears the name of a variable of the store"
-            findings.append(Finding(("axes", axis.name), rule, _REMEDY))
+        other_coordinates = {
+            parameter.coordinate
+            for other in axes
+            if other is not axis
+            for parameter in other.parameters
+        }
+        own_coordinates = (
+            {parameter.coordinate for parameter in axis.parameters}
+            if len(axis.parameters) > 1
+            else set()
+        )
+        if axis.is_zipped and axis.name in other_coordinates | own_coordinates:
+            findings.append(
+                Finding(("axes", axis.name), "bears the name of a coordinate", _NAME_REMEDY)
+            )
+        elif axis.is_zipped and axis.name in GRID_VARIABLES:
+            problem = "bears the name of a variable of the store"
+            findings.append(Finding(("axes", axis.name), problem, _NAME_REMEDY))
     return findings
 
 
@@ -371,15 +425,17 @@ def _name_clashes(axes: list[Axis]) -> list[Finding]:
 # exact until the one rounding of each: a generator makes the float that the same value, written
 # out, gives.
 
-MOST_VALUES = 20_000_000
-_FORMS = {
+AXIS_VALUES_MAX = 20_000_000
+_GENERATOR_FORMS = {
     "linear": "{linear: [first, last], number: 10}",
     "log": "{log: [first, last], number: 10}",
     "step": "{step: [first, last, step]}",
 }
-_ALIASES = {"linspace": "linear", "geomspace": "log", "logspace": "log", "arange": "step"}
+_NUMPY_ALIASES = {"linspace": "linear", "geomspace": "log", "logspace": "log", "arange": "step"}
 """Names that generators have in NumPy."""
-_NUMBER = Numeric(about="", example="10", at_least="2", at_most=str(MOST_VALUES), whole=True)
+_NUMBER_OF_VALUES_RULE = NumericRule(
+    description="", example="10", at_least="2", at_most=str(AXIS_VALUES_MAX), is_integer=True
+)
 
 
 # Regular values, exactly
@@ -393,18 +449,18 @@ class Progression:
     increment: Fraction = Fraction(0)
     number: int = 1
 
-    def mapped(self, factor: Fraction, offset: Fraction) -> Progression:
+    def scale_and_shift(self, factor: Fraction, offset: Fraction) -> Progression:
         """Return the progression of ``factor * value + offset``."""
         return Progression(self.start * factor + offset, self.increment * factor, self.number)
 
     def values(self) -> np.ndarray:
         """Floats (number,), each the nearest to its exact value: quotients of whole numbers."""
-        common = math.lcm(self.start.denominator, self.increment.denominator)
-        first, step = int(self.start * common), int(self.increment * common)
-        return np.array([(first + step * i) / common for i in range(self.number)])
+        denominator = math.lcm(self.start.denominator, self.increment.denominator)
+        first, step = int(self.start * denominator), int(self.increment * denominator)
+        return np.array([(first + step * i) / denominator for i in range(self.number)])
 
 
-def _rounded(values: np.ndarray) -> np.ndarray:
+def _round_to_15_digits(values: np.ndarray) -> np.ndarray:
     """Values (n,) to 15 significant digits.
 
     Powers and logarithms may differ in the last bit from one machine to the next; 15 digits are
@@ -413,224 +469,245 @@ def _rounded(values: np.ndarray) -> np.ndarray:
     magnitude = np.abs(values)
     np.floor(np.log10(magnitude, where=magnitude > 0, out=np.zeros(values.shape)), out=magnitude)
     exponent = 14 - magnitude.astype(np.int64)
-    inside = np.abs(exponent) <= 22  # powers of ten that are exact floats
-    scale = 10.0 ** np.where(inside, np.abs(exponent), 0)
-    up, down = np.rint(values * scale) / scale, np.rint(values / scale) * scale
-    return np.where(inside, np.where(exponent >= 0, up, down), values)
+    has_exact_scale = np.abs(exponent) <= 22  # powers of ten that are exact floats
+    scale = 10.0 ** np.where(has_exact_scale, np.abs(exponent), 0)
+    scaled_up, scaled_down = np.rint(values * scale) / scale, np.rint(values / scale) * scale
+    return np.where(has_exact_scale, np.where(exponent >= 0, scaled_up, scaled_down), values)
 
 
-def values_in(unit: Unit, si: np.ndarray) -> np.ndarray:
+def convert_from_si(unit: Unit, si_values: np.ndarray) -> np.ndarray:
     """SI values (n,) in the given unit, to 15 significant digits."""
-    if unit.decibel:
-        return _rounded(10.0 * np.log10(si / float(unit.factor)))
+    if unit.is_logarithmic:
+        return _round_to_15_digits(10.0 * np.log10(si_values / float(unit.factor)))
     if (unit.factor, unit.offset) == (1, 0):
-        return _rounded(si.astype(float))
+        return _round_to_15_digits(si_values.astype(float))
     (p, q), (a, b) = unit.offset.as_integer_ratio(), unit.factor.as_integer_ratio()
-    ratios = (value.as_integer_ratio() for value in si.tolist())
-    return _rounded(np.array([(n * q - p * d) * b / (d * q * a) for n, d in ratios]))
+    ratios = (value.as_integer_ratio() for value in si_values.tolist())
+    return _round_to_15_digits(np.array([(n * q - p * d) * b / (d * q * a) for n, d in ratios]))
 
 
-def in_units(rule: Numeric, written: object, units: str) -> float:
+def read_in_unit(rule: NumericRule, raw_value: object, unit_name: str) -> float:
     """Written value in the unit of choice."""
-    number, unit = rule.exact(written)
-    single = Values(np.array([unit.to_si(number)]), unit, Progression(number))
-    return float(single.displayed(rule.exact(f"1 {units}" if units else 1)[1])[0])
+    number, unit = rule.read_exact(raw_value)
+    single_value = PieceValues(np.array([unit.to_si(number)]), unit, Progression(number))
+    return float(single_value.to_unit(rule.read_exact(f"1 {unit_name}" if unit_name else 1)[1])[0])
 
 
 # Written values
 
 
 @dataclass(frozen=True)
-class Values:
+class PieceValues:
     """Numbers or words of one written piece of an axis."""
 
-    si: np.ndarray
+    si_values: np.ndarray
     """SI values (n,), or words."""
     unit: Unit
     """The unit they were written in; of words none."""
     progression: Progression | None = None
     """The same numbers exactly, in `unit`, where they are regular."""
 
-    def displayed(self, unit: Unit) -> np.ndarray:
+    def to_unit(self, unit: Unit) -> np.ndarray:
         """Values (n,) in the unit of choice."""
         if self.progression is not None and unit == self.unit:
             return self.progression.values()
-        if self.progression is None or unit.decibel or self.unit.decibel:
-            return values_in(unit, self.si)
+        if self.progression is None or unit.is_logarithmic or self.unit.is_logarithmic:
+            return convert_from_si(unit, self.si_values)
         offset = (self.unit.offset - unit.offset) / unit.factor
-        return self.progression.mapped(self.unit.factor / unit.factor, offset).values()
+        return self.progression.scale_and_shift(self.unit.factor / unit.factor, offset).values()
 
-    def repeated(self, number: int) -> Values:
+    def repeat(self, number: int) -> PieceValues:
         """Return a single value as often as asked."""
         progression = self.progression and replace(self.progression, number=number)
-        return replace(self, si=np.repeat(self.si, number), progression=progression)
+        return replace(self, si_values=np.repeat(self.si_values, number), progression=progression)
 
 
-def read_pieces(written: object, rule: Rule, location: Location) -> list[Values]:
+def read_pieces(raw_value: object, rule: Rule, location: Location) -> list[PieceValues]:
     """Values of an axis over one field: a list of values and generators, or one generator."""
-    if isinstance(written, dict):
-        return [_read_generator(written, rule, location)]
-    if not isinstance(written, list):
-        example = getattr(rule, "example", "") if written is None else written
-        remedy = f"write e.g. [{example}] or {_FORMS['linear']}"
-        raise rejected(location, "must be a list or a generator", remedy, written)
-    if not written:
-        raise rejected(location, "holds no value", "list at least one")
-    pieces: list[Values] = []
+    if isinstance(raw_value, dict):
+        return [_read_generator(raw_value, rule, location)]
+    if not isinstance(raw_value, list):
+        example = getattr(rule, "example", "") if raw_value is None else raw_value
+        remedy = f"write e.g. [{example}] or {_GENERATOR_FORMS['linear']}"
+        raise findings_error(location, "must be a list or a generator", remedy, raw_value)
+    if not raw_value:
+        raise findings_error(location, "holds no value", "list at least one")
+    pieces: list[PieceValues] = []
     findings = Findings()
-    for i, piece in enumerate(written):
-        read = _read_generator if isinstance(piece, dict) else read_single
-        with findings.of():
-            pieces.append(read(piece, rule, (*location, i)))
-    findings.refuse_any()
+    for i, piece in enumerate(raw_value):
+        read_piece = _read_generator if isinstance(piece, dict) else read_single_value
+        with findings.collect():
+            pieces.append(read_piece(piece, rule, (*location, i)))
+    findings.raise_if_any()
     return pieces
 
 
-def read_single(written: object, rule: Rule, location: Location) -> Values:
+def read_single_value(raw_value: object, rule: Rule, location: Location) -> PieceValues:
     """One value: of numeric fields with its unit, of others the word."""
     try:
-        value = rule.read(written)
-        if not isinstance(rule, Numeric):
-            return Values(np.array([str(value)]), Unit(""))
-        number, unit = rule.exact(written)
+        value = rule.read(raw_value)
+        if not isinstance(rule, NumericRule):
+            return PieceValues(np.array([str(value)]), Unit(""))
+        number, unit = rule.read_exact(raw_value)
     except QuantityError as error:
-        raise rejected(location, error.rule, error.suggestion, written) from None
-    kind = np.int64 if rule.whole else np.float64
-    return Values(np.array([value], dtype=kind), unit, Progression(number))
+        raise findings_error(location, error.rule, error.suggestion, raw_value) from None
+    dtype = np.int64 if rule.is_integer else np.float64
+    return PieceValues(np.array([value], dtype=dtype), unit, Progression(number))
 
 
-def _read_generator(written: dict[Any, Any], rule: Rule, location: Location) -> Values:
+def _read_generator(raw_generator: dict[Any, Any], rule: Rule, location: Location) -> PieceValues:
     """Values of ``{linear: ...}``, ``{log: ...}`` or ``{step: ...}``, within the field's bounds."""
-    kinds = [key for key in written if key in _FORMS]
-    if len(kinds) != 1:
-        name, value = next(iter(written.items()), ("", None))
-        remedy = near_miss(_ALIASES.get(str(name), str(name)), _FORMS)
-        if isinstance(value, list) and name not in _ALIASES and len(written) == 1:
+    given_forms = [key for key in raw_generator if key in _GENERATOR_FORMS]
+    if len(given_forms) != 1:
+        name, value = next(iter(raw_generator.items()), ("", None))
+        remedy = suggest_similar_name(_NUMPY_ALIASES.get(str(name), str(name)), _GENERATOR_FORMS)
+        if isinstance(value, list) and name not in _NUMPY_ALIASES and len(raw_generator) == 1:
             remedy = remedy or f"write the list alone, without '{name}:'"
-        remedy = remedy or f"write e.g. {_FORMS['linear']}"
-        raise rejected(location, "must have exactly one of linear, log and step", remedy)
-    if not isinstance(rule, Numeric):
-        raise rejected(location, "takes words, which have no steps", "list them")
-    kind, findings = kinds[0], Findings()
-    allowed = {kind} if kind == "step" else {kind, "number"}
-    remedy = f"write {_FORMS[kind]}"
-    for key, value in written.items():
-        if key not in allowed:
-            where = (*location, str(key))
-            findings.append(Finding(where, f"is no part of '{kind}'", remedy, value))
+        remedy = remedy or f"write e.g. {_GENERATOR_FORMS['linear']}"
+        raise findings_error(location, "must have exactly one of linear, log and step", remedy)
+    if not isinstance(rule, NumericRule):
+        raise findings_error(location, "takes words, which have no steps", "list them")
+    form, findings = given_forms[0], Findings()
+    allowed_keys = {form} if form == "step" else {form, "number"}
+    remedy = f"write {_GENERATOR_FORMS[form]}"
+    for key, value in raw_generator.items():
+        if key not in allowed_keys:
+            key_location = (*location, str(key))
+            findings.append(Finding(key_location, f"is no part of '{form}'", remedy, value))
     number = 0
-    if kind != "step" and "number" not in written:
+    if form != "step" and "number" not in raw_generator:
         findings.append(Finding(location, "lacks the number of values", remedy))
-    elif kind != "step":
-        with findings.of((*location, "number"), written["number"]):
-            number = int(_NUMBER.read(written["number"]))
-    values: Values | None = None
-    with findings.of():
+    elif form != "step":
+        with findings.collect((*location, "number"), raw_generator["number"]):
+            number = int(_NUMBER_OF_VALUES_RULE.read(raw_generator["number"]))
+    values: PieceValues | None = None
+    with findings.collect():
         # Bounds are looked at even if the number of values cannot be read.
-        values = _spaced(kind, written[kind], number or 2, rule, (*location, kind))
-        if number or kind == "step":
-            _hold_to_rule(values, rule, location)
-    findings.refuse_any()
+        values = _generate_values(form, raw_generator[form], number or 2, rule, (*location, form))
+        if number or form == "step":
+            _check_bounds(values, rule, location)
+    findings.raise_if_any()
     assert values is not None
     return values
 
 
-def _spaced(kind: str, written: object, number: int, rule: Numeric, location: Location) -> Values:
+def _generate_values(
+    form: str, raw_bounds: object, number: int, rule: NumericRule, location: Location
+) -> PieceValues:
     """Values between written bounds."""
-    bounds, unit = _read_bounds(kind, written, rule, location)
-    if kind == "step":
-        return _regular(_stepped(bounds, location), unit, rule, location)
+    bounds, unit = _read_bounds(form, raw_bounds, rule, location)
+    if form == "step":
+        return _progression_values(_step_progression(bounds, location), unit, rule, location)
     if bounds[0] == bounds[1]:
-        raise rejected(location, "begins and ends with the same value", "write it as a list of one")
-    if kind == "log":
-        return _geometric(bounds, unit, number, rule, location)
+        raise findings_error(
+            location, "begins and ends with the same value", "write it as a list of one"
+        )
+    if form == "log":
+        return _geometric_values(bounds, unit, number, rule, location)
     progression = Progression(bounds[0], (bounds[1] - bounds[0]) / (number - 1), number)
-    return _regular(progression, unit, rule, location)
+    return _progression_values(progression, unit, rule, location)
 
 
 def _read_bounds(
-    kind: str, written: object, rule: Numeric, location: Location
+    form: str, raw_bounds: object, rule: NumericRule, location: Location
 ) -> tuple[list[Fraction], Unit]:
     """First, last and (for a step) increment as exact numbers in the first one's unit."""
-    count = 3 if kind == "step" else 2
-    if not isinstance(written, list) or len(written) != count:
-        raise rejected(
-            location, f"must be a list of {count} values", f"write {_FORMS[kind]}", written
+    count = 3 if form == "step" else 2
+    if not isinstance(raw_bounds, list) or len(raw_bounds) != count:
+        raise findings_error(
+            location,
+            f"must be a list of {count} values",
+            f"write {_GENERATOR_FORMS[form]}",
+            raw_bounds,
         )
-    exact: list[tuple[Fraction, Unit]] = []
+    exact_values: list[tuple[Fraction, Unit]] = []
     findings = Findings()
-    for i, text in enumerate(written):
-        with findings.of((*location, i), text):
-            exact.append(rule.exact(text))
+    for i, raw_bound in enumerate(raw_bounds):
+        with findings.collect((*location, i), raw_bound):
+            exact_values.append(rule.read_exact(raw_bound))
             if i < 2:
-                rule.read(text)
-    findings.refuse_any()
-    first = exact[0][1]
-    if any(unit.decibel != first.decibel for _, unit in exact):
-        raise rejected(location, "mixes decibels with a plain unit", "take one of them")
-    if first.decibel and any(unit.factor != first.factor for _, unit in exact):
-        raise rejected(location, "mixes units of decibels", f"take {first.text} for all")
+                rule.read(raw_bound)
+    findings.raise_if_any()
+    first_unit = exact_values[0][1]
+    if any(unit.is_logarithmic != first_unit.is_logarithmic for _, unit in exact_values):
+        raise findings_error(location, "mixes decibels with a plain unit", "take one of them")
+    if first_unit.is_logarithmic and any(
+        unit.factor != first_unit.factor for _, unit in exact_values
+    ):
+        raise findings_error(
+            location, "mixes units of decibels", f"take {first_unit.symbol} for all"
+        )
     # An increment feels no offset.
-    offsets = [exact[0][1].offset - first.offset, exact[1][1].offset - first.offset, Fraction(0)]
+    offsets = [
+        exact_values[0][1].offset - first_unit.offset,
+        exact_values[1][1].offset - first_unit.offset,
+        Fraction(0),
+    ]
     return [
-        (number * unit.factor + offset) / first.factor
-        for (number, unit), offset in zip(exact, offsets, strict=False)
-    ], first
+        (number * unit.factor + offset) / first_unit.factor
+        for (number, unit), offset in zip(exact_values, offsets, strict=False)
+    ], first_unit
 
 
-def _stepped(bounds: list[Fraction], location: Location) -> Progression:
+def _step_progression(bounds: list[Fraction], location: Location) -> Progression:
     """Values from first to last, last included where a step lands on it."""
     first, last, step = bounds
     if step == 0:
-        raise rejected(location, "has a step of zero", "list the values")
+        raise findings_error(location, "has a step of zero", "list the values")
     if (last - first) / step < 0:
         remedy = "turn its sign, or swap first and last"
-        raise rejected(location, "has a step that leads away from its end", remedy)
+        raise findings_error(location, "has a step that leads away from its end", remedy)
     number = math.floor((last - first) / step) + 1
-    if number > MOST_VALUES:
-        rule = f"gives {number} values, and an axis has at most {MOST_VALUES}"
-        raise rejected(location, rule, "take a larger step")
+    if number > AXIS_VALUES_MAX:
+        problem = f"gives {number} values, and an axis has at most {AXIS_VALUES_MAX}"
+        raise findings_error(location, problem, "take a larger step")
     return Progression(first, step, number)
 
 
-def _regular(progression: Progression, unit: Unit, rule: Numeric, location: Location) -> Values:
+def _progression_values(
+    progression: Progression, unit: Unit, rule: NumericRule, location: Location
+) -> PieceValues:
     """Values of a regular progression, whole ones where the field asks for them."""
-    if unit.decibel:
-        si = np.array([unit.to_si(Fraction(x)) for x in progression.values().tolist()])
-        return Values(si, unit, progression)
-    exact = progression.mapped(unit.factor, unit.offset)
-    if not rule.whole:
-        return Values(exact.values(), unit, progression)
-    if exact.start.denominator != 1 or exact.increment.denominator != 1:
-        raise rejected(location, "gives values that are not whole", "list them")
+    if unit.is_logarithmic:
+        si_values = np.array([unit.to_si(Fraction(x)) for x in progression.values().tolist()])
+        return PieceValues(si_values, unit, progression)
+    si_progression = progression.scale_and_shift(unit.factor, unit.offset)
+    if not rule.is_integer:
+        return PieceValues(si_progression.values(), unit, progression)
+    if si_progression.start.denominator != 1 or si_progression.increment.denominator != 1:
+        raise findings_error(location, "gives values that are not whole", "list them")
     steps = np.arange(progression.number, dtype=np.int64)
-    return Values(int(exact.start) + int(exact.increment) * steps, unit, progression)
+    return PieceValues(
+        int(si_progression.start) + int(si_progression.increment) * steps, unit, progression
+    )
 
 
-def _geometric(
-    bounds: list[Fraction], unit: Unit, number: int, rule: Numeric, location: Location
-) -> Values:
+def _geometric_values(
+    bounds: list[Fraction], unit: Unit, number: int, rule: NumericRule, location: Location
+) -> PieceValues:
     """Values with a constant ratio, spaced in SI so that the unit of the ends doesn't matter."""
-    if unit.decibel:
-        remedy = f"write {_FORMS['linear']}"
-        raise rejected(location, "steps in decibels, which are logarithms already", remedy)
+    if unit.is_logarithmic:
+        remedy = f"write {_GENERATOR_FORMS['linear']}"
+        raise findings_error(location, "steps in decibels, which are logarithms already", remedy)
     first, last = (unit.to_si(bound) for bound in bounds)
     if first <= 0 or last <= 0:
-        raise rejected(location, "must begin and end above zero")
-    si = _rounded(np.geomspace(first, last, number))
-    si[0], si[-1] = first, last
-    if not rule.whole:
-        return Values(si, unit)
-    whole = np.rint(si)
-    if np.any(np.abs(si - whole) > 1e-9 * whole):
-        raise rejected(location, "gives values that are not whole", "list them")
-    return Values(whole.astype(np.int64), unit)
+        raise findings_error(location, "must begin and end above zero")
+    si_values = _round_to_15_digits(np.geomspace(first, last, number))
+    si_values[0], si_values[-1] = first, last
+    if not rule.is_integer:
+        return PieceValues(si_values, unit)
+    rounded = np.rint(si_values)
+    if np.any(np.abs(si_values - rounded) > 1e-9 * rounded):
+        raise findings_error(location, "gives values that are not whole", "list them")
+    return PieceValues(rounded.astype(np.int64), unit)
 
 
-def _hold_to_rule(values: Values, rule: Numeric, location: Location) -> None:
+def _check_bounds(values: PieceValues, rule: NumericRule, location: Location) -> None:
     """Values within the bounds of their field, or a finding that names the first outside."""
-    broken = rule.first_outside(values.si)
-    if broken is not None:
-        index, words = broken
-        value = f"{values.displayed(values.unit)[index]:.12g} {values.unit.text}".rstrip()
-        raise rejected(location, f"{words}, and value {index + 1} of the generator is {value}")
+    violation = rule.first_out_of_bounds(values.si_values)
+    if violation is not None:
+        index, problem = violation
+        value_text = f"{values.to_unit(values.unit)[index]:.12g} {values.unit.symbol}".rstrip()
+        raise findings_error(
+            location, f"{problem}, and value {index + 1} of the generator is {value_text}"
+        )

@@ -8,15 +8,15 @@ from typing import Any
 from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
-from sweep.spec.parts import all_parts, fields_of, rule_of
-from sweep.spec.reading import library
-from sweep.spec.rules import Json, Numeric, Rule
+from sweep.spec.fields import fields_by_name, reachable_models, rule_of_field
+from sweep.spec.rules import Json, NumericRule, Rule
 from sweep.spec.sections import parameter_rules
-from sweep.spec.study import SceneSpec, Spec
+from sweep.spec.specs import GridSpec, SceneSpec
+from sweep.spec.yaml_document import library_instruments
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
-_INSTRUMENT_SECTIONS = ("Laser", "Chirp", "Telescope", "Receiver", "Processing")
+_INSTRUMENT_MODEL_NAMES = ("Laser", "Chirp", "Telescope", "Receiver", "Processing")
 
 
 def json_schema() -> Json:
@@ -25,33 +25,33 @@ def json_schema() -> Json:
     Values of parameters are described by field. Fields that an axis or an instrument file may
     supply are not required by it; `sweep.load` does require them.
     """
-    _, schema = models_json_schema([(Spec, "validation"), (SceneSpec, "validation")])
+    _, schema = models_json_schema([(GridSpec, "validation"), (SceneSpec, "validation")])
     definitions: Json = schema["$defs"]
-    for model in all_parts(Spec, SceneSpec):
-        _show_written_defaults(definitions[model.__name__]["properties"], model)
-    for name in (*_INSTRUMENT_SECTIONS, "Instrument", "Target"):
+    for model in reachable_models(GridSpec, SceneSpec):
+        _format_defaults(definitions[model.__name__]["properties"], model)
+    for name in (*_INSTRUMENT_MODEL_NAMES, "Instrument", "Target"):
         definitions[name].pop("required", None)
-    instrument, file = (
+    instrument, file_description = (
         definitions["Instrument"],
         "YAML file of the instrument, relative to this one",
     )
     instrument["description"] = "A Doppler lidar: in whole, or fields set anew of a known one"
     instrument["properties"] = {
         "like": {
-            "enum": list(library()),
+            "enum": list(library_instruments()),
             "description": "Instrument of the library, which has all fields that are not given "
             "here; sweep instruments tells of each",
         },
-        "file": {"type": "string", "description": file},
+        "file": {"type": "string", "description": file_description},
         **instrument["properties"],
     }
     rules = parameter_rules()
     for path, rule in rules.items():
         definitions[f"{path}.value"] = rule.schema()
         definitions[f"{path}.values"] = _values_schema(path, rule)
-    scene = {path: rule for path, rule in rules.items() if SceneSpec.may_vary(path)}
-    _complete(definitions["Spec"], rules, ())
-    _complete(definitions["SceneSpec"], scene, ("scene", "platform", "scanners"))
+    scene_rules = {path: rule for path, rule in rules.items() if SceneSpec.may_be_on_axis(path)}
+    _complete_study_schema(definitions["GridSpec"], rules, ())
+    _complete_study_schema(definitions["SceneSpec"], scene_rules, ("scene", "platform", "scanners"))
     return {
         "$schema": DIALECT,
         "title": "sweep study",
@@ -62,9 +62,11 @@ def json_schema() -> Json:
     }
 
 
-def _complete(study: Json, rules: Mapping[str, Rule], required: tuple[str, ...]) -> None:
+def _complete_study_schema(
+    study_schema: Json, rules: Mapping[str, Rule], required: tuple[str, ...]
+) -> None:
     """Describe a study's instrument and axes, and name what it can't do without."""
-    study["properties"]["instrument"] = {
+    study_schema["properties"]["instrument"] = {
         "description": "The instrument: its name in the library (sweep instruments), the path of "
         "its file, one of these with fields set anew, or all of it",
         "anyOf": [
@@ -72,65 +74,76 @@ def _complete(study: Json, rules: Mapping[str, Rule], required: tuple[str, ...])
             {"$ref": "#/$defs/Instrument"},
         ],
     }
-    study["properties"]["axes"] = _axes_schema(rules)
-    study["patternProperties"] = {"^x-": {"description": "Anchors for other sections; not read"}}
-    study["required"] = ["title", "instrument", *required]
+    study_schema["properties"]["axes"] = _axes_schema(rules)
+    study_schema["patternProperties"] = {
+        "^x-": {"description": "Anchors for other sections; not read"}
+    }
+    study_schema["required"] = ["title", "instrument", *required]
 
 
-def _show_written_defaults(properties: Json, model: type[BaseModel]) -> None:
+def _format_defaults(properties: Json, model: type[BaseModel]) -> None:
     """Defaults as a user would write them, in place of SI values; of single fields only."""
-    for name, field in fields_of(model).items():
-        described, rule = properties[name], rule_of(field)
-        if rule is not None and described.get("default") not in (None, "", [], {}):
-            described["default"] = rule.written(field.default)
+    for name, field in fields_by_name(model).items():
+        field_schema, rule = properties[name], rule_of_field(field)
+        if rule is not None and field_schema.get("default") not in (None, "", [], {}):
+            field_schema["default"] = rule.format(field.default)
         else:
-            described.pop("default", None)
+            field_schema.pop("default", None)
 
 
-def _reference(path: str, part: str) -> Json:
+def _definition_reference(path: str, suffix: str) -> Json:
     """Return a reference to what a field may hold."""
-    return {"$ref": f"#/$defs/{path}.{part}"}
+    return {"$ref": f"#/$defs/{path}.{suffix}"}
 
 
-def _object(properties: Json, *required: str, **more: Any) -> Json:
+def _object_schema(properties: Json, *required: str, **keywords: Any) -> Json:
     """Return the schema of a mapping with properties of its own and no other ones."""
-    needed = {"required": list(required)} if required else {}
+    required_keyword = {"required": list(required)} if required else {}
     return (
-        {"type": "object", "properties": properties, "additionalProperties": False} | needed | more
+        {"type": "object", "properties": properties, "additionalProperties": False}
+        | required_keyword
+        | keywords
     )
 
 
-def _list(items: Json, least: int = 1, **more: Any) -> Json:
-    return {"type": "array", "items": items, "minItems": least} | more
+def _list_schema(items: Json, length_min: int = 1, **keywords: Any) -> Json:
+    return {"type": "array", "items": items, "minItems": length_min} | keywords
 
 
 def _values_schema(path: str, rule: Rule) -> Json:
     """Return the schema of a list of values and generators, or of one generator."""
-    single = _reference(path, "value")
-    generators = list(_generators(single)) if isinstance(rule, Numeric) else []
-    pieces = _list({"anyOf": [single, *generators]})
-    return {"description": rule.schema()["description"], "anyOf": [pieces, *generators]}
+    value_schema = _definition_reference(path, "value")
+    generator_schemas = (
+        list(_generator_schemas(value_schema)) if isinstance(rule, NumericRule) else []
+    )
+    list_schema = _list_schema({"anyOf": [value_schema, *generator_schemas]})
+    return {"description": rule.schema()["description"], "anyOf": [list_schema, *generator_schemas]}
 
 
-def _generators(single: Json) -> Iterator[Json]:
+def _generator_schemas(value_schema: Json) -> Iterator[Json]:
     """Yield the schemas of the three generators."""
-    number = {"anyOf": [{"type": "integer", "minimum": 2}, {"type": "string"}]}
-    for kind in ("linear", "log"):
-        bounds = _list(single, 2, maxItems=2)
-        yield _object({kind: bounds, "number": number}, kind, "number")
-    steps = _list({"type": ["string", "number"]}, 3, maxItems=3)
-    yield _object({"step": steps}, "step")
+    number_schema = {"anyOf": [{"type": "integer", "minimum": 2}, {"type": "string"}]}
+    for form in ("linear", "log"):
+        bounds_schema = _list_schema(value_schema, 2, maxItems=2)
+        yield _object_schema({form: bounds_schema, "number": number_schema}, form, "number")
+    steps_schema = _list_schema({"type": ["string", "number"]}, 3, maxItems=3)
+    yield _object_schema({"step": steps_schema}, "step")
 
 
 def _axes_schema(rules: Mapping[str, Rule]) -> Json:
     """Axes by path, each with its own field's values, and zipped axes by any other name."""
-    either = {
-        path: {"anyOf": [_reference(path, "value"), _reference(path, "values")]} for path in rules
+    value_schemas = {
+        path: {
+            "anyOf": [_definition_reference(path, "value"), _definition_reference(path, "values")]
+        }
+        for path in rules
     }
-    piece = _object(either, minProperties=1)
+    piece_schema = _object_schema(value_schemas, minProperties=1)
     return {
         "type": "object",
         "description": "Parameters that vary: a list, a generator, or a zipped axis by any name",
-        "properties": {path: _reference(path, "values") for path in rules},
-        "additionalProperties": _object({"zip": {"anyOf": [piece, _list(piece)]}}, "zip"),
+        "properties": {path: _definition_reference(path, "values") for path in rules},
+        "additionalProperties": _object_schema(
+            {"zip": {"anyOf": [piece_schema, _list_schema(piece_schema)]}}, "zip"
+        ),
     }

@@ -12,7 +12,7 @@ from typing import Any, Self
 
 from pydantic import BaseModel, model_validator
 
-import sweep.spec.parts as of
+import sweep.spec.fields as declare
 from sweep.model import waveform
 from sweep.model.accuracy import AUTOMATIC, COUNTED
 from sweep.model.beam import COUPLINGS
@@ -21,315 +21,349 @@ from sweep.model.estimators import ESTIMATORS, PEAK_BIN
 from sweep.model.ground import LAWS
 from sweep.model.looks import COMBINED, SPECKLES
 from sweep.model.threshold import PROCESSING, WAYS
-from sweep.spec.parts import Part, rules_of, with_modes, with_parameters
-from sweep.spec.rules import Method, Rule, Window, broken, near_miss
+from sweep.spec.fields import SpecSection, add_effect_modes, add_effect_parameters, rules_by_path
+from sweep.spec.rules import (
+    ChoiceOrFunctionRule,
+    Rule,
+    WindowFunctionRule,
+    rule_error,
+    suggest_similar_name,
+)
 
 ARCHITECTURES = ("homodyne", "heterodyne", "direct")
-_WATTS = ("1e-18 W", "1e9 W")
-_HERTZ = ("1 mHz", "1e15 Hz")
-_OHMS = ("1 uohm", "1e12 ohm")
-_WAIST = ("5 mm", "100 nm", "1 km")
+_POWER_BOUNDS = ("1e-18 W", "1e9 W")
+_FREQUENCY_BOUNDS = ("1 mHz", "1e15 Hz")
+_RESISTANCE_BOUNDS = ("1 uohm", "1e12 ohm")
+_WAIST_EXAMPLE_AND_BOUNDS = ("5 mm", "100 nm", "1 km")
 
 
-@with_parameters("instrument.laser")
-class Laser(Part):
+@add_effect_parameters("instrument.laser")
+class Laser(SpecSection):
     """Transmitter: wavelength, power and beam."""
 
-    wavelength: float = of.length("Optical wavelength", "1550 nm", "1 nm", "100 m")
-    power: float = of.quantity("Transmitted optical power", "W", "1 W", *_WATTS)
-    beam_divergence: float = of.angle(
+    wavelength: float = declare.length("Optical wavelength", "1550 nm", "1 nm", "100 m")
+    power: float = declare.quantity("Transmitted optical power", "W", "1 W", *_POWER_BOUNDS)
+    beam_divergence: float = declare.angle(
         "Full angle of the beam, for a Gaussian beam between its 1/e^2 points; or give beam_waist",
-        "50 urad", "1e-12 rad", "90 deg", default=0.0, word="none",
+        "50 urad", "1e-12 rad", "90 deg", default=0.0, keyword="none",
     )  # fmt: skip
-    beam_waist: float = of.length(
+    beam_waist: float = declare.length(
         "1/e^2 radius of the beam as it leaves the telescope; or give beam_divergence",
-        *_WAIST, default=0.0, word="none",
+        *_WAIST_EXAMPLE_AND_BOUNDS, default=0.0, keyword="none",
     )  # fmt: skip
-    beam_quality: float = of.number(
+    beam_quality: float = declare.number(
         "M^2 of the sent beam; 1 for a beam at the limit of diffraction",
         "1.2", "1", "1e6", default=1.0,
     )  # fmt: skip
-    focus: float = of.length(
+    focus: float = declare.length(
         "Distance at which the telescope is focused; none: at infinity",
-        "20 m", "1 mm", "1e15 m", default=0.0, word="none",
+        "20 m", "1 mm", "1e15 m", default=0.0, keyword="none",
     )  # fmt: skip
 
 
-@with_parameters("instrument.chirp")
-class Chirp(Part):
+@add_effect_parameters("instrument.chirp")
+class Chirp(SpecSection):
     """Segments of a shot: linear sweeps of the frequency, and the light without one."""
 
-    bandwidth: float = of.quantity("Frequency swept in one chirp", "Hz", "1 GHz", *_HERTZ)
-    start_frequency: float = of.quantity(
+    bandwidth: float = declare.quantity(
+        "Frequency swept in one chirp", "Hz", "1 GHz", *_FREQUENCY_BOUNDS
+    )
+    start_frequency: float = declare.quantity(
         "Frequency at which the chirp starts", "Hz", "5.5 GHz", "0 Hz", "1e15 Hz"
     )
-    duration: float = of.duration("Length of one segment", "500 us", "1 ps", "1e6 s")
-    segments: str = of.choice(
+    duration: float = declare.duration("Length of one segment", "500 us", "1 ps", "1e6 s")
+    segments: str = declare.choice(
         "Segments of a shot in the order of time: up- and down-chirp, and the light without a "
         "chirp, which tells the Doppler shift alone. 'up down' is the triangle of automotive "
         "lidars, whose beats are read as |f_d| < f_r. Direct detection has none without a chirp",
         waveform.ORDERS,
     )
-    doppler_slope: float = of.number(
+    doppler_slope: float = declare.number(
         "Chirp rate of the segment 'doppler' over that of the segment 'up', with its sign: 0 for "
         "light without a chirp",
         "0.5", "-1000", "1000", default=0.0,
     )  # fmt: skip
-    down_slope: float = of.number(
+    down_slope: float = declare.number(
         "Chirp rate of the segment 'down' over that of the segment 'up', with its sign: -1 for a "
         "down-chirp as steep, 0.5 for a second up-chirp half as steep. With slopes other than 0 "
         "and -1 range and velocity are a weighted least-squares fit to the beats of all segments "
         "that are detected",
         "-0.5", "-1000", "1000", default=-1.0,
     )  # fmt: skip
-    gap: float = of.duration(
+    gap: float = declare.duration(
         "Time from the end of a segment to the start of the next", "5 us", "0 s", "1e6 s",
         default=0.0,
     )  # fmt: skip
 
 
-@with_parameters("instrument.telescope")
-class Telescope(Part):
+@add_effect_parameters("instrument.telescope")
+class Telescope(SpecSection):
     """Receiving optics."""
 
-    aperture: float = of.length("Diameter of the aperture", "25 mm", "1 um", "1 km")
-    optical_efficiency: float = of.number(
+    aperture: float = declare.length("Diameter of the aperture", "25 mm", "1 um", "1 km")
+    optical_efficiency: float = declare.number(
         "Fraction of the collected light that reaches the detector", "0.8", "1e-12", "1",
         default=1.0, is_power_ratio=True,
     )  # fmt: skip
-    coupling: str = of.choice(
+    coupling: str = declare.choice(
         "Light that mixes with the local oscillator: that of a single mode, or all in "
         "the aperture, as the thesis has it; direct detection always has all",
         COUPLINGS,
     )
 
 
-@with_parameters("instrument.receiver")
-class Receiver(Part):
+@add_effect_parameters("instrument.receiver")
+class Receiver(SpecSection):
     """Detector, local oscillator and amplifiers."""
 
-    responsivity: float = of.quantity(
+    responsivity: float = declare.quantity(
         "Responsivity at unit gain", "A/W", "1.1 A/W", "1e-9 A/W", "1e3 A/W"
     )
-    detector_bandwidth: float = of.quantity(
-        "Electrical bandwidth of the detector", "Hz", "400 MHz", *_HERTZ
+    detector_bandwidth: float = declare.quantity(
+        "Electrical bandwidth of the detector", "Hz", "400 MHz", *_FREQUENCY_BOUNDS
     )
-    optical_passband: float = of.length("Width of the optical filter", "25 nm", "0 m", "100 m")
-    noise_equivalent_power: float = of.quantity(
+    optical_passband: float = declare.length("Width of the optical filter", "25 nm", "0 m", "100 m")
+    noise_equivalent_power: float = declare.quantity(
         "Noise-equivalent power density of the detector",
         "W/Hz^0.5", "5 pW/rtHz", "0 W/Hz^0.5", "100 W/Hz^0.5",
     )  # fmt: skip
-    transimpedance: float = of.quantity(
-        "Gain of the transimpedance amplifier", "ohm", "7 kohm", *_OHMS
+    transimpedance: float = declare.quantity(
+        "Gain of the transimpedance amplifier", "ohm", "7 kohm", *_RESISTANCE_BOUNDS
     )
-    amplifier_bandwidth: float = of.quantity(
-        "Electrical bandwidth of the amplifier", "Hz", "400 MHz", *_HERTZ
+    amplifier_bandwidth: float = declare.quantity(
+        "Electrical bandwidth of the amplifier", "Hz", "400 MHz", *_FREQUENCY_BOUNDS
     )
-    amplifier_noise_current: float = of.quantity(
+    amplifier_noise_current: float = declare.quantity(
         "Input-referred noise current of the amplifier, rms over its bandwidth",
         "A", "25 nA", "0 A", "1 kA",
     )  # fmt: skip
-    antialias_bandwidth: float = of.quantity(
+    antialias_bandwidth: float = declare.quantity(
         "Bandwidth of a Butterworth low-pass between amplifier and ADC, 3 dB down there; none: no "
         "filter but the poles of detector and amplifier. At most the sample rate",
-        "Hz", "250 MHz", *_HERTZ, default=0.0, word="none",
+        "Hz", "250 MHz", *_FREQUENCY_BOUNDS, default=0.0, keyword="none",
     )  # fmt: skip
-    antialias_order: int = of.count(
+    antialias_order: int = declare.count(
         "Order of that filter, whose stop band falls by 6 dB an octave and order", "6", "3", "12",
         default=6,
     )  # fmt: skip
-    noise_shape: str = of.choice(
+    noise_shape: str = declare.choice(
         "Density of the receiver's noise: shaped by its bandwidths as signals are, or "
         "white over the record",
         ("receiver", "white"),
     )
-    architecture: str = of.choice("How the echo is detected", ARCHITECTURES)
-    record: str = of.choice(
+    architecture: str = declare.choice("How the echo is detected", ARCHITECTURES)
+    record: str = declare.choice(
         "Samples of a record: real, or complex from I and Q behind a 90 deg hybrid, which keep the "
         "beat's sign: no folding, twice as many bins, and the noise of two receivers in each; "
         "coherent receivers only",
         ("real", "complex"),
     )
-    local_oscillator_power: float = of.quantity(
-        "Power of the local oscillator; direct detection has none", "W", "1 mW", *_WATTS,
+    local_oscillator_power: float = declare.quantity(
+        "Power of the local oscillator; direct detection has none", "W", "1 mW", *_POWER_BOUNDS,
         default=1e-3,
     )  # fmt: skip
-    local_oscillator_waist: float = of.length(
+    local_oscillator_waist: float = declare.length(
         "1/e^2 radius at the telescope of the beam that the local oscillator would make; "
         "none: the sent beam's. single_mode only",
-        *_WAIST, default=0.0, word="none",
+        *_WAIST_EXAMPLE_AND_BOUNDS, default=0.0, keyword="none",
     )  # fmt: skip
-    mixing_efficiency: float = of.number(
+    mixing_efficiency: float = declare.number(
         "Heterodyne efficiency: share of the echo's power that mixes with the local "
         "oscillator, as which it counts in the SNR",
         "0.7", "1e-9", "1", default=1.0, is_power_ratio=True,
     )  # fmt: skip
-    apd_gain: float = of.number("Avalanche gain; 1 for a PIN diode", "10", "1", "1e9", default=1.0)
-    excess_noise_factor: float = of.number(
+    apd_gain: float = declare.number(
+        "Avalanche gain; 1 for a PIN diode", "10", "1", "1e9", default=1.0
+    )
+    excess_noise_factor: float = declare.number(
         "Excess noise factor of the avalanche", "2.5", "1", "1e9", default=1.0
     )
-    noise_figure: float = of.quantity(
+    noise_figure: float = declare.quantity(
         "Noise figure of the radio-frequency stages; heterodyne only",
         "dB", "3 dB", "0 dB", "300 dB", default=1.0,
     )  # fmt: skip
-    modulation_index: float = of.number(
+    modulation_index: float = declare.number(
         "Depth of the intensity modulation; direct only", "0.9", "1e-9", "1", default=1.0
     )
-    load_resistance: float = of.quantity(
+    load_resistance: float = declare.quantity(
         "Load whose thermal noise limits direct detection; direct only",
-        "ohm", "50 ohm", *_OHMS, default=50.0,
+        "ohm", "50 ohm", *_RESISTANCE_BOUNDS, default=50.0,
     )  # fmt: skip
-    temperature: float = of.quantity(
+    temperature: float = declare.quantity(
         "Temperature of the load; direct only", "K", "290 K", "1 nK", "1e9 K", default=290.0
     )
 
 
-class Detector(Part):
+class Detector(SpecSection):
     """Detector of bins in a spectrum, where whole spectra are drawn."""
 
-    kind: str = of.field(
-        Method(about="Detector: fixed threshold or CFAR", options=tuple(DETECTORS)), FIXED
+    kind: str = declare.field_of_rule(
+        ChoiceOrFunctionRule(
+            description="Detector: fixed threshold or CFAR", options=tuple(DETECTORS)
+        ),
+        FIXED,
     )
-    training: int = of.count(
+    training: int = declare.count(
         "Training cells of a CFAR detector, half of them on either side; even",
         "32", "2", "100000", default=32,
     )  # fmt: skip
-    guard: int = of.count(
+    guard: int = declare.count(
         "Guard cells on either side of the bin, which train nothing", "4", "0", "100000", default=4
     )
-    rank: int = of.count(
+    rank: int = declare.count(
         "Rank of OS-CFAR's training cell, 1 for the least; auto: three quarters of them",
-        "24", "1", "100000", default=0, word="auto",
+        "24", "1", "100000", default=0, keyword="auto",
     )  # fmt: skip
-    pfa: float = of.number(
+    pfa: float = declare.number(
         "Design probability of a false alarm in a bin of noise, of CFAR detectors",
         "1e-6", "1e-30", "0.5", default=1e-6,
     )  # fmt: skip
 
 
-class Estimator(Part):
+class Estimator(SpecSection):
     """Estimator that places a detected peak between bins, where whole spectra are drawn."""
 
-    kind: str = of.field(
-        Method(about="Estimator of the peak's frequency", options=tuple(ESTIMATORS)), PEAK_BIN
+    kind: str = declare.field_of_rule(
+        ChoiceOrFunctionRule(
+            description="Estimator of the peak's frequency", options=tuple(ESTIMATORS)
+        ),
+        PEAK_BIN,
     )
 
 
-def _looked_for(about: str, *rule: str) -> Any:
+def _search_limit_field(description: str, *rule_arguments: str) -> Any:
     """Field of an end of the search band."""
-    whole = f"{about}, as a segment starts; a search band has all four ends, and without them the "
-    whole += "whole record is searched. What lies outside is neither detected nor a false alarm"
-    return of.quantity(whole, *rule, default=None)
+    full_description = (
+        f"{description}, as a segment starts; a search band has all four ends, and without them "
+        "the "
+    )
+    full_description += (
+        "whole record is searched. What lies outside is neither detected nor a false alarm"
+    )
+    return declare.quantity(full_description, *rule_arguments, default=None)
 
 
-class Search(Part):
+class SearchBand(SpecSection):
     """Band of ranges and radial velocities that is searched: those bins that they put a beat in."""
 
-    min_range: float | None = _looked_for("Least range looked for", "m", "10 m", "0 m")
-    max_range: float | None = _looked_for("Largest range looked for", "m", "2 km", "0 m")
-    min_radial_velocity: float | None = _looked_for(
+    min_range: float | None = _search_limit_field("Least range looked for", "m", "10 m", "0 m")
+    max_range: float | None = _search_limit_field("Largest range looked for", "m", "2 km", "0 m")
+    min_radial_velocity: float | None = _search_limit_field(
         "Least radial velocity looked for, positive when closing", "m/s", "-5 m/s"
     )
-    max_radial_velocity: float | None = _looked_for(
+    max_radial_velocity: float | None = _search_limit_field(
         "Largest radial velocity looked for, positive when closing", "m/s", "40 m/s"
     )
 
 
-def _design_pfa(where: str) -> Any:
+def _design_pfa_field(noise_scope: str) -> Any:
     """Field of a probability of a false alarm that the threshold is set by."""
-    about = f"Instead of tnr: probability that noise alone raises a false alarm in {where}"
-    return of.number(about, "1e-6", "1e-300", "0.99", default=None)
+    description = (
+        f"Instead of tnr: probability that noise alone raises a false alarm in {noise_scope}"
+    )
+    return declare.number(description, "1e-6", "1e-300", "0.99", default=None)
 
 
-@with_parameters("instrument.processing")
-class Processing(Part):
+@add_effect_parameters("instrument.processing")
+class Processing(SpecSection):
     """Sampling, transform and threshold."""
 
-    sample_rate: float = of.quantity("Rate of the ADC", "Hz", "600 MHz", *_HERTZ)
-    fft_size: int = of.count("Points of the FFT", "2^17", "2", "2^30")
-    tnr: float | None = of.number(
+    sample_rate: float = declare.quantity("Rate of the ADC", "Hz", "600 MHz", *_FREQUENCY_BOUNDS)
+    fft_size: int = declare.count("Points of the FFT", "2^17", "2", "2^30")
+    tnr: float | None = declare.number(
         "Threshold over the standard deviation of a noise-only bin's magnitude",
         "10", "1e-6", "1e6", default=None,
     )  # fmt: skip
-    threshold_to_mean: float | None = of.number(
+    threshold_to_mean: float | None = declare.number(
         "Instead of tnr: threshold over the mean of a noise-only bin's magnitude",
         "4", "1e-6", "1e6", default=None,
     )  # fmt: skip
-    design_pfa_bin: float | None = _design_pfa("a bin")
-    design_pfa_segment: float | None = _design_pfa("any bin of a segment, the up-chirp's")
-    design_pfa_shot: float | None = _design_pfa("any segment of a shot")
-    window: str = of.field(
-        Window(about="Window function, by scipy.signal's name, with its parameters"), "hamming"
+    design_pfa_bin: float | None = _design_pfa_field("a bin")
+    design_pfa_segment: float | None = _design_pfa_field("any bin of a segment, the up-chirp's")
+    design_pfa_shot: float | None = _design_pfa_field("any segment of a shot")
+    window: str = declare.field_of_rule(
+        WindowFunctionRule(
+            description="Window function, by scipy.signal's name, with its parameters"
+        ),
+        "hamming",
     )
-    acquisition_delay: float = of.duration(
+    acquisition_delay: float = declare.duration(
         "Time from the start of a segment to its first sample", "70 us", "0 s", "1e6 s", default=0.0
     )
-    bins_counted: str = of.choice(
+    bins_counted: str = declare.choice(
         "Bins that may raise a false alarm: half the FFT, as a real record has, or all",
         ("half", "all"),
     )
-    detection: str = of.choice(
+    detection: str = declare.choice(
         "Bins by which an echo is detected: any that it occupies, or the largest alone",
         ("any_bin", "peak_bin"),
     )
-    shot_detection: str = of.choice(
+    shot_detection: str = declare.choice(
         "Segments in which a shot is detected: both chirps; or any two of three, which still tell "
         "range and velocity where the third is missed",
         waveform.SHOT_DETECTIONS,
     )
-    peaks: str = of.choice(
+    peaks: str = declare.choice(
         "Peaks of a segment that are reported: all that cross the threshold; or the strongest "
         "alone, which may be another than the echo's (p_wrong_range); in grids without draws, and "
         "in flights that draw whole spectra",
         waveform.REPORTED_PEAKS,
     )
-    two_beats: str = of.choice(
+    two_beats: str = declare.choice(
         "What is taken for granted where two beats of a real record tell range and velocity: far, "
         "the range beat of a chirp exceeds the Doppler shift (and where one of them is of the "
         "light without a chirp, the target is closing); fast, the Doppler shift exceeds them",
         waveform.ASSUMPTIONS,
     )
-    noise_bins: str = of.choice(
+    noise_bins: str = declare.choice(
         "Noise of bins: correlated as window and padding make it, and real at DC and "
         "Nyquist; or independent and circular, as the thesis takes it",
         ("correlated", "independent"),
     )
-    search: Search = Search()
+    search: SearchBand = SearchBand()
     detector: Detector = Detector()
     estimator: Estimator = Estimator()
 
     @model_validator(mode="after")
-    def _one_threshold(self) -> Self:
+    def _check_single_threshold(self) -> Self:
         """Refuse a threshold that is not set, or that is set in several ways."""
-        ways = [way.removeprefix(PROCESSING) for way in WAYS]
-        given = [way for way in ways if getattr(self, way) is not None]
-        if len(given) != 1:
-            rule = (
-                f"sets the threshold by {' and by '.join(given)}" if given else "has no threshold"
+        threshold_fields = [field_name.removeprefix(PROCESSING) for field_name in WAYS]
+        given_fields = [
+            field_name for field_name in threshold_fields if getattr(self, field_name) is not None
+        ]
+        if len(given_fields) != 1:
+            problem = (
+                f"sets the threshold by {' and by '.join(given_fields)}"
+                if given_fields
+                else "has no threshold"
             )
-            remedy = "keep one of them" if given else f"write 'tnr: 10', or {', '.join(ways[1:])}"
-            raise broken(rule, remedy)
+            remedy = (
+                "keep one of them"
+                if given_fields
+                else f"write 'tnr: 10', or {', '.join(threshold_fields[1:])}"
+            )
+            raise rule_error(problem, remedy)
         return self
 
 
-class LooksOfShot(Part):
+class LooksOfShot(SpecSection):
     """Several records of each segment, from which a shot is detected: the waveform N times over."""
 
-    number: int = of.count(
+    number: int = declare.count(
         "Records of each segment. A shot lasts so many times as long, and false alarms are those "
         "of all its records together",
         "8", "1", "256", default=1,
     )  # fmt: skip
-    combine: str = of.choice(
+    combine: str = declare.choice(
         "Detection from several records: by their mean power, by the number of those that cross, "
         "or by their sum in amplitude, with the phases that a steady velocity makes put right. "
         "tnr and threshold_to_mean are over the noise of one record, or of the mean of a sum",
         COMBINED,
     )
-    votes: int = of.count(
+    votes: int = declare.count(
         "Records that must cross in a bin; binary only", "3", "1", "256", default=1
     )
-    speckle: str = of.choice(
+    speckle: str = declare.choice(
         "Speckle of the records: as the motion from one to the next changes it; common to all; or "
         "independent, where the beam moves on by its own width. Surfaces of a stated "
         "target.roughness have one speckle for all records of a shot",
@@ -337,7 +371,7 @@ class LooksOfShot(Part):
     )
 
 
-class Instrument(Part):
+class Instrument(SpecSection):
     """A Doppler lidar."""
 
     laser: Laser
@@ -351,150 +385,156 @@ class Instrument(Part):
 # Target, footprint, air and effects; accuracy, draws, storage and execution of a study
 
 
-def sunlight(on: str) -> Any:
+def sunlight_field(illuminated: str) -> Any:
     """Field of the sunlight on something."""
-    about = f"Spectral irradiance of sunlight on the {on}"
-    return of.quantity(
-        about, "W/m^3", "0.5 W/m^2/nm", "0 W/m^3", "1e18 W/m^3", default=0.0
+    description = f"Spectral irradiance of sunlight on the {illuminated}"
+    return declare.quantity(
+        description, "W/m^3", "0.5 W/m^2/nm", "0 W/m^3", "1e18 W/m^3", default=0.0
     )  # fmt: skip
 
 
-SHARE_SCATTERED = of.number("Fraction of light scattered back", "0.1", "0", "1")
+REFLECTANCE_FIELD = declare.number("Fraction of light scattered back", "0.1", "0", "1")
 """Field of a reflectance."""
 
 
-@with_parameters("target")
-class Target(Part):
+@add_effect_parameters("target")
+class Target(SpecSection):
     """A flat plane, seen at an angle."""
 
-    range: float = of.length("Distance to the target", "2 km", "1 nm", "1e15 m")
-    grazing_angle: float = of.angle(
+    range: float = declare.length("Distance to the target", "2 km", "1 nm", "1e15 m")
+    grazing_angle: float = declare.angle(
         "Angle between beam and surface, 90 deg along the normal", "15 deg", "1e-6 deg", "90 deg"
     )
-    reflectance: float = SHARE_SCATTERED
-    reflectance_law: str = of.choice(
+    reflectance: float = REFLECTANCE_FIELD
+    reflectance_law: str = declare.choice(
         "How it scatters: Lambertian, as regolith, or as the thesis has it", LAWS, "lambert"
     )
-    radial_velocity: float = of.quantity(
+    radial_velocity: float = declare.quantity(
         "Speed along the line of sight, positive when closing", "m/s", "150 m/s", default=0.0
     )
-    solar_irradiance: float = sunlight("target")
+    solar_irradiance: float = sunlight_field("target")
 
 
-@with_parameters("footprint")
-class Footprint(Part):
+@add_effect_parameters("footprint")
+class Footprint(SpecSection):
     """The spot on the target, as a sum of beamlets."""
 
-    beamlets: int = of.count(
+    beamlets: int = declare.count(
         "Number of beamlets; auto: as many as accuracy.tolerance needs where powers add "
         "(each point of a plane and each shot of a flight as many as it needs), else 109",
-        "109", "1", "100000", default=0, word="auto",
+        "109", "1", "100000", default=0, keyword="auto",
     )  # fmt: skip
-    phases: str = of.choice(
+    phases: str = declare.choice(
         "Whether the beamlets' optical phases follow the surface or average out",
         ("coherent", "incoherent"),
         "incoherent",
     )
 
 
-@with_parameters("atmosphere")
-class Atmosphere(Part):
+@add_effect_parameters("atmosphere")
+class Atmosphere(SpecSection):
     """The air between instrument and target."""
 
 
-@with_modes
-class Effects(Part):
+@add_effect_modes
+class Effects(SpecSection):
     """Modes of physical effects: simulated where the tolerance needs it, always or never."""
 
 
-def _share(about: str) -> Any:
+def _tolerance_share_field(description: str) -> Any:
     """Part of the tolerance that can be set by hand."""
-    about += "; auto: as accuracy.tolerance needs"
-    return of.number(about, "1e-6", "0", "1", default=AUTOMATIC, word="auto")
+    description += "; auto: as accuracy.tolerance needs"
+    return declare.number(description, "1e-6", "0", "1", default=AUTOMATIC, keyword="auto")
 
 
-class Accuracy(Part):
+class Accuracy(SpecSection):
     """Accuracy of the computation; part of a study's identity."""
 
-    tolerance: float = of.number(
+    tolerance: float = declare.number(
         "How far a probability of detection, log10 of one of a false alarm or a relative "
         "magnitude may be off by effects left out, all together, and where it is drawn a "
         "probability by the half-width of its interval; 0 simulates all that the scene has",
         "1e-3", "0", "1", default=1e-3,
     )  # fmt: skip
-    confidence: float = of.number(
+    confidence: float = declare.number(
         "Confidence of the intervals of probabilities of detection that a grid draws",
         "0.95", above="0", below="1", default=0.95,
     )  # fmt: skip
-    line_error: float = _share("Error of a bin, in noise sigmas, by few lines for many")
-    leakage_error: float = _share("Chance of leakage far from the lines that is not looked for")
-    leakage_floor: float = of.number(
+    line_error: float = _tolerance_share_field(
+        "Error of a bin, in noise sigmas, by few lines for many"
+    )
+    leakage_error: float = _tolerance_share_field(
+        "Chance of leakage far from the lines that is not looked for"
+    )
+    leakage_floor: float = declare.number(
         "Bins with less leaked signal than so many noise sigmas count as noise alone, "
         "where bins are taken one by one: in draws, padded FFTs, tabulated windows, under a "
         "Gaussian line; auto: as accuracy.leakage_error allows",
-        "0.1", "1e-9", "1000", default=AUTOMATIC, word="auto",
+        "0.1", "1e-9", "1000", default=AUTOMATIC, keyword="auto",
     )  # fmt: skip
 
 
-SPECTRA = "spectra"
+SPECTRA_METHOD = "spectra"
 """Method of draws that are whole spectra."""
 
 
-class Draws(Part):
+class Draws(SpecSection):
     """Random realisations of each point."""
 
-    number: int = of.count(
+    number: int = declare.count(
         "Draws a point; 0 computes probabilities alone", "10000", "0", "1e12", default=0
     )
-    limit: int = of.count(
+    limit: int = declare.count(
         "Draws of a point at most, where it draws until accuracy.tolerance is met; 0 draws "
         "draws.number instead",
         "1e5", "0", "1e12", default=0,
     )  # fmt: skip
-    batch: int = of.count("Draws that are counted together", "100", "1", "1e9", default=100)
-    method: str = of.choice(
+    batch: int = declare.count("Draws that are counted together", "100", "1", "1e9", default=100)
+    method: str = declare.choice(
         "Draw against the probabilities, add noise to the bins that matter, or draw "
         "whole spectra for instrument.processing.detector and .estimator to look at",
-        ("probabilities", "noise", SPECTRA),
+        ("probabilities", "noise", SPECTRA_METHOD),
     )
-    interval: str = of.choice(
+    interval: str = declare.choice(
         "Interval of the share of draws with a detection, where noise alone is drawn: "
         "at least as sure as promised everywhere, or on the average",
         tuple(COUNTED),
     )
 
     @property
-    def any(self) -> bool:
+    def has_draws(self) -> bool:
         """True if anything is drawn."""
-        return self.number > 0 or self.adaptive
+        return self.number > 0 or self.is_adaptive
 
     @property
-    def whole_spectra(self) -> bool:
+    def draws_whole_spectra(self) -> bool:
         """True if a detector and an estimator look at whole spectra."""
-        return self.method == SPECTRA
+        return self.method == SPECTRA_METHOD
 
     @property
-    def adaptive(self) -> bool:
+    def is_adaptive(self) -> bool:
         """True if each point is drawn until its accuracy is met."""
         return self.limit > 0
 
 
-class Storage(Part):
+class Storage(SpecSection):
     """Division of results in the store; part of a study's identity."""
 
-    block_points: int = of.count(
+    block_points: int = declare.count(
         "Points that one block holds at most; 0 for 65536, and more in studies so large that "
         "their files would be too many to handle",
         "65536", "0", "1e9", default=0,
     )  # fmt: skip
 
 
-class Execution(Part):
+class Execution(SpecSection):
     """Execution of a study; never part of its identity, as it changes no result."""
 
-    workers: int = of.count("Worker processes; 0 for one a core", "4", "0", "100000", default=0)
-    threads: int = of.count("Threads of one worker", "1", "1", "10000", default=1)
-    scheduler: str = of.text(
+    workers: int = declare.count(
+        "Worker processes; 0 for one a core", "4", "0", "100000", default=0
+    )
+    threads: int = declare.count("Threads of one worker", "1", "1", "10000", default=1)
+    scheduler: str = declare.text(
         "'none' for a plain loop without Dask; empty for workers on this machine",
         "",
         pattern="(none)?",
@@ -505,7 +545,7 @@ class Execution(Part):
 
 # Fields by dotted path: what an axis may vary
 
-SECTIONS: dict[str, type[BaseModel]] = {
+MODEL_BY_SECTION: dict[str, type[BaseModel]] = {
     "instrument": Instrument,
     "target": Target,
     "atmosphere": Atmosphere,
@@ -514,8 +554,10 @@ SECTIONS: dict[str, type[BaseModel]] = {
 }
 
 
-AXES_TAKE = f"axes take fields of {', '.join([*SECTIONS][:-1])} and {[*SECTIONS][-1]}"
-NOT_ON_AXES = (
+AXES_REMEDY = (
+    f"axes take fields of {', '.join([*MODEL_BY_SECTION][:-1])} and {[*MODEL_BY_SECTION][-1]}"
+)
+SECTIONS_NOT_ON_AXES = (
     "draws", "effects", "error_floor", "execution", "figures", "interface",
     "navigation", "platform", "question", "scanners", "scene", "seed", "storage", "title",
 )  # fmt: skip
@@ -526,36 +568,36 @@ NOT_ON_AXES = (
 def parameter_rules() -> MappingProxyType[str, Rule]:
     """Rule of every parameter that an axis may vary, by dotted path."""
     rules: dict[str, Rule] = {}
-    for section, model in SECTIONS.items():
-        rules |= rules_of(model, section)
+    for section, model in MODEL_BY_SECTION.items():
+        rules |= rules_by_path(model, section)
     return MappingProxyType(rules)
 
 
-def default_of(path: str) -> Any:
+def default_value(path: str) -> Any:
     """Default of a parameter, SI; None where it has none."""
-    section, *rest = path.split(".")
-    model: Any = SECTIONS[section]
-    for name in rest[:-1]:
+    section, *names = path.split(".")
+    model: Any = MODEL_BY_SECTION[section]
+    for name in names[:-1]:
         model = model.model_fields[name].annotation
-    field = model.model_fields[rest[-1]]
+    field = model.model_fields[names[-1]]
     return None if field.is_required() else field.default
 
 
 def short_name(path: str) -> str:
     """Last part of a parameter's path; of what a part is, the part's own name."""
-    *parts, last = path.split(".")
-    return parts[-1] if last == "kind" and parts else last
+    *parent_names, last_name = path.split(".")
+    return parent_names[-1] if last_name == "kind" and parent_names else last_name
 
 
-def parameter_suggestion(path: str, known: Iterable[str] | None = None) -> str:
+def suggest_parameter(path: str, known: Iterable[str] | None = None) -> str:
     """Suggestion for a path that names no parameter; of those known, all by default."""
-    rules = list(parameter_rules() if known is None else known)
+    paths = list(parameter_rules() if known is None else known)
     tail = short_name(path)
-    same_tail = [known for known in rules if short_name(known) == tail]
+    same_tail = [known for known in paths if short_name(known) == tail]
     if len(same_tail) == 1:
         return f"did you mean '{same_tail[0]}'?"
-    by_tail = {short_name(known): known for known in rules}
-    suggestion = near_miss(path, rules) or near_miss(tail, by_tail)
-    for short, known in by_tail.items():
-        suggestion = suggestion.replace(f"'{short}'", f"'{known}'")
-    return suggestion or AXES_TAKE
+    path_by_tail = {short_name(known): known for known in paths}
+    suggestion = suggest_similar_name(path, paths) or suggest_similar_name(tail, path_by_tail)
+    for tail_of_path, known in path_by_tail.items():
+        suggestion = suggestion.replace(f"'{tail_of_path}'", f"'{known}'")
+    return suggestion or AXES_REMEDY

@@ -36,30 +36,26 @@ from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
-from sweep.messages import printable
-from sweep.plain_files import (
-    open_below,
-    read_below,
-    refuse_larger,
-)
+from sweep.messages import escape_unprintable
+from sweep.regular_files import check_size, open_below, read_below
 
 #: Kinds of addresses; `memory` is for tests, and lives as long as its process.
-SCHEMES = ("s3", "gs", "az", "memory")
+URL_SCHEMES = ("s3", "gs", "az", "memory")
 
 #: Directory of the journal inside a store.
-JOURNAL = ".sweep"
+JOURNAL_DIR = ".sweep"
 
 #: What the name of a file ends in that is still being written.
-PARTIAL = ".partial"
+DRAFT_SUFFIX = ".partial"
 
 #: Attribute of a copy of a store with many chunks to a file.
-PACKED = "packed"
+PACKED_ATTRIBUTE = "packed"
 
 #: Requests to an object store at once: each takes some ms, nearly all of it waiting.
-REQUESTS = 16
+CONCURRENT_REQUESTS_MAX = 16
 
 #: What is tried again, and for how long: replies of 500 and more, none in time, lost connections.
-RETRIES = {
+RETRY_CONFIG = {
     "max_retries": 8,
     "retry_timeout": timedelta(seconds=90),
     "backoff": {
@@ -70,39 +66,45 @@ RETRIES = {
 }
 
 #: The same at first contact, where a wrong address is likelier than a passing fault.
-FIRST_RETRIES = {**RETRIES, "max_retries": 3, "retry_timeout": timedelta(seconds=10)}
+FIRST_CONTACT_RETRY_CONFIG = {
+    **RETRY_CONFIG,
+    "max_retries": 3,
+    "retry_timeout": timedelta(seconds=10),
+}
 
-CLIENT = {"timeout": "30s", "connect_timeout": "5s"}
+CLIENT_OPTIONS = {"timeout": "30s", "connect_timeout": "5s"}
 
-Tag = Any
+ObjectVersion = Any
 """Mark by which an object store knows a state of an object."""
 
 Item = TypeVar("Item")
-Found = TypeVar("Found")
+Result = TypeVar("Result")
 
 _clients: dict[str, Any] = {}
-_opening = threading.RLock()
+_clients_lock = threading.RLock()
 
 
 class ObjectStoreError(OSError):
     """An object store that can't be used as asked: the text says why and what to do."""
 
     def __str__(self) -> str:
-        return printable(f"{self.filename}: {self.strerror}")
+        return escape_unprintable(f"{self.filename}: {self.strerror}")
 
 
 @dataclass(frozen=True, order=True)
 class ObjectPath:
     """A key in an object store, spoken to as far as needed in the words of `pathlib`."""
 
-    root: str  # kind and bucket: s3://bucket
+    bucket_url: str  # kind and bucket: s3://bucket
     key: str  # without a slash at either end
 
     def __str__(self) -> str:
-        return f"{self.root}/{self.key}"
+        return f"{self.bucket_url}/{self.key}"
 
     def __truediv__(self, other: str) -> ObjectPath:
-        return ObjectPath(self.root, "/".join(filter(None, [self.key, str(other).strip("/")])))
+        return ObjectPath(
+            self.bucket_url, "/".join(filter(None, [self.key, str(other).strip("/")]))
+        )
 
     def joinpath(self, *others: str) -> ObjectPath:
         """Return the key below this one."""
@@ -116,7 +118,7 @@ class ObjectPath:
     @property
     def parent(self) -> ObjectPath:
         """The key without its last part."""
-        return ObjectPath(self.root, self.key.rpartition("/")[0])
+        return ObjectPath(self.bucket_url, self.key.rpartition("/")[0])
 
     def with_name(self, name: str) -> ObjectPath:
         """Return a key in the same folder."""
@@ -129,17 +131,19 @@ class ObjectPath:
     @property
     def client(self) -> Any:
         """The object store, connected once a process; the first contact checks that it exists."""
-        with _opening:
-            if self.root not in _clients:
-                with in_words(self):
-                    if not self.root.startswith("memory:"):
-                        _client(self.root, FIRST_RETRIES).list_with_delimiter(self.key or None)
-                    _clients[self.root] = _client(self.root, RETRIES)
-            return _clients[self.root]
+        with _clients_lock:
+            if self.bucket_url not in _clients:
+                with translate_errors(self):
+                    if not self.bucket_url.startswith("memory:"):
+                        _connect(self.bucket_url, FIRST_CONTACT_RETRY_CONFIG).list_with_delimiter(
+                            self.key or None
+                        )
+                    _clients[self.bucket_url] = _connect(self.bucket_url, RETRY_CONFIG)
+            return _clients[self.bucket_url]
 
-    def _head(self) -> Any:
+    def _head_object(self) -> Any:
         """Metadata of the object; None where there is none."""
-        with in_words(self), suppress(FileNotFoundError):
+        with translate_errors(self), suppress(FileNotFoundError):
             return self.client.head(self.key)
 
     def exists(self) -> bool:
@@ -148,12 +152,12 @@ class ObjectPath:
 
     def size(self) -> int:
         """Bytes of the object; -1 where there is none."""
-        head = self._head()
+        head = self._head_object()
         return -1 if head is None else int(head["size"])
 
-    def modified(self) -> float | None:
+    def last_modified(self) -> float | None:
         """Time at which the object was last written [s since the epoch]; None without one."""
-        head = self._head()
+        head = self._head_object()
         return None if head is None else float(head["last_modified"].timestamp())
 
     def read_bytes(self, bytes_max: int | None = None) -> bytes:
@@ -163,86 +167,91 @@ class ObjectPath:
         """
         from obstore.exceptions import BaseError
 
-        with in_words(self):
-            answer = self.client.get(self.key)
+        with translate_errors(self):
+            response = self.client.get(self.key)
             if bytes_max is not None:
-                refuse_larger(answer.meta["size"], bytes_max, str(self))
+                check_size(response.meta["size"], bytes_max, str(self))
             try:
-                return bytes(answer.bytes())
+                return bytes(response.bytes())
             except BaseError:
                 return bytes(self.client.get(self.key).bytes())
 
     def write_bytes(self, content: bytes) -> None:
         """Put an object, whole, in the place of whatever is there."""
-        with in_words(self):
+        with translate_errors(self):
             self.client.put(self.key, content)
 
     def unlink(self, missing_ok: bool = False) -> None:
         """Take the object away; that there is none is no error, whatever is asked for."""
-        with in_words(self), suppress(FileNotFoundError):
+        with translate_errors(self), suppress(FileNotFoundError):
             self.client.delete(self.key)
 
-    def below(self) -> Iterator[tuple[str, int]]:
+    def iter_objects_below(self) -> Iterator[tuple[str, int]]:
         """Keys under this one, relative to it, and their sizes, a page in memory at a time."""
-        with in_words(self):
+        with translate_errors(self):
             for page in self.client.list(self.key or None):
-                for found in page:
-                    yield found["path"][len(self.key) :].lstrip("/"), found["size"]
+                for entry in page:
+                    yield entry["path"][len(self.key) :].lstrip("/"), entry["size"]
 
-    def _children(self) -> list[str]:
-        with in_words(self):
-            found = self.client.list_with_delimiter(self.key or None)
-        paths = [*found["common_prefixes"], *(one["path"] for one in found["objects"])]
+    def _child_names(self) -> list[str]:
+        with translate_errors(self):
+            listing = self.client.list_with_delimiter(self.key or None)
+        paths = [*listing["common_prefixes"], *(entry["path"] for entry in listing["objects"])]
         return sorted(path.rpartition("/")[2] for path in paths)
 
     def is_dir(self) -> bool:
         """Tell whether keys lie under this one."""
-        return bool(self._children())
+        return bool(self._child_names())
 
     def glob(self, pattern: str) -> list[ObjectPath]:
         """Keys right under this one whose name fits a pattern."""
-        return [self / name for name in self._children() if fnmatch(name, pattern)]
+        return [self / name for name in self._child_names() if fnmatch(name, pattern)]
 
-    def read_tagged(self) -> tuple[bytes, Tag] | None:
+    def read_with_version(self) -> tuple[bytes, ObjectVersion] | None:
         """Return the object and the tag of what it holds; None where there is none."""
-        with in_words(self), suppress(FileNotFoundError):
-            found = self.client.get(self.key)
-            return bytes(found.bytes()), _tag(found.meta)
+        with translate_errors(self), suppress(FileNotFoundError):
+            response = self.client.get(self.key)
+            return bytes(response.bytes()), _object_version(response.meta)
         return None
 
-    def put_if(self, content: bytes, tag: Tag | None) -> Tag | None:
+    def put_if_unchanged(
+        self, content: bytes, expected_version: ObjectVersion | None
+    ) -> ObjectVersion | None:
         """Put an object if none is there, or only what has a tag; None if somebody was quicker."""
         from obstore.exceptions import AlreadyExistsError, PreconditionError
 
-        mode = "create" if tag is None else tag
-        quicker = (AlreadyExistsError, PreconditionError, FileNotFoundError)
-        with in_words(self), suppress(*quicker):
-            return _tag(self.client.put(self.key, content, mode=mode))
+        mode = "create" if expected_version is None else expected_version
+        conflict_errors = (AlreadyExistsError, PreconditionError, FileNotFoundError)
+        with translate_errors(self), suppress(*conflict_errors):
+            return _object_version(self.client.put(self.key, content, mode=mode))
         return None
 
 
-def _tag(found: Any) -> Tag:
-    return {key: found[key] for key in ("e_tag", "version") if found[key] is not None}
+def _object_version(meta: Any) -> ObjectVersion:
+    return {field: meta[field] for field in ("e_tag", "version") if meta[field] is not None}
 
 
-def _client(root: str, retries: Any) -> Any:
+def _connect(bucket_url: str, retry_config: Any) -> Any:
     from obstore.store import MemoryStore, from_url
 
-    if root.startswith("memory:"):
+    if bucket_url.startswith("memory:"):
         return MemoryStore()
-    allowed = os.environ.get("AWS_ALLOW_HTTP", "").lower() in ("1", "true", "yes")
-    options: Any = {**CLIENT, "allow_http": allowed or _endpoint().startswith("http:")}
-    return from_url(root, client_options=options, retry_config=retries)
+    allow_http = os.environ.get("AWS_ALLOW_HTTP", "").lower() in ("1", "true", "yes")
+    options: Any = {
+        **CLIENT_OPTIONS,
+        "allow_http": allow_http or _s3_endpoint().startswith("http:"),
+    }
+    return from_url(bucket_url, client_options=options, retry_config=retry_config)
 
 
-def _endpoint() -> str:
+def _s3_endpoint() -> str:
     return os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL", "")
 
 
 @contextmanager
-def in_words(where: object) -> Iterator[None]:
+def translate_errors(location: object) -> Iterator[None]:
     """Errors of an object store in words, with what to do; nothing where a path is a file's."""
-    if not isinstance(where, ObjectPath):
+    if not isinstance(location, ObjectPath):
         yield
         return
     from obstore.exceptions import BaseError
@@ -250,79 +259,91 @@ def in_words(where: object) -> Iterator[None]:
     try:
         yield
     except BaseError as error:
-        number, why = explained(str(error), where.root)
-        raise ObjectStoreError(number, why, str(where)) from error
+        error_number, explanation = classify_error_text(str(error), location.bucket_url)
+        raise ObjectStoreError(error_number, explanation, str(location)) from error
 
 
-def worded(error: Exception) -> Exception:
+def to_readable_error(error: Exception) -> Exception:
     """Put an error into words if an object store raised it through Zarr or xarray."""
     if type(error).__module__.partition(".")[0] != "obstore":
         return error
-    return ObjectStoreError(*explained(str(error), ""), "the store")
+    return ObjectStoreError(*classify_error_text(str(error), ""), "the store")
 
 
-def explained(text: str, root: str) -> tuple[int, str]:
+def classify_error_text(error_text: str, bucket_url: str) -> tuple[int, str]:
     """Return the number and words of what an object store's library says, of a kind and bucket."""
-    bucket, at = root.partition("://")[2], _endpoint() or f"the service of {root.split(':')[0]}://"
-    said = text.partition("\n\nDebug source")[0]
-    status = re.search(r"status code: (\d+ [A-Za-z ]+)|\b([45]\d\d [A-Z][a-z ]+)", said)
-    answer = (status[1] or status[2]).strip() if status else ""
-    if "NoSuchBucket" in text or "ContainerNotFound" in text:
-        return errno.ENXIO, f"{at} has no bucket {bucket!r}: make it, or mend its name"
+    bucket, service = (
+        bucket_url.partition("://")[2],
+        _s3_endpoint() or f"the service of {bucket_url.split(':')[0]}://",
+    )
+    error_summary = error_text.partition("\n\nDebug source")[0]
+    status_match = re.search(
+        r"status code: (\d+ [A-Za-z ]+)|\b([45]\d\d [A-Z][a-z ]+)", error_summary
+    )
+    http_status = (status_match[1] or status_match[2]).strip() if status_match else ""
+    if "NoSuchBucket" in error_text or "ContainerNotFound" in error_text:
+        return errno.ENXIO, f"{service} has no bucket {bucket!r}: make it, or mend its name"
     if (
-        "169.254.169.254" in text
-        or re.search(r"Missing \w*Key", said)
-        or "metadata.google.internal" in text
+        "169.254.169.254" in error_text
+        or re.search(r"Missing \w*Key", error_summary)
+        or "metadata.google.internal" in error_text
     ):
         return errno.EACCES, (
             "no credentials are set: give AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY (workers "
             "need them too); AWS_SKIP_SIGNATURE=true reads what is public"
         )
-    if answer[:3] in ("401", "403") or "PermissionDenied" in text:
+    if http_status[:3] in ("401", "403") or "PermissionDenied" in error_text:
         return errno.EACCES, (
-            f"{at} refuses access{f' ({answer})' if answer else ''}: "
+            f"{service} refuses access{f' ({http_status})' if http_status else ''}: "
             "check the credentials, and that they may list, read and write there"
         )
-    if "imed out" in text or "Timeout" in text:
-        return errno.ETIMEDOUT, f"{at} does not answer in time: try again, or look at the network"
-    if "body error" in text:
-        return errno.EIO, f"{at} cuts its answers short: try again, or look at the network"
-    if "error sending request" in text or "onnect" in said:
-        return errno.ECONNREFUSED, (
-            f"{at} can't be reached: is it up, and are AWS_ENDPOINT_URL and the network right?"
+    if "imed out" in error_text or "Timeout" in error_text:
+        return (
+            errno.ETIMEDOUT,
+            f"{service} does not answer in time: try again, or look at the network",
         )
-    if answer:
-        return errno.EIO, f"{at} keeps failing ({answer}): try again"
-    return errno.EIO, said
+    if "body error" in error_text:
+        return errno.EIO, f"{service} cuts its answers short: try again, or look at the network"
+    if "error sending request" in error_text or "onnect" in error_summary:
+        return errno.ECONNREFUSED, (
+            f"{service} can't be reached: is it up, and are AWS_ENDPOINT_URL and the network right?"
+        )
+    if http_status:
+        return errno.EIO, f"{service} keeps failing ({http_status}): try again"
+    return errno.EIO, error_summary
 
 
 Location = Path | ObjectPath
 """A place; both know `/`, `name`, `parent`, `exists()` and `read_bytes()`."""
 
 
-def located(where: str | Location) -> Location:
+def parse_location(address: str | Location) -> Location:
     """Parse a place: a path, ``s3://bucket/key``, ``gs://...``, ``az://...``."""
-    if isinstance(where, ObjectPath):
-        return where
-    if not isinstance(where, str | os.PathLike):
-        kind = type(where).__name__
-        raise TypeError(f"a store is named by its path, such as 'study.zarr', and not by a {kind}")
-    text = str(where)
-    if not re.match(rf"({'|'.join(SCHEMES)}):/", text):
-        if re.match(r"(?!file:)[A-Za-z][A-Za-z0-9+.-]+:/", text):
-            kinds = ", ".join(f"{scheme}://" for scheme in SCHEMES if scheme != "memory")
-            raise ObjectStoreError(22, f"is no place for a store: write a path, or {kinds}", text)
-        return Path(os.path.expanduser(text.removeprefix("file://")))
-    scheme, _, rest = text.partition(":")
-    bucket, _, key = rest.strip("/").partition("/")
+    if isinstance(address, ObjectPath):
+        return address
+    if not isinstance(address, str | os.PathLike):
+        type_name = type(address).__name__
+        raise TypeError(
+            f"a store is named by its path, such as 'study.zarr', and not by a {type_name}"
+        )
+    address_text = str(address)
+    if not re.match(rf"({'|'.join(URL_SCHEMES)}):/", address_text):
+        if re.match(r"(?!file:)[A-Za-z][A-Za-z0-9+.-]+:/", address_text):
+            schemes_text = ", ".join(f"{scheme}://" for scheme in URL_SCHEMES if scheme != "memory")
+            raise ObjectStoreError(
+                22, f"is no place for a store: write a path, or {schemes_text}", address_text
+            )
+        return Path(os.path.expanduser(address_text.removeprefix("file://")))
+    scheme, _, bucket_and_key = address_text.partition(":")
+    bucket, _, key = bucket_and_key.strip("/").partition("/")
     if not bucket or not key.strip("/"):
         raise ObjectStoreError(
-            22, f"is no place for a store: write {scheme}://BUCKET/NAME.zarr", text
+            22, f"is no place for a store: write {scheme}://BUCKET/NAME.zarr", address_text
         )
     return ObjectPath(f"{scheme}://{bucket}", key.strip("/"))
 
 
-def zarr_store(location: Location) -> Any:
+def to_zarr_store(location: Location) -> Any:
     """Return a place as Zarr and xarray open it."""
     if isinstance(location, Path):
         return location
@@ -331,124 +352,124 @@ def zarr_store(location: Location) -> Any:
     return StorePath(ObjectStore(location.client), location.key)
 
 
-def each(
-    location: Location, function: Callable[[Item], Found], items: Iterable[Item]
-) -> list[Found]:
+def map_concurrently(
+    location: Location, function: Callable[[Item], Result], items: Iterable[Item]
+) -> list[Result]:
     """Map a function, in order; concurrently if each call is a request over the network."""
     if isinstance(location, Path):
         return [function(item) for item in items]
-    return list(_requests().map(function, items))
+    return list(_request_pool().map(function, items))
 
 
 @cache
-def _requests() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(REQUESTS, thread_name_prefix="object-store")
+def _request_pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(CONCURRENT_REQUESTS_MAX, thread_name_prefix="object-store")
 
 
-def read_object(location: Location, name: str, bytes_max: int) -> bytes:
+def read_object(location: Location, object_name: str, bytes_max: int) -> bytes:
     """Read a file below a place whole; UnfitFileError where it is none, or larger than that."""
     if isinstance(location, ObjectPath):
-        return (location / name).read_bytes(bytes_max)
-    return read_below(location, name, bytes_max)
+        return (location / object_name).read_bytes(bytes_max)
+    return read_below(location, object_name, bytes_max)
 
 
-def names_below(location: Location) -> Iterator[str]:
+def iter_names_below(location: Location) -> Iterator[str]:
     """Names of all that is below a place but folders, relative to it, however many; also links."""
     if isinstance(location, ObjectPath):
-        yield from (name for name, _ in location.below())
+        yield from (name for name, _ in location.iter_objects_below())
         return
-    start = len(str(location)) + 1
-    yield from (entry.path[start:] for entry in entries_below(str(location)))
+    prefix_length = len(str(location)) + 1
+    yield from (entry.path[prefix_length:] for entry in iter_entries_below(str(location)))
 
 
-def entries_below(folder: str) -> Iterator[os.DirEntry[str]]:
+def iter_entries_below(folder: str) -> Iterator[os.DirEntry[str]]:
     """Everything below a folder but folders; no link is followed."""
     with os.scandir(folder) as entries:
         for entry in entries:  # no look at a file: there may be millions
             if entry.is_dir(follow_symlinks=False):
-                yield from entries_below(entry.path)
+                yield from iter_entries_below(entry.path)
             else:
                 yield entry
 
 
-def files_below(location: Location) -> dict[str, int]:
+def file_sizes_below(location: Location) -> dict[str, int]:
     """Sizes of all files below a place by their names, relative to it."""
     if isinstance(location, ObjectPath):
-        return dict(location.below())
-    return {name: (location / name).lstat().st_size for name in names_below(location)}
+        return dict(location.iter_objects_below())
+    return {name: (location / name).lstat().st_size for name in iter_names_below(location)}
 
 
-def beside(location: Location) -> Path:
+def output_dir(location: Location) -> Path:
     """Folder for what is made of a store: where it is, or here where it is in an object store."""
     return location.parent if isinstance(location, Path) else Path()
 
 
-def put_whole(location: Location, content: bytes) -> None:
+def atomic_write(location: Location, content: bytes) -> None:
     """Write a small file in one step: readers, and power cuts, find the old one or the new one."""
     if isinstance(location, ObjectPath):
         location.write_bytes(content)
     else:
-        put(str(location), content, durable=True)
+        atomic_write_file(str(location), content, durable=True)
 
 
-def put(file: str, content: bytes, *, durable: bool = False) -> None:
+def atomic_write_file(file_path: str, content: bytes, *, durable: bool = False) -> None:
     """Write a file on disk in one step, also where a directory has got into its place.
 
     A power cut can't leave the name of a `durable` one with nothing behind it.
     """
-    draft = f"{file}.{uuid.uuid4().hex}{PARTIAL}"
+    draft_path = f"{file_path}.{uuid.uuid4().hex}{DRAFT_SUFFIX}"
     try:
         try:
-            _write(draft, content, durable)
+            _write_new_file(draft_path, content, durable)
         except FileNotFoundError:
-            os.makedirs(os.path.dirname(file), exist_ok=True)
-            _write(draft, content, durable)
+            os.makedirs(os.path.dirname(file_path), exist_ok=True)
+            _write_new_file(draft_path, content, durable)
         try:
-            os.replace(draft, file)
+            os.replace(draft_path, file_path)
         except IsADirectoryError:
-            shutil.rmtree(file)
-            os.replace(draft, file)
+            shutil.rmtree(file_path)
+            os.replace(draft_path, file_path)
     except BaseException:
         with suppress(FileNotFoundError):
-            os.unlink(draft)
+            os.unlink(draft_path)
         raise
 
 
-def _write(file: str, content: bytes, durable: bool) -> None:
-    opened = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+def _write_new_file(file_path: str, content: bytes, durable: bool) -> None:
+    descriptor = os.open(file_path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
     try:
-        left = memoryview(content)
-        while left:
-            left = left[os.write(opened, left) :]
+        remaining = memoryview(content)
+        while remaining:
+            remaining = remaining[os.write(descriptor, remaining) :]
         if durable:
-            os.fsync(opened)
+            os.fsync(descriptor)
     finally:
-        os.close(opened)
+        os.close(descriptor)
 
 
-NEXT = ".next"
+STAGING_SUFFIX = ".next"
 
 #: Seconds after which what another host has half made is taken for abandoned.
-ABANDONED = 86400.0
+ABANDONED_DRAFT_AGE = 86400.0
 
 #: Seconds that the clock of a file server may be behind.
-SKEW = 60.0
+CLOCK_SKEW_MAX = 60.0
 
-_LEFT = re.compile(
+_LEFTOVER_NAME = re.compile(
     r"\.(?P<name>.+)\.(?P<state>creating|packing|replaced|removing)-"
     r"(?:(?P<host>.+)-)?(?P<pid>\d+)(?:\.(?P<start>\d+))?-[0-9a-f]{8}"
 )
 """Names of what is left by processes; those of earlier versions name no host, or no start."""
 
 #: Start of a process that is there, but hidden from other users.
-HIDDEN = -1
+HIDDEN_PROCESS = -1
 
 
 PID_MAX = 2**31 - 1
 """Largest number of a process that a system can give."""
 
 
-def process_start(pid: int) -> int:
+def process_start_id(pid: int) -> int:
     """Start of a process, which tells it from others that had its number; no clock changes it.
 
     In clock ticks since the machine was started on Linux, in hundredths of a second since the
@@ -460,48 +481,48 @@ def process_start(pid: int) -> int:
         return 0
     if sys.platform == "linux":
         try:
-            content = Path(f"/proc/{pid}/stat").read_bytes()
+            stat_line = Path(f"/proc/{pid}/stat").read_bytes()
         except OSError:
-            return HIDDEN if psutil.pid_exists(pid) else 0
-        state, *fields = content.rpartition(b")")[2].split()
+            return HIDDEN_PROCESS if psutil.pid_exists(pid) else 0
+        state, *fields = stat_line.rpartition(b")")[2].split()
         return 0 if state in (b"Z", b"X") else int(fields[18])
     try:
         return int(100 * psutil.Process(pid).create_time())
     except psutil.AccessDenied:
-        return HIDDEN
+        return HIDDEN_PROCESS
     except psutil.Error:
         return 0
 
 
-def real(location: Location) -> Location:
+def resolve_links(location: Location) -> Location:
     """Follow symbolic links: the folder is renamed, not the link. OSError where they never end."""
     if not isinstance(location, Path):
         return location
     if not location.is_symlink():
         return location.absolute()
     try:
-        place = location.resolve()
+        resolved = location.resolve()
     except RuntimeError:  # Python's word for a loop before 3.13
-        place = location
-    if place.is_symlink():
+        resolved = location
+    if resolved.is_symlink():
         raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(location))
-    return place
+    return resolved
 
 
 def eyepoints_path(store: Location, geometry_id: str) -> Location:
     """Eyepoint store of a geometry, in a folder next to the stores of the studies that use it."""
-    return real(store).parent / "eyepoints" / f"{geometry_id}.zarr"
+    return resolve_links(store).parent / "eyepoints" / f"{geometry_id}.zarr"
 
 
-def successor(path: Path) -> Path:
+def staging_path_for(path: Path) -> Path:
     """Place of a store that is to replace another once it is complete."""
-    return path.with_name(f".{path.name}{NEXT}")
+    return path.with_name(f".{path.name}{STAGING_SUFFIX}")
 
 
-def replaced_by(path: Path) -> Path:
+def final_path_for(path: Path) -> Path:
     """Return the place that a store is made for: its own, or that of the store it replaces."""
-    made = re.fullmatch(rf"\.(.+){re.escape(NEXT)}", path.name)
-    return path.with_name(made[1]) if made else path
+    staging_match = re.fullmatch(rf"\.(.+){re.escape(STAGING_SUFFIX)}", path.name)
+    return path.with_name(staging_match[1]) if staging_match else path
 
 
 def is_free(location: Location) -> bool:
@@ -516,66 +537,66 @@ def is_free(location: Location) -> bool:
 
 
 @contextmanager
-def draft(path: Path, *, replace: bool = False) -> Iterator[Path]:
+def atomic_path(path: Path, *, replace: bool = False) -> Iterator[Path]:
     """Make a file or folder in a hidden place, and put it in its own at the end."""
-    settle(path)
+    recover_interrupted_replace(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    made = _hidden(path, "creating")
+    draft_path = _hidden_path(path, "creating")
     try:
-        yield made
+        yield draft_path
         if replace:
-            take_place(made, path)
+            replace_path(draft_path, path)
         else:
-            os.rename(made, path)
+            os.rename(draft_path, path)
     finally:
-        _delete(made)
+        _remove_tree(draft_path)
 
 
-def take_place(new: Path, path: Path) -> None:
+def replace_path(new_path: Path, path: Path) -> None:
     """Put a file or folder in the place of another, which is removed then."""
-    if new.is_file():
-        os.replace(new, path)
+    if new_path.is_file():
+        os.replace(new_path, path)
         return
     while True:
-        old = _hidden(path, "replaced")
+        retired_path = _hidden_path(path, "replaced")
         with suppress(FileNotFoundError):
-            os.rename(path, old)
+            os.rename(path, retired_path)
         try:
-            os.rename(new, path)
+            os.rename(new_path, path)
         except OSError as error:
             if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
                 continue  # `settle` elsewhere saw the gap, and has put the old one back
             if not path.exists():  # else it has put the new one there
                 with suppress(OSError):
-                    os.rename(old, path)
+                    os.rename(retired_path, path)
                 raise
-        retire(old, path)
+        remove_replaced_store(retired_path, path)
         return
 
 
-def retire(old: Path, new: Path) -> None:
+def remove_replaced_store(old_path: Path, new_path: Path) -> None:
     """Remove what another has taken the place of, but for files of the user's: they move there.
 
     All of it stays, under its hidden name, where they can't be moved.
     """
-    from sweep.storage.foreign import carry_over
+    from sweep.storage.foreign_files import move_foreign_files
 
     try:
-        carry_over(old, new)
+        move_foreign_files(old_path, new_path)
     except OSError:
         return
-    discard(old)
+    remove_atomically(old_path)
 
 
-def discard(path: Path) -> None:
+def remove_atomically(path: Path) -> None:
     """Take a file or folder away, out of its place in one step."""
-    removing = _hidden(path, "removing")
+    removal_path = _hidden_path(path, "removing")
     with suppress(FileNotFoundError):
-        os.rename(path, removing)
-    _delete(removing)
+        os.rename(path, removal_path)
+    _remove_tree(removal_path)
 
 
-def settle(location: Location) -> None:
+def recover_interrupted_replace(location: Location) -> None:
     """Finish or undo what processes that died have left in the folder of a store.
 
     A store whose replacement was interrupted is replaced if its successor is whole, or is put
@@ -585,63 +606,73 @@ def settle(location: Location) -> None:
     if not isinstance(location, Path):
         return
     with suppress(OSError):
-        path = real(location)
+        path = resolve_links(location)
         assert isinstance(path, Path)
         for name in os.listdir(path.parent):
-            if left := _LEFT.fullmatch(name):
+            if leftover_match := _LEFTOVER_NAME.fullmatch(name):
                 with suppress(OSError):
-                    _settle(path.parent / name, left)
+                    _recover_leftover(path.parent / name, leftover_match)
 
 
-def stamp(location: Location) -> tuple[int, ...] | None:
+def store_identity(location: Location) -> tuple[int, ...] | None:
     """Identity of the store at a place, unlike any other that was or will be there; or None."""
     if not isinstance(location, Path):
         return None
     try:
-        opened = open_below(location, "zarr.json")  # opened: a file server is asked anew
+        descriptor = open_below(location, "zarr.json")  # opened: a file server is asked anew
     except OSError:
         return None
     try:
-        found = os.fstat(opened)
+        status = os.fstat(descriptor)
     finally:
-        os.close(opened)
-    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns
+        os.close(descriptor)
+    return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
 
 
-def _settle(left: Path, made: re.Match[str]) -> None:
-    path = left.with_name(made["name"])
-    if made["state"] == "replaced":
+def _recover_leftover(leftover: Path, leftover_match: re.Match[str]) -> None:
+    path = leftover.with_name(leftover_match["name"])
+    if leftover_match["state"] == "replaced":
         if not path.exists():
-            os.rename(successor(path) if successor(path).exists() else left, path)
-        if left.exists():
-            retire(left, path)
-    elif made["state"] == "removing" or not _is_made(left, made):
-        _delete(left)
+            os.rename(staging_path_for(path) if staging_path_for(path).exists() else leftover, path)
+        if leftover.exists():
+            remove_replaced_store(leftover, path)
+    elif leftover_match["state"] == "removing" or not _is_being_written(leftover, leftover_match):
+        _remove_tree(leftover)
 
 
-def _is_made(draft: Path, made: re.Match[str]) -> bool:
+def _is_being_written(draft_path: Path, leftover_match: re.Match[str]) -> bool:
     """Tell whether the process that makes a draft may still be at it."""
     import psutil
 
-    begun = draft.stat().st_mtime
-    if made["host"] not in (None, socket.gethostname()):
-        return time.time() - begun < ABANDONED
-    if made["start"]:
-        return process_start(int(made["pid"])) in (int(made["start"]), HIDDEN)
+    modified_time = draft_path.stat().st_mtime
+    if leftover_match["host"] not in (None, socket.gethostname()):
+        return time.time() - modified_time < ABANDONED_DRAFT_AGE
+    if leftover_match["start"]:
+        return process_start_id(int(leftover_match["pid"])) in (
+            int(leftover_match["start"]),
+            HIDDEN_PROCESS,
+        )
     try:  # a process that is younger than the draft has got its maker's number
-        return psutil.Process(int(made["pid"])).create_time() < begun + SKEW
+        return (
+            psutil.Process(int(leftover_match["pid"])).create_time()
+            < modified_time + CLOCK_SKEW_MAX
+        )
     except psutil.Error:
         return False
 
 
-def _hidden(path: Path, state: str) -> Path:
-    process = f"{os.getpid()}.{process_start(os.getpid())}"
-    maker = f"{socket.gethostname()}-{process}-{uuid.uuid4().hex[:8]}"
-    name = made["name"] if (made := _LEFT.fullmatch(path.name)) else path.name
-    return path.with_name(f".{name}.{state}-{maker}")
+def _hidden_path(path: Path, state: str) -> Path:
+    process_tag = f"{os.getpid()}.{process_start_id(os.getpid())}"
+    unique_tag = f"{socket.gethostname()}-{process_tag}-{uuid.uuid4().hex[:8]}"
+    name = (
+        leftover_match["name"]
+        if (leftover_match := _LEFTOVER_NAME.fullmatch(path.name))
+        else path.name
+    )
+    return path.with_name(f".{name}.{state}-{unique_tag}")
 
 
-def _delete(path: Path) -> None:
+def _remove_tree(path: Path) -> None:
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:
@@ -650,11 +681,11 @@ def _delete(path: Path) -> None:
 
 
 #: Words for a disk that has room, but takes no further file.
-NO_INODES = "No inodes left on device"
+NO_INODES_TEXT = "No inodes left on device"
 
 
 #: What to do where a store can't be written, by the number of the error.
-REMEDIES = {
+REMEDY_BY_ERRNO = {
     errno.ENOSPC: "make room on its disk",
     errno.EDQUOT: "make room in your quota",
     errno.EMFILE: "raise the limit of open files, `ulimit -n`",
@@ -665,29 +696,29 @@ REMEDIES = {
 }
 
 
-def reason(error: OSError, place: object) -> str:
+def os_error_reason(error: OSError, path: object) -> str:
     """Words for why a place can't be written or read.
 
     The system says "no space" also where a disk has room, but no inode for a further file.
     """
-    words = error.strerror or str(error)
-    if error.errno == errno.ENOSPC and isinstance(place, Path) and _lacks_inodes(place):
-        return NO_INODES
-    return words
+    reason_text = error.strerror or str(error)
+    if error.errno == errno.ENOSPC and isinstance(path, Path) and _lacks_inodes(path):
+        return NO_INODES_TEXT
+    return reason_text
 
 
 def write_remedy(error: OSError, place: object, otherwise: str) -> str:
     """Return what to do where a place can't be written: by the error, or else as is proposed."""
-    if NO_INODES in (error.strerror, reason(error, place)):
+    if NO_INODES_TEXT in (error.strerror, os_error_reason(error, place)):
         return "remove files from its disk, or have one with more inodes"
-    return REMEDIES.get(error.errno or 0, otherwise)
+    return REMEDY_BY_ERRNO.get(error.errno or 0, otherwise)
 
 
-def _lacks_inodes(place: Path) -> bool:
+def _lacks_inodes(path: Path) -> bool:
     """Tell whether the disk of a place, which need not exist, has no inodes left."""
-    while not place.exists() and place != place.parent:
-        place = place.parent
+    while not path.exists() and path != path.parent:
+        path = path.parent
     with suppress(OSError):
-        disk = os.statvfs(place)
+        disk = os.statvfs(path)
         return disk.f_files > 0 and disk.f_favail == 0 and disk.f_bavail > 0
     return False

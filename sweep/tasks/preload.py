@@ -10,8 +10,8 @@ from typing import Any
 
 from distributed.comm import get_address_host
 
-from sweep.tasks.interrupts import HANGUP
-from sweep.tasks.streams import ForgivingStream
+from sweep.tasks.engine.interrupts import HANGUP_SIGNAL
+from sweep.tasks.engine.text_streams import ForgivingStream
 
 
 def dask_setup(worker: Any) -> None:
@@ -20,8 +20,8 @@ def dask_setup(worker: Any) -> None:
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         # The same of one that is closed; a worker ends with its nanny.
-        if HANGUP is not None and getattr(worker, "nanny", None) is not None:
-            signal.signal(HANGUP, signal.SIG_IGN)
+        if HANGUP_SIGNAL is not None and getattr(worker, "nanny", None) is not None:
+            signal.signal(HANGUP_SIGNAL, signal.SIG_IGN)
         # What a user's function prints would fail its block where nobody reads it any more.
         sys.stdout, sys.stderr = ForgivingStream(sys.stdout), ForgivingStream(sys.stderr)
         if get_address_host(worker.address) == get_address_host(worker.scheduler.address):

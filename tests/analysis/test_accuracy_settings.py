@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from sweep.analysis import accuracy as settings
-from sweep.analysis.opening import NotAStoreError
+from sweep.analysis import accuracy_results as settings
+from sweep.analysis.datasets import NotAStoreError
 
 MADE_UP = [
     # name, kind, tolerance, us a point, errors by point
@@ -55,15 +55,18 @@ def dataset():
 
 
 def test_the_front_is_what_nothing_else_is_both_as_fast_and_as_accurate_as(dataset):
-    found = settings.front(settings.candidates(settings.settings_in(dataset)))
+    found = settings.pareto_front(settings.without_reference(settings.read_settings(dataset)))
     names = [s.name for s in found]
     assert names == ["auto at 0.1", "19 beamlets", "109 beamlets", "as written", "auto at 1e-06"]
 
 
 def test_errors_below_the_references_own_are_alike(dataset):
     """1e-10 of `all effects on` is no better than the 0 of a setting five times as fast."""
-    found = settings.settings_in(dataset)
-    assert settings.cheapest(settings.candidates(found), 0.0).name == "auto at 1e-06"
+    found = settings.read_settings(dataset)
+    assert (
+        settings.cheapest_within_error(settings.without_reference(found), 0.0).name
+        == "auto at 1e-06"
+    )
 
 
 @pytest.mark.parametrize(
@@ -71,34 +74,38 @@ def test_errors_below_the_references_own_are_alike(dataset):
     [(0.1, "auto at 0.1"), (4e-2, "19 beamlets"), (1e-3, "109 beamlets"), (1e-5, "auto at 1e-06")],
 )
 def test_the_cheapest_setting_meets_the_error_at_every_point(dataset, error, name):
-    found = settings.candidates(settings.settings_in(dataset))
-    assert settings.cheapest(found, error).name == name
-    assert settings.cheapest([], error) is None
+    found = settings.without_reference(settings.read_settings(dataset))
+    assert settings.cheapest_within_error(found, error).name == name
+    assert settings.cheapest_within_error([], error) is None
 
 
 def test_the_best_round_counts_and_ratios_are_taken_round_by_round(dataset):
     dataset.seconds[2, :] = 1e-6 * np.array([30.0, 40.0, 40.0])  # one round of it disturbed
-    one, *_ = settings.of_kinds(settings.settings_in(dataset), "as written")
-    other = settings.settings_in(dataset)[2]
-    assert one.seconds == pytest.approx(20e-6) and other.seconds == pytest.approx(30e-6)
-    assert one.times_faster(other) == pytest.approx(1.0)
+    one, *_ = settings.select_kinds(settings.read_settings(dataset), "as written")
+    other = settings.read_settings(dataset)[2]
+    assert one.best_seconds == pytest.approx(20e-6) and other.best_seconds == pytest.approx(30e-6)
+    assert one.speedup_over(other) == pytest.approx(1.0)
 
 
 def test_adaptive_settings_meet_the_best_fixed_one_that_is_as_accurate(dataset):
-    duels = settings.against_fixed(settings.settings_in(dataset))
+    duels = settings.compare_with_fixed(settings.read_settings(dataset))
     assert [(d.adaptive.name, d.other.name) for d in duels] == [
         ("auto at 0.1", "19 beamlets"),
         ("auto at 0.001", "109 beamlets"),
         ("auto at 1e-06", "all effects on"),
     ]
-    assert [d.times_faster() for d in duels] == pytest.approx([1.2, 0.9, 5.0])
+    assert [d.speedup() for d in duels] == pytest.approx([1.2, 0.9, 5.0])
     (told,) = [
-        s for s in settings.sentences(dataset, settings.settings_in(dataset)) if "single" in s
+        s
+        for s in settings.conclusion_sentences(dataset, settings.read_settings(dataset))
+        if "single" in s
     ]
     assert "0.9 to 5 times" in told and "NOT met, by 2 s in all; planning takes 2 s; with" in told
     dataset.seconds[5] *= 1.02  # 0.918 of its time: within the 10 %
     (told,) = [
-        s for s in settings.sentences(dataset, settings.settings_in(dataset)) if "single" in s
+        s
+        for s in settings.conclusion_sentences(dataset, settings.read_settings(dataset))
+        if "single" in s
     ]
     assert told.endswith(": met.")
 
@@ -106,11 +113,13 @@ def test_adaptive_settings_meet_the_best_fixed_one_that_is_as_accurate(dataset):
 def test_of_few_points_what_is_lost_is_held_against_the_making_of_their_store(dataset):
     """Ten points, of which one as at 0.001 takes 20 us, and 18 us with 109 beamlets."""
     dataset.attrs |= {"study_points": 10, "storing_seconds": 30e-6}
-    worst = settings.against_fixed(settings.settings_in(dataset))[1]
+    worst = settings.compare_with_fixed(settings.read_settings(dataset))[1]
     # Rounds of 30, 20, 40 us against 27, 18, 36, and 3 us a point besides.
-    assert worst.times_faster(3e-6) == pytest.approx(30 / 33)
+    assert worst.speedup(3e-6) == pytest.approx(30 / 33)
     (told,) = [
-        s for s in settings.sentences(dataset, settings.settings_in(dataset)) if "single" in s
+        s
+        for s in settings.conclusion_sentences(dataset, settings.read_settings(dataset))
+        if "single" in s
     ]
     assert "0.9 to 5 times" in told and told.endswith(
         "NOT met, by 2e-05 s in all; planning takes 2e-05 s; with the study's store it is 0.91 "
@@ -120,27 +129,28 @@ def test_of_few_points_what_is_lost_is_held_against_the_making_of_their_store(da
 
 def test_a_store_of_an_earlier_version_does_not_say_what_storing_takes(dataset):
     del dataset.attrs["storing_seconds"]
-    told = settings.sentences(dataset, settings.settings_in(dataset))
+    told = settings.conclusion_sentences(dataset, settings.read_settings(dataset))
     assert "take 20 s on one core. No other" in told[0] and "NOT met, by 2 s" in told[1]
 
 
 def test_no_fixed_setting_as_accurate_is_no_defeat(dataset):
     none = dataset.isel(rung=[0, 1, 2, 3, 10])
-    duels = settings.against_fixed(settings.settings_in(none))
-    assert all(d.other is None and d.times_faster() == np.inf for d in duels)
+    duels = settings.compare_with_fixed(settings.read_settings(none))
+    assert all(d.other is None and d.speedup() == np.inf for d in duels)
     assert any(
-        "No fixed setting" in s for s in settings.sentences(none, settings.settings_in(none))
+        "No fixed setting" in s
+        for s in settings.conclusion_sentences(none, settings.read_settings(none))
     )
 
 
 def test_the_thesiss_way_meets_the_fastest_adaptive_one_at_its_error(dataset):
-    found = settings.settings_in(dataset)
-    (described,) = settings.against_thesis(found)
-    (improved,) = settings.against_thesis(found, settings.IMPROVED)
+    found = settings.read_settings(dataset)
+    (described,) = settings.compare_with_thesis(found)
+    (improved,) = settings.compare_with_thesis(found, settings.IMPROVED_THESIS_KIND)
     assert described.adaptive.name == "auto at 0.1" and improved.adaptive.name == "auto at 0.001"
-    assert described.times_faster() == pytest.approx(9.0)
-    assert improved.times_faster() == pytest.approx(6.0)
-    told = " ".join(settings.sentences(dataset, settings.settings_in(dataset)))
+    assert described.speedup() == pytest.approx(9.0)
+    assert improved.speedup() == pytest.approx(6.0)
+    told = " ".join(settings.conclusion_sentences(dataset, settings.read_settings(dataset)))
     assert "Speed-up: 6 over thesis 2^12. Speed-up over improved versions: 8 over" in told
     assert "9 over thesis 2^12. Requirement, at least 5: met over thesis 2^12." in told
     assert "Speed-up of auto at 0.001, error" in told and ": 6 over thesis 2^12, folded" in told
@@ -148,58 +158,70 @@ def test_the_thesiss_way_meets_the_fastest_adaptive_one_at_its_error(dataset):
 
 def test_one_slow_trial_of_two_does_not_count():
     """A median of two would be moved by it."""
-    whole = {"kind": "", "tolerance": 0.0, "planning": 0.0, "pd_error": np.zeros(1), "likely": 1.0}
+    whole = {
+        "kind": "",
+        "tolerance": 0.0,
+        "planning_seconds": 0.0,
+        "pd_error": np.zeros(1),
+        "error_quantile": 1.0,
+    }
     whole |= dict.fromkeys(("log10_pfa_error", "leakage_error", "magnitude_error"), 0.0)
-    one = settings.Setting(name="one", rounds=np.array([1.0, 1.5]), **whole)
-    other = settings.Setting(name="other", rounds=np.array([0.9, 0.9]), **whole)
-    assert one.times_faster(other) == pytest.approx(0.9)
-    longer = replace(one, rounds=np.array([1.0, 1.5, 2.0]))
-    steady = replace(other, rounds=np.array([0.9, 0.9, 0.9]))
-    assert longer.times_faster(steady) == pytest.approx(0.6)
+    one = settings.MeasuredSetting(name="one", seconds_by_round=np.array([1.0, 1.5]), **whole)
+    other = settings.MeasuredSetting(name="other", seconds_by_round=np.array([0.9, 0.9]), **whole)
+    assert one.speedup_over(other) == pytest.approx(0.9)
+    longer = replace(one, seconds_by_round=np.array([1.0, 1.5, 2.0]))
+    steady = replace(other, seconds_by_round=np.array([0.9, 0.9, 0.9]))
+    assert longer.speedup_over(steady) == pytest.approx(0.6)
 
 
 def test_with_other_beamlets_than_the_thesis_has_nothing_is_asked_for(dataset):
     dataset.attrs["thesis_beamlets"] = 19
-    told = " ".join(settings.sentences(dataset, settings.settings_in(dataset)))
+    told = " ".join(settings.conclusion_sentences(dataset, settings.read_settings(dataset)))
     assert ": 9 over thesis 2^12." in told and "at least 5" not in told
     assert "This scene has 19 beamlets" in told
 
 
 def test_what_leaves_leakage_out_is_no_fixed_setting_to_be_compared(dataset):
     """The closed form with the thesis's effects is the fastest at 0.06, if nothing leaks."""
-    adaptive = [s for s in settings.settings_in(dataset) if s.kind == settings.ADAPTIVE]
+    adaptive = [s for s in settings.read_settings(dataset) if s.kind == settings.ADAPTIVE_KIND]
     errors, closed = np.array([6e-2, 2e-2, 1e-2]), 1e-6 * np.array([8.0])
     for leaked, beats in ((6e-2, True), (7e-2, False)):
         setting = replace(
-            adaptive[0], name="closed", kind=settings.CLOSED_FORM, rounds=closed, pd_error=errors,
-            log10_pfa_error=0.0, magnitude_error=0.0, leakage_error=leaked,
-        )  # fmt: skip
-        loose = replace(adaptive[0], pd_error=errors, rounds=1e-6 * np.array([9.0]))
-        (duel,) = settings.against_fixed([loose, setting])
+            adaptive[0],
+            name="closed",
+            kind=settings.CLOSED_FORM_KIND,
+            seconds_by_round=closed,
+            pd_error=errors,
+            log10_pfa_error=0.0,
+            magnitude_error=0.0,
+            leakage_error=leaked,
+        )
+        loose = replace(adaptive[0], pd_error=errors, seconds_by_round=1e-6 * np.array([9.0]))
+        (duel,) = settings.compare_with_fixed([loose, setting])
         assert (duel.other == setting) == beats, leaked
-    assert adaptive[0].is_whole
+    assert adaptive[0].is_complete
 
 
 def test_what_counts_is_the_largest_of_all_that_is_promised(dataset):
     dataset["magnitude_error"] = 10 * dataset.pd_error
     dataset["log10_pfa_error"] = 0.0 * dataset.pd_error
-    named = {s.name: s for s in settings.settings_in(dataset)}
-    assert named["auto at 0.001"].error == pytest.approx(5e-3)
-    assert named["auto at 0.001"].quantile(1.0) == pytest.approx(5e-4)
+    named = {s.name: s for s in settings.read_settings(dataset)}
+    assert named["auto at 0.001"].largest_error == pytest.approx(5e-3)
+    assert named["auto at 0.001"].pd_error_quantile(1.0) == pytest.approx(5e-4)
     dataset["leakage_error"] = 20 * dataset.pd_error  # which is not promised
-    assert settings.settings_in(dataset)[2].error == pytest.approx(5e-3)
+    assert settings.read_settings(dataset)[2].largest_error == pytest.approx(5e-3)
     dataset["magnitude_error"] = np.nan * dataset.pd_error  # as of detections counted
-    assert settings.settings_in(dataset)[2].error == pytest.approx(5e-4)
+    assert settings.read_settings(dataset)[2].largest_error == pytest.approx(5e-4)
 
 
 def test_where_errors_are_random_most_of_the_points_count(dataset):
     dataset.standard_error[:] = 0.01
-    found = settings.settings_in(dataset)[1]
-    assert found.error == pytest.approx(np.quantile([5e-2, 1e-3, 0.0], 0.95))
+    found = settings.read_settings(dataset)[1]
+    assert found.largest_error == pytest.approx(np.quantile([5e-2, 1e-3, 0.0], 0.95))
 
 
 def test_the_page_has_every_setting_and_the_sentences(dataset):
-    found = settings.page(dataset, settings.settings_in(dataset)).text()
+    found = settings.accuracy_page(dataset, settings.read_settings(dataset)).to_text()
     assert all(name in found for name, *_ in MADE_UP)
     assert "All 1,000,000 points take 20 s on one core; storing them takes at least 0.5 s" in found
     assert (
@@ -210,7 +232,7 @@ def test_the_page_has_every_setting_and_the_sentences(dataset):
 
 
 def test_marks_stand_at_times_and_errors(dataset):
-    sheet = settings.sheet(dataset, settings.settings_in(dataset))
+    sheet = settings.draw_accuracy_sheet(dataset, settings.read_settings(dataset))
     (axes,) = sheet.axes
     marks = {
         tuple(np.ravel(line.get_data()))
@@ -218,7 +240,9 @@ def test_marks_stand_at_times_and_errors(dataset):
         if line.get_marker() in "os^DPXvp*" and len(line.get_xdata()) == 1
     }
     expected = {
-        (us, max(max(e), settings.EXACT)) for _, kind, _, us, e in MADE_UP if kind != "reference"
+        (us, max(max(e), settings.NEGLIGIBLE_ERROR))
+        for _, kind, _, us, e in MADE_UP
+        if kind != "reference"
     }
     assert {(round(t, 9), e) for t, e in marks} == expected
     assert axes.get_xscale() == axes.get_yscale() == "log"
@@ -228,4 +252,4 @@ def test_marks_stand_at_times_and_errors(dataset):
 
 def test_a_store_of_another_kind_is_refused(tmp_path):
     with pytest.raises(NotAStoreError, match="there is no store"):
-        settings.opened(tmp_path / "none.zarr")
+        settings.open_accuracy_store(tmp_path / "none.zarr")

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import xarray as xr
 from click.testing import CliRunner
-from drawn_studies import POWERS, SURFACE, stored, study
-from made_datasets import made
+from stored_studies import POWER_AND_CUT_AXES, SURFACE_AXES, run_into_store, spec_over_axes
+from synthetic_datasets import dataset_of_deviates
 
 import sweep
 from sweep.cli import main
@@ -18,17 +18,17 @@ PERIODS = 3 * 500e-6
 
 @pytest.fixture(scope="module")
 def surface(tmp_path_factory):
-    return sweep.open(stored(tmp_path_factory.mktemp("answers"), SURFACE))
+    return sweep.open(run_into_store(tmp_path_factory.mktemp("answers"), SURFACE_AXES))
 
 
 @pytest.fixture(scope="module")
 def speckled(tmp_path_factory):
     return sweep.open(
-        stored(
+        run_into_store(
             tmp_path_factory.mktemp("speckled"),
             {"target.range": ["500 m", "3 km", "6 km"]},
             footprint={"beamlets": 1, "speckle": "none"},
-            target=study({}).to_yaml_mapping()["target"] | {"roughness": "10 um"},
+            target=spec_over_axes({}).to_yaml_mapping()["target"] | {"roughness": "10 um"},
             draws={"number": 400, "batch": 400},
             seed=5,
         )
@@ -37,7 +37,7 @@ def speckled(tmp_path_factory):
 
 def test_a_point_is_selected_by_what_it_is_in_any_unit(tmp_path):
     axes = {"target.range": ["1 km", "2 km"], "target.grazing_angle": ["20 deg", "45 deg"]}
-    dataset = sweep.open(stored(tmp_path, axes))
+    dataset = sweep.open(run_into_store(tmp_path, axes))
     expected = float(dataset.pd_shot.isel(range=1, grazing_angle=0))
     for distance in ("2 km", "2000 m", 2.0, "2e6 mm"):
         point = dataset.sweep.sel(range=distance, grazing_angle="20 deg")
@@ -61,7 +61,7 @@ def test_a_value_that_is_not_there_is_refused_with_the_nearest(surface):
 
 
 def test_one_value_along_a_zipped_axis_keeps_the_points_that_have_it(tmp_path):
-    dataset = sweep.open(stored(tmp_path, POWERS))
+    dataset = sweep.open(run_into_store(tmp_path, POWER_AND_CUT_AXES))
     part = dataset.sweep.sel(power="3 W", grazing_angle="85 deg")
     assert part.pd_shot.dims == ("cut",)
     assert (part.grazing_angle == 85).all() and part.power.item() == 3
@@ -69,7 +69,9 @@ def test_one_value_along_a_zipped_axis_keeps_the_points_that_have_it(tmp_path):
 
 
 def test_words_are_selected_as_they_are_written(tmp_path):
-    dataset = sweep.open(stored(tmp_path, {"instrument.processing.window": ["hann", "hamming"]}))
+    dataset = sweep.open(
+        run_into_store(tmp_path, {"instrument.processing.window": ["hann", "hamming"]})
+    )
     assert float(dataset.sweep.sel(window="hamming").pd_shot) == float(dataset.pd_shot[1])
     with pytest.raises(ValueError, match="there is hann, hamming"):
         dataset.sweep.sel(window="blackman")
@@ -92,7 +94,7 @@ def test_a_drawn_probability_has_its_interval_within_zero_and_one(speckled):
 def test_a_roc_curve_is_the_model_at_each_threshold(surface):
     part = surface.sweep.sel(range="9 km", method="nearest").sweep.sel(grazing_angle="60 deg")
     tnr = np.array([3.0, 6.0, 8.0, 10.0, 13.0])
-    base = study(SURFACE).parameters() | {
+    base = spec_over_axes(SURFACE_AXES).parameters() | {
         "target.range": part.range.item(), "target.grazing_angle": np.deg2rad(60),
     }  # fmt: skip
     flags = part.effects.attrs
@@ -113,7 +115,7 @@ def test_a_roc_curve_is_the_model_at_each_threshold(surface):
 
 def test_a_study_of_thresholds_has_the_curve_of_its_point_at_each_of_them(tmp_path, surface):
     axes = {"instrument.processing.tnr": [8, 10], "target.range": ["7 km", "9 km"]}
-    store = stored(tmp_path, axes)
+    store = run_into_store(tmp_path, axes)
     dataset = sweep.open(store)
     curves = dataset.sweep.roc([1e-9, 1e-6, 1e-3])
     assert curves.pd.dims == ("pfa_bin", "tnr", "range") and curves.tnr.values.tolist() == [8, 10]
@@ -132,7 +134,7 @@ def test_the_roc_of_a_speckled_target_is_swerlings(speckled):
     point = speckled.sweep.sel(range="3 km")
     pfa = np.logspace(-14, -2, 5)
     curve = point.sweep.roc(pfa, segment="up", draws=4000)
-    smooth = study({}, footprint={"beamlets": 1, "speckle": "none"}).parameters() | {
+    smooth = spec_over_axes({}, footprint={"beamlets": 1, "speckle": "none"}).parameters() | {
         "target.range": 3000.0
     }
     snr = evaluate(smooth)["snr_up"].item()
@@ -178,7 +180,7 @@ def test_false_alarms_with_leakage_are_those_of_either_cause(surface):
 
 def test_the_duration_of_a_chirp_may_be_an_axis(tmp_path):
     axes = {"instrument.chirp.duration": ["400 us", "500 us"]}
-    dataset = sweep.open(stored(tmp_path, axes))
+    dataset = sweep.open(run_into_store(tmp_path, axes))
     rates = dataset.sweep.false_alarms_per_second() / dataset.pfa_both_chirps
     assert rates.values == pytest.approx([1 / 1.2e-3, 1 / 1.5e-3])
 
@@ -186,7 +188,9 @@ def test_the_duration_of_a_chirp_may_be_an_axis(tmp_path):
 def test_a_contour_of_a_plane_is_a_straight_line():
     x, y = np.linspace(1000, 2000, 6), np.linspace(10, 80, 8)
     level = 0.7
-    dataset = made((1800 - x[:, None]) / 300 + (y - 40) / 20, range=x, grazing_angle=y)
+    dataset = dataset_of_deviates(
+        (1800 - x[:, None]) / 300 + (y - 40) / 20, range=x, grazing_angle=y
+    )
     line = dataset.sweep.contour(level)
     from scipy.special import ndtri
 
@@ -221,7 +225,10 @@ def test_studies_are_compared_where_they_meet_whatever_their_units_and_order(tmp
         "target.grazing_angle": [f"{float(np.deg2rad(60))!r} rad"],
         "target.range": ["9000 m", "3000 m", "1000 m"],
     }
-    ours, other = sweep.open(stored(tmp_path, one)), sweep.open(stored(tmp_path / "a", two))
+    ours, other = (
+        sweep.open(run_into_store(tmp_path, one)),
+        sweep.open(run_into_store(tmp_path / "a", two)),
+    )
     found = ours.sweep.compare(other).compute()
     assert dict(found.sizes) == {"range": 2, "grazing_angle": 1}
     assert found.range.values.tolist() == [1.0, 9.0]
@@ -237,7 +244,7 @@ def test_studies_are_compared_where_they_meet_whatever_their_units_and_order(tmp
 
 
 def test_studies_without_a_point_in_common_are_refused(surface, tmp_path):
-    other = sweep.open(stored(tmp_path, {"target.range": ["11 km", "12 km"]}))
+    other = sweep.open(run_into_store(tmp_path, {"target.range": ["11 km", "12 km"]}))
     with pytest.raises(ValueError, match="along range the two studies have no value in common"):
         surface.sweep.compare(other)
 
@@ -246,14 +253,14 @@ def test_other_draws_agree_within_their_intervals_and_another_laser_does_not(spe
     spec = json.loads(speckled.attrs["spec"])
     sections = {name: spec[name] for name in ("target", "draws", "footprint")}
     axes = {"target.range": ["500 m", "3 km", "6 km"]}
-    redrawn = sweep.open(stored(tmp_path, axes, seed=6, **sections))
+    redrawn = sweep.open(run_into_store(tmp_path, axes, seed=6, **sections))
     found = speckled.sweep.compare(redrawn).compute()
     assert (found.pd_up != 0).all() and found.pd_up_agrees.all()
     allowed = (speckled.pd_up_half_width + redrawn.pd_up_half_width).values
     assert (found.pd_up_allowed.values >= allowed).all()
     (tmp_path / "weak").mkdir()
     instrument = spec["instrument"] | {"laser": spec["instrument"]["laser"] | {"power": "0.2 W"}}
-    weak = stored(tmp_path / "weak", axes, seed=6, instrument=instrument, **sections)
+    weak = run_into_store(tmp_path / "weak", axes, seed=6, instrument=instrument, **sections)
     assert not speckled.sweep.compare(sweep.open(weak)).pd_up_agrees.all()
 
 
@@ -287,9 +294,9 @@ def lone_tone_bound(distance, noise_variance):
 def test_errors_stand_beside_the_bound_that_the_link_budget_gives(tmp_path):
     windows = {"instrument.processing.window": ["hann", "hamming"]}
     axes = {"target.range": ["1003 m", "4001 m"], **windows}
-    target = study({}).to_yaml_mapping()["target"] | {"grazing_angle": "90 deg"}
+    target = spec_over_axes({}).to_yaml_mapping()["target"] | {"grazing_angle": "90 deg"}
     dataset = sweep.open(
-        stored(tmp_path, axes, footprint={"beamlets": 1, "speckle": "none"}, target=target)
+        run_into_store(tmp_path, axes, footprint={"beamlets": 1, "speckle": "none"}, target=target)
     )
     place, speed = dataset.sweep.range_error(), dataset.sweep.velocity_error()
     assert place.bound.chunks is not None
@@ -306,12 +313,12 @@ def test_errors_stand_beside_the_bound_that_the_link_budget_gives(tmp_path):
 
 
 def test_a_study_of_whole_spectra_answers_with_what_it_counted(tmp_path):
-    from drawn_studies import INSTRUMENT
+    from stored_studies import INSTRUMENT
 
     small = INSTRUMENT | {"processing": INSTRUMENT["processing"] | {"fft_size": 2048}}
     axes = {"target.range": ["20 m", "60 m"]}
     dataset = sweep.open(
-        stored(tmp_path, axes, instrument=small, draws={"method": "spectra", "number": 40})
+        run_into_store(tmp_path, axes, instrument=small, draws={"method": "spectra", "number": 40})
     ).compute()
     found = dataset.sweep.range_error()
     assert set(found.data_vars) == {"bias", "rmse", "bound"}

@@ -1,12 +1,12 @@
 import numpy as np
 import pytest
 import xarray as xr
-from drawn_studies import INSTRUMENT, stored, study
 from hypothesis import given
 from hypothesis import strategies as st
-from made_datasets import made
 from scipy.optimize import brentq
 from scipy.special import ndtr, ndtri
+from stored_studies import INSTRUMENT, run_into_store, spec_over_axes
+from synthetic_datasets import dataset_of_deviates
 
 import sweep
 from sweep.model.shot import evaluate
@@ -16,7 +16,7 @@ RANGES = np.array([100.0, 200.0, 400.0, 700.0, 1100.0])
 
 
 def answers(z, x=RANGES, **options):
-    found = made(z, range=x).sweep.limit("range", 0.9, **options).compute()
+    found = dataset_of_deviates(z, range=x).sweep.limit("range", 0.9, **options).compute()
     return {
         kind: (float(found[kind]), found[f"{kind}_reason"].item())
         for kind in ("unbroken", "farthest")
@@ -87,7 +87,7 @@ def test_any_profile_is_walked_as_step_by_step(z, from_highest):
 
 def test_intervals_of_pd_make_intervals_of_range():
     z = LEVEL + (640.0 - RANGES) / 1000
-    found = made(z, 0.02, range=RANGES).sweep.maximum_range().compute()
+    found = dataset_of_deviates(z, 0.02, range=RANGES).sweep.maximum_range().compute()
     for end, moved in (("low", -0.02), ("high", 0.02)):
         shifted = np.clip(ndtr(z) + moved, 0, 1)
         i = np.flatnonzero(shifted >= 0.9)[-1]
@@ -100,7 +100,9 @@ def test_intervals_of_pd_make_intervals_of_range():
 def test_the_least_angle_is_found_from_the_normal_down_at_every_range():
     angles, ranges = np.arange(5.0, 91.0, 5.0), np.array([1000.0, 2000.0, 4000.0])
     least = np.array([12.5, 31.0, 55.0])
-    dataset = made(LEVEL + (angles - least[:, None]) / 10, range=ranges, grazing_angle=angles)
+    dataset = dataset_of_deviates(
+        LEVEL + (angles - least[:, None]) / 10, range=ranges, grazing_angle=angles
+    )
     found = dataset.sweep.minimum_grazing_angle()
     assert found.unbroken.values == pytest.approx(least)
     assert found.unbroken.attrs["units"] == "deg"
@@ -113,7 +115,7 @@ def test_the_answer_is_lazy_and_the_same_in_any_chunks(chunks):
     x, y = np.linspace(1, 2, 40), np.linspace(10, 80, 8)
     z = LEVEL + rng.normal(0, 2, (40, 8))
     z[rng.random(z.shape) < 0.05] = np.nan
-    whole = made(z, range=x, grazing_angle=y)
+    whole = dataset_of_deviates(z, range=x, grazing_angle=y)
     lazy = whole.chunk(chunks).sweep.maximum_range()
     assert all(array.chunks is not None for array in lazy.data_vars.values())
     assert lazy.compute().identical(whole.sweep.maximum_range())
@@ -123,7 +125,7 @@ def test_the_answer_is_lazy_and_the_same_in_any_chunks(chunks):
 def test_a_level_of_pd_is_a_share_or_in_percent(pd):
     angles = np.array([20.0, 40.0])
     z = LEVEL + (640.0 - RANGES[:, None]) / 1000 * [1.0, 2.0]
-    dataset = made(z, range=RANGES, grazing_angle=angles)
+    dataset = dataset_of_deviates(z, range=RANGES, grazing_angle=angles)
     for ask in ("maximum_range", "contour"):
         expected, found = (getattr(dataset.sweep, ask)(each) for each in (0.9, pd))
         xr.testing.assert_allclose(found, expected, rtol=1e-6)
@@ -132,17 +134,19 @@ def test_a_level_of_pd_is_a_share_or_in_percent(pd):
 @pytest.mark.parametrize("pd", ["0.9 W", "high", [0.5, 0.9], None, True, "90", 0, 1, "100 %", 1.5])
 @pytest.mark.parametrize("ask", ["maximum_range", "contour"])
 def test_what_is_no_level_of_pd_is_refused_in_words(ask, pd):
-    dataset = made(np.zeros((5, 2)), range=RANGES, grazing_angle=np.array([20.0, 40.0]))
+    dataset = dataset_of_deviates(
+        np.zeros((5, 2)), range=RANGES, grazing_angle=np.array([20.0, 40.0])
+    )
     with pytest.raises(ValueError, match="a level of pd"):
         getattr(dataset.sweep, ask)(pd)
 
 
 def test_what_cannot_be_walked_is_refused():
-    dataset = made(np.zeros(2), range=[1.0, 1.0])
+    dataset = dataset_of_deviates(np.zeros(2), range=[1.0, 1.0])
     with pytest.raises(ValueError, match="more than once"):
         dataset.sweep.maximum_range()
     with pytest.raises(ValueError, match="single value"):
-        made(np.zeros(1), range=[1.0]).sweep.maximum_range()
+        dataset_of_deviates(np.zeros(1), range=[1.0]).sweep.maximum_range()
     with pytest.raises(ValueError, match="is no coordinate"):
         dataset.sweep.minimum_grazing_angle()
     with pytest.raises(ValueError, match="between 0 and 1"):
@@ -160,8 +164,8 @@ def test_the_maximum_range_is_the_root_of_the_model_itself(step, error, tmp_path
     axes = {"target.range": {"step": ["1 km", "9 km", f"{step} m"]}}
     sections = {"instrument": SMOOTH, "footprint": {"beamlets": 1, "speckle": "none"}}
     sections["effects"] = {"overlap": "off"}  # `evaluate` by itself has records filled
-    found = sweep.open(stored(tmp_path, axes, **sections)).sweep.maximum_range().compute()
-    parameters = study({}, **sections).parameters()
+    found = sweep.open(run_into_store(tmp_path, axes, **sections)).sweep.maximum_range().compute()
+    parameters = spec_over_axes({}, **sections).parameters()
 
     def excess(distance):
         return evaluate(parameters | {"target.range": distance})["pd_shot"].item() - 0.9
@@ -183,7 +187,9 @@ def test_a_zipped_axis_is_walked_after_a_selection(tmp_path):
         }
     }
     dataset = sweep.open(
-        stored(tmp_path, axes, footprint={"beamlets": 1, "speckle": "none"}, instrument=SMOOTH)
+        run_into_store(
+            tmp_path, axes, footprint={"beamlets": 1, "speckle": "none"}, instrument=SMOOTH
+        )
     )
     with pytest.raises(ValueError, match="select by the other coordinates along 'cut'"):
         dataset.sweep.maximum_range()

@@ -7,9 +7,9 @@ import big_store
 import pytest
 
 import sweep
-from sweep.analysis import canvas, charts, opening
-from sweep.analysis.figures import draw
-from sweep.storage.chunks import CheckedFiles
+from sweep.analysis import canvas, charts, datasets
+from sweep.analysis.study_figures import draw_figures
+from sweep.storage.size_checks import SizeCheckedLocalStore
 
 FIGURES = [
     {"kind": "surface", "variable": "pd_shot", "x": "range", "y": "grazing_angle"},
@@ -23,8 +23,8 @@ def stores(directory, gigabytes, block_points):
     """Stores with their sizes [B]."""
     made = {}
     for size in gigabytes:
-        spec = big_store.spec_of(size, block_points=block_points, powers=4, figures=FIGURES)
-        made[directory / f"{size}.zarr"] = big_store.make(directory / f"{size}.zarr", spec)
+        spec = big_store.spec_of_size(size, block_points=block_points, powers=4, figures=FIGURES)
+        made[directory / f"{size}.zarr"] = big_store.make_store(directory / f"{size}.zarr", spec)
     return made
 
 
@@ -39,7 +39,7 @@ def peak_of(work, *given):
 
 def growth(work, sizes, monkeypatch):
     """Memory that work takes more where a store is larger, as a share of what it is larger by."""
-    monkeypatch.setattr(opening, "PIECE", 2**13)
+    monkeypatch.setattr(datasets, "VALUES_PER_READ", 2**13)
     work(next(iter(sizes)))  # so that imports and caches are there
     peaks = [peak_of(work, path) for path in sizes]
     less, more = sizes.values()
@@ -48,7 +48,7 @@ def growth(work, sizes, monkeypatch):
 
 def test_memory_does_not_grow_with_the_store(tmp_path, monkeypatch):
     def reduce(path):
-        found = big_store.reduce(path)
+        found = big_store.reduce_store(path)
         assert found["points"] == sweep.open(path).attrs["points"]
         assert found["error"] < 1e-6  # [m]: pd is straight in its normal deviate
 
@@ -60,30 +60,30 @@ def test_memory_does_not_grow_with_the_store(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_neither_does_that_of_its_figures(tmp_path, monkeypatch):
     # as many cells of both, and what they are drawn in left out
-    monkeypatch.setattr(charts, "SHEET", replace(charts.SHEET, columns=20))
-    monkeypatch.setattr(charts, "STRETCHES", 5)
-    monkeypatch.setattr(canvas, "save", lambda sheet, path, source: path)
+    monkeypatch.setattr(charts, "SHEET_LIMITS", replace(charts.SHEET_LIMITS, columns_max=20))
+    monkeypatch.setattr(charts, "LINE_INTERVALS", 5)
+    monkeypatch.setattr(canvas, "save_sheet", lambda sheet, path, source: path)
     sizes = stores(tmp_path, (0.006, 0.024), 2000)
     # what grows is what a handful of pieces takes; with all points in memory it was 0.37
-    assert growth(lambda path: draw(path, tmp_path), sizes, monkeypatch) < 0.15
+    assert growth(lambda path: draw_figures(path, tmp_path), sizes, monkeypatch) < 0.15
 
 
 def test_pieces_are_whole_chunks_and_one_point_is_read_from_one(tmp_path, monkeypatch):
     path = tmp_path / "small.zarr"
-    big_store.make(path, big_store.spec_of(0.01, block_points=900))
+    big_store.make_store(path, big_store.spec_of_size(0.01, block_points=900))
     dataset = sweep.open(path)
     array = dataset["pd_shot"]
     assert array.data.npartitions == 1
     stored = array.encoding["chunks"]
     assert all(n >= c for n, c in zip(array.shape, stored, strict=True)) and stored != array.shape
     read = []
-    get = CheckedFiles.get
+    get = SizeCheckedLocalStore.get
 
     async def counted(self, key, *rest, **options):
         read.append(key)
         return await get(self, key, *rest, **options)
 
-    monkeypatch.setattr(CheckedFiles, "get", counted)
+    monkeypatch.setattr(SizeCheckedLocalStore, "get", counted)
     value = float(array.isel(power=7, range=3, grazing_angle=80))
     assert len(read) == 1
     assert value == float(array.compute().isel(power=7, range=3, grazing_angle=80))

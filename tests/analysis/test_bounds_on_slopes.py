@@ -9,14 +9,14 @@ import pytest
 import sweep
 
 sys.path.append(str(Path(__file__).parents[1] / "tasks"))
-from small import STUDY, quiet, small
+from small_studies import STUDY_MAPPING, run_serially, small_spec
 
 PROCESSING = {
     "sample_rate": "200 MHz", "fft_size": "2^13", "tnr": 10, "window": "hann",
     "acquisition_delay": "5 us",
 }  # fmt: skip
 INSTRUMENT = {
-    **STUDY["instrument"],
+    **STUDY_MAPPING["instrument"],
     "laser": {
         "wavelength": "1550 nm", "power": "300 mW", "beam_divergence": "none", "beam_waist": "5 mm"
     },
@@ -33,7 +33,7 @@ DRAWS = 1500
 def grid(rule, processing, **sections):
     """Slopes of a beam of 5 mm."""
     processing = PROCESSING | {"detection": rule} | processing
-    return small(
+    return small_spec(
         instrument={**INSTRUMENT, "processing": processing}, target=TARGET,
         footprint={"speckle": "developed"}, axes={"target.grazing_angle": ANGLES},
         **sections,
@@ -45,7 +45,7 @@ def test_bounds_of_grids_on_slopes_hold_the_wander_that_is_drawn(rule, tmp_path)
     """The strongest frequency of a record errs by speckle; three bins err further by its shape."""
     whole = {"draws": {"method": "spectra", "number": DRAWS}}
     stores = [
-        quiet(spec, tmp_path / f"{name}.zarr").store
+        run_serially(spec, tmp_path / f"{name}.zarr").store
         for name, spec in (
             ("drawn", grid(rule, {"estimator": {"kind": "chirp_z"}}, **whole)),
             ("closed", grid(rule, {})),
@@ -63,5 +63,5 @@ def test_bounds_of_grids_on_slopes_hold_the_wander_that_is_drawn(rule, tmp_path)
         # With the wander by speckle it is an estimate as well: up to a tenth above what is drawn.
         assert (bound < 1.1 * drawn.radial_velocity_rmse).all()
     steady = grid(rule, {}, effects={"fading": "off"})
-    still = sweep.open(quiet(steady, tmp_path / "steady.zarr").store).compute()
+    still = sweep.open(run_serially(steady, tmp_path / "steady.zarr").store).compute()
     assert (still.sweep.range_error().bound < 0.3 * place.bound).all()

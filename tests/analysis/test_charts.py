@@ -4,14 +4,21 @@ import dask.array
 import numpy as np
 import pytest
 import xarray as xr
-from drawn_studies import study
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import LogNorm
+from stored_studies import spec_over_axes
 
 from sweep.analysis import canvas, charts
-from sweep.analysis.selection import HIGHEST, LOWEST, MEAN, Points, Side, confined
+from sweep.analysis.selection import (
+    HIGHEST,
+    LOWEST,
+    MEAN,
+    PointSelection,
+    SortedCoordinate,
+    select_where,
+)
 
 BY_HAND = {MEAN: np.mean, LOWEST: np.min, HIGHEST: np.max}
 
@@ -26,7 +33,7 @@ def points_of(values, **axes):
         for name, column in members.items():
             coordinates[name] = (dim, np.asarray(column), {"units": UNITS.get(name, "")})
     variables = {"pd_shot": (list(axes), np.asarray(values, float))}
-    return Points.of(xr.Dataset(variables, coordinates))
+    return PointSelection.from_dataset(xr.Dataset(variables, coordinates))
 
 
 def points_on(x, y, values):
@@ -36,20 +43,20 @@ def points_on(x, y, values):
 
 def surface(found, **changes):
     options = {"x": "range", "y": "grazing_angle", "variable": "pd_shot", "words": "pd"}
-    return charts.surface(found, **(options | changes))
+    return charts.surface_chart(found, **(options | changes))
 
 
 def slices(found, by=""):
-    return charts.slices(found, x="range", by=by, variable="pd_shot", words="pd")
+    return charts.slice_chart(found, x="range", by=by, variable="pd_shot", label="pd")
 
 
 def sheet(chart):
-    return canvas.sheet_of(chart, "", "")
+    return canvas.draw_chart(chart, "", "")
 
 
 def map_of(found):
     (panel,) = surface(found).panels
-    return panel.map
+    return panel.heat_map
 
 
 def painted(chart, value):
@@ -57,7 +64,7 @@ def painted(chart, value):
     drawn = sheet(chart)
     drawn.canvas.draw()
     pixels = np.asarray(drawn.canvas.buffer_rgba())[..., :3].astype(int)
-    colour = np.round(np.array(canvas.colours()(value)[:3]) * 255).astype(int)
+    colour = np.round(np.array(canvas.colour_map()(value)[:3]) * 255).astype(int)
     return int((np.abs(pixels - colour).max(axis=-1) <= 2).sum())
 
 
@@ -88,18 +95,23 @@ def test_cells_hold_their_points_whatever_the_chunks(shape, most, chunks, kind, 
     rng = np.random.default_rng(seed)
     values = np.where(rng.random(shape) < 0.2, np.nan, rng.random(shape))
     array = xr.DataArray(dask.array.from_array(values, chunks=chunks), dims=["y", "x"])
-    sides = [Side(d, np.arange(n), np.arange(n) / 7) for d, n in zip("yx", shape, strict=True)]
-    points = Points.of(xr.Dataset({"v": array}))
-    found = points.cells("v", list(zip(sides, most, strict=True)), kind).values
-    up, across = (side.together(number) for side, number in zip(sides, most, strict=True))
-    assert found.shape == tuple(side.middles(m).size for side, m in zip(sides, most, strict=True))
+    sides = [
+        SortedCoordinate(d, np.arange(n), np.arange(n) / 7)
+        for d, n in zip("yx", shape, strict=True)
+    ]
+    points = PointSelection.from_dataset(xr.Dataset({"v": array}))
+    found = points.coarsen("v", list(zip(sides, most, strict=True)), kind).values
+    up, across = (side.points_per_cell(number) for side, number in zip(sides, most, strict=True))
+    assert found.shape == tuple(
+        side.cell_means(m).size for side, m in zip(sides, most, strict=True)
+    )
     assert all(size <= number for size, number in zip(found.shape, most, strict=True))
     for (i, j), cell in np.ndenumerate(found):
         own = values[i * up : (i + 1) * up, j * across : (j + 1) * across]
         own = own[np.isfinite(own)]
         assert cell == pytest.approx(BY_HAND[kind](own), rel=1e-14) if own.size else np.isnan(cell)
     middle = np.mean(sides[1].values[:across])
-    assert sides[1].middles(most[1])[0] == pytest.approx(middle, rel=1e-14)
+    assert sides[1].cell_means(most[1])[0] == pytest.approx(middle, rel=1e-14)
 
 
 def test_parts_of_zipped_axes_are_told_apart():
@@ -108,23 +120,25 @@ def test_parts_of_zipped_axes_are_told_apart():
         {"target.range": ["1 km", "2 km", "3 km"], "target.grazing_angle": "85 deg"},
         {"target.range": "3 km", "target.grazing_angle": ["30 deg", "50 deg", "70 deg"]},
     ]}  # fmt: skip
-    spec = study({"instrument.laser.power": ["1 W", "3 W"], "cut": cut})
+    spec = spec_over_axes({"instrument.laser.power": ["1 W", "3 W"], "cut": cut})
     coordinates = {
-        member.name: (axis.name, member.display, {"units": member.units})
+        member.coordinate: (axis.name, member.display_values, {"units": member.units})
         for axis in spec.axes
-        for member in axis.members
+        for member in axis.parameters
     }
-    points = Points.of(xr.Dataset({"pd_shot": (("power", "cut"), np.ones((2, 9)))}, coordinates))
+    points = PointSelection.from_dataset(
+        xr.Dataset({"pd_shot": (("power", "cut"), np.ones((2, 9)))}, coordinates)
+    )
 
     def parts(shown, where):
-        return charts.facets_of(confined(points, spec, where), shown, 6)
+        return charts.split_into_parts(select_where(points, spec, where), shown, 6)
 
     found, left_out = parts(["range", "power"], {})
     assert left_out == 0
     assert [words for words, _ in found] == ["grazing angle 15°", "grazing angle 85°"]
-    assert found[1][1].side("range").positions.tolist() == [3, 4, 5]
+    assert found[1][1].sorted_coordinate("range").indices.tolist() == [3, 4, 5]
     ((_, held),), _ = parts(["range", "power"], {"grazing_angle": "85 deg"})
-    assert held.side("range").values.tolist() == [1, 2, 3]
+    assert held.sorted_coordinate("range").values.tolist() == [1, 2, 3]
     assert parts(["range"], {"grazing_angle": "86 deg"}) == ([], 0)
 
 
@@ -147,18 +161,18 @@ def test_the_mean_of_a_cell_is_painted_beside_its_lowest_value():
 
 
 def test_cells_meet_half_way_between_points_and_in_the_logarithm_where_points_do():
-    assert canvas.edges(np.array([1.0, 2.0, 4.0]), False).tolist() == [0.5, 1.5, 3.0, 5.0]
+    assert canvas.cell_edges(np.array([1.0, 2.0, 4.0]), False).tolist() == [0.5, 1.5, 3.0, 5.0]
     expected = np.array([0.1, 1.0, 10.0, 100.0]) * np.sqrt(10)
-    assert canvas.edges(np.array([1.0, 10.0, 100.0]), True) == pytest.approx(expected)
-    assert charts.is_geometric(np.geomspace(1, 1e4, 30))
-    assert not charts.is_geometric(np.linspace(1, 1e4, 30))
+    assert canvas.cell_edges(np.array([1.0, 10.0, 100.0]), True) == pytest.approx(expected)
+    assert charts.is_log_spaced(np.geomspace(1, 1e4, 30))
+    assert not charts.is_log_spaced(np.linspace(1, 1e4, 30))
 
 
 def test_probabilities_of_detection_span_0_to_1_and_tiny_chances_a_logarithm():
-    chance = canvas.norm_of(charts.scale_of("pd_shot", "pd", [np.array([0.4, 0.6])]))
+    chance = canvas.colour_norm(charts.fit_colour_scale("pd_shot", "pd", [np.array([0.4, 0.6])]))
     assert (chance.vmin, chance.vmax) == (0.0, 1.0)
-    tiny = charts.scale_of("p_leakage_up", "leakage", [np.geomspace(1e-12, 0.1, 40)])
-    assert isinstance(canvas.norm_of(tiny), LogNorm)
+    tiny = charts.fit_colour_scale("p_leakage_up", "leakage", [np.geomspace(1e-12, 0.1, 40)])
+    assert isinstance(canvas.colour_norm(tiny), LogNorm)
 
 
 def test_words_stand_one_after_the_other_along_an_axis():
@@ -171,9 +185,9 @@ def test_words_stand_one_after_the_other_along_an_axis():
 
 def test_parameters_that_vary_together_make_no_panels_and_others_do():
     found = points_of(np.ones((2, 2)), tnr=[5, 10], pairs={"range": [1.0, 2.0], "power": [1, 3]})
-    assert found.further(["range"]) == ["tnr"]
-    assert found.further(["range", "tnr"]) == []
-    assert found.further(["tnr"]) == ["range"]
+    assert found.distinguishing_coordinates(["range"]) == ["tnr"]
+    assert found.distinguishing_coordinates(["range", "tnr"]) == []
+    assert found.distinguishing_coordinates(["tnr"]) == ["range"]
 
 
 def line_points(values, **by):

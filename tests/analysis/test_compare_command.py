@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from drawn_studies import INSTRUMENT, stored
+from stored_studies import INSTRUMENT, run_into_store
 
 from sweep.cli import main
 
@@ -19,7 +19,7 @@ def stores(tmp_path_factory):
         ("weak", AXES, {"instrument": WEAK}),
         ("far", {"target.range": ["20 km", "30 km"]}, {}),
     ):
-        made[name] = str(stored(tmp_path_factory.mktemp(name), axes, **sections))
+        made[name] = str(run_into_store(tmp_path_factory.mktemp(name), axes, **sections))
     return made
 
 
@@ -62,7 +62,7 @@ def test_what_cannot_be_compared_ends_with_2(stores, tmp_path):
 
 
 def test_a_store_of_which_nothing_is_computed_ends_with_3(stores, tmp_path):
-    empty = Path(stored(tmp_path, AXES))
+    empty = Path(run_into_store(tmp_path, AXES))
     (empty / ".sweep" / "receipts.jsonl").unlink()
     for chunk in empty.glob("*/c/*"):
         if chunk.parent.parent.name not in ("range", "effects"):

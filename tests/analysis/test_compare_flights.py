@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 import xarray as xr
 from click.testing import CliRunner
-from drawn_scenes import MAPPING, cut_short, flown
-from drawn_studies import stored
+from stored_scenes import SCENE_MAPPING, copy_without_last_cycles, run_flight_into_store
+from stored_studies import run_into_store
 
 import sweep
-from sweep.analysis.opening import open_scene
+from sweep.analysis.datasets import open_scene
 from sweep.cli import main
 
-SQUARE = MAPPING["scanners"]["square"]
+SQUARE = SCENE_MAPPING["scanners"]["square"]
 
 
 @pytest.fixture(scope="module")
@@ -20,7 +20,7 @@ def slower(tmp_path_factory):
 
     Of a cycle at 10 Hz the four beams are at 0, 25, 50, 75 ms; at 5 Hz at 0, 50, 100 and 150 ms.
     """
-    return flown(
+    return run_flight_into_store(
         tmp_path_factory.mktemp("slower"),
         axes={"instrument.laser.power": ["0.5 mW", "300 uW"]},
         scanners={"square": SQUARE | {"rate": "5 Hz"}},
@@ -98,7 +98,7 @@ def test_the_command_prints_a_table_for_each_scanner_and_draws(scene_store, slow
 
 
 def test_draws_that_are_not_computed_are_not_taken_for_shots_without_a_point(scene_store, tmp_path):
-    tree = open_scene(cut_short(scene_store, tmp_path, geometry=False))
+    tree = open_scene(copy_without_last_cycles(scene_store, tmp_path, with_geometry=False))
     tree.attrs["points_committed"] -= 1  # as receipts tell of a store that is cut off
     found = tree.sweep.compare(open_scene(scene_store))["square"].to_dataset().compute()
     assert "detected" not in found and found.sizes["shot"] == 316
@@ -106,7 +106,7 @@ def test_draws_that_are_not_computed_are_not_taken_for_shots_without_a_point(sce
 
 
 def test_flights_that_do_not_meet_and_other_kinds_are_refused(scene_store, slower, tmp_path):
-    grid = stored(tmp_path, {"target.range": ["1 km", "5 km"]})
+    grid = run_into_store(tmp_path, {"target.range": ["1 km", "5 km"]})
     tree, dataset = open_scene(scene_store), sweep.open(grid)
     for one, two in ((tree, dataset), (dataset, tree)):
         with pytest.raises(ValueError, match="a grid of points and a flight"):

@@ -5,11 +5,11 @@ import pytest
 import xarray as xr
 from click.testing import CliRunner
 
-from sweep.analysis.consistency import consistency, inconsistencies
-from sweep.analysis.export import export
+from sweep.analysis.scene_results.consistency import check_consistency, inconsistency_messages
+from sweep.analysis.scene_results.point_export import export
 from sweep.cli import main
 from sweep.model.pairing import TRUE
-from sweep.report.writing import write
+from sweep.report.study_report import write_report
 from sweep.spec import SceneSpec
 from sweep.tasks import driver
 
@@ -52,27 +52,29 @@ def cloud(understated=1.0, *, navigated=1.0, shots=SHOTS):
 
 
 def test_normal_errors_of_the_stated_size_are_consistent():
-    found = consistency(cloud())
+    found = check_consistency(cloud())
     assert [each.quantity for each in found] == ["range", "radial velocity", "velocity", "altitude"]
     for each in found:
-        assert each.ratio == pytest.approx(1, abs=0.1) and each.is_consistent
+        assert each.error_ratio == pytest.approx(1, abs=0.1) and each.is_consistent
 
 
 def test_errors_are_told_by_their_ratio_to_those_that_are_stated():
-    found = {each.quantity: each for each in consistency(cloud(100.0, navigated=7.0))}
+    found = {each.quantity: each for each in check_consistency(cloud(100.0, navigated=7.0))}
     for quantity, ratio in (("range", 100), ("radial velocity", 100), ("velocity", 7),
                             ("altitude", 7)):  # fmt: skip
-        assert found[quantity].ratio == pytest.approx(ratio, rel=0.1)
+        assert found[quantity].error_ratio == pytest.approx(ratio, rel=0.1)
         assert not found[quantity].is_consistent
-    assert "residuals are " in found["range"].words and "times the stated" in found["range"].words
+    assert (
+        "residuals are " in found["range"].message and "times the stated" in found["range"].message
+    )
 
 
 def test_few_errors_and_long_flights():
     few = cloud(100.0, shots=3).isel(draw=slice(2), power=slice(1))
-    assert [each.number for each in consistency(few)] == [6, 6, 2, 2]
-    assert all(each.is_consistent for each in consistency(few))
-    long = consistency(cloud(3.0, shots=3 << 14))
-    assert long[0].number < 3 << 20 and long[0].ratio == pytest.approx(3, rel=0.05)
+    assert [each.n_errors for each in check_consistency(few)] == [6, 6, 2, 2]
+    assert all(each.is_consistent for each in check_consistency(few))
+    long = check_consistency(cloud(3.0, shots=3 << 14))
+    assert long[0].n_errors < 3 << 20 and long[0].error_ratio == pytest.approx(3, rel=0.05)
 
 
 @pytest.fixture(scope="module")
@@ -95,10 +97,13 @@ def over_hills(tmp_path_factory):
 
 
 def test_run_report_and_export_say_what_is_inconsistent(over_hills, tmp_path):
-    (told,) = inconsistencies(over_hills)
+    (told,) = inconsistency_messages(over_hills)
     assert told.startswith("four: altitude is inconsistent: residuals are ")
-    assert inconsistencies(over_hills, "none of these") == []
-    assert "four: altitude is inconsistent" in write(over_hills, tmp_path / "p.html").read_text()
+    assert inconsistency_messages(over_hills, "none of these") == []
+    assert (
+        "four: altitude is inconsistent"
+        in write_report(over_hills, tmp_path / "p.html").read_text()
+    )
     export(over_hills, tmp_path / "cloud.ply", scanner="four")
     header = (tmp_path / "cloud.ply").read_bytes().split(b"end_header")[0]
     assert b"comment four: altitude is inconsistent" in header

@@ -11,17 +11,17 @@ from pathlib import Path
 import numpy as np
 import plotly.graph_objects as go
 import pytest
-from drawn_scenes import flown
-from drawn_studies import POWERS, SURFACE, TARGET, stored, study
 from matplotlib.figure import Figure
+from stored_scenes import run_flight_into_store
+from stored_studies import POWER_AND_CUT_AXES, SURFACE_AXES, TARGET, run_into_store, spec_over_axes
 
 import sweep
-from sweep.analysis import canvas, shot_figure
+from sweep.analysis import canvas, shot_spectra
 from sweep.analysis.answers import comparison
-from sweep.analysis.canvas import sheet_of
-from sweep.analysis.figures import draw
-from sweep.report import writing
-from sweep.report.page import Plot
+from sweep.analysis.canvas import draw_chart
+from sweep.analysis.study_figures import draw_figures
+from sweep.report import study_report
+from sweep.report.html_page import Plot
 
 GOLDEN = Path(__file__).with_name("every_figure.json")
 WRITES = os.environ.get("SWEEP_GOLDEN") == "write"
@@ -74,32 +74,32 @@ KINDS = (*SHEETS, *(f"{page}: {heading}" for page, every in PLOTS.items() for he
 def pictures(tmp_path_factory):
     """Sheets and plotly's figures by kind."""
     directory, sheets = tmp_path_factory.mktemp("every"), {}
-    stores = {"grid": stored(directory, SURFACE, figures=GRID)}
-    stores["scene"] = flown(directory, figures=SCENE)
-    for name, axes, more in (("powers", POWERS, {}), ("drawn", SURFACE, SPECKLED)):
+    stores = {"grid": run_into_store(directory, SURFACE_AXES, figures=GRID)}
+    stores["scene"] = run_flight_into_store(directory, figures=SCENE)
+    for name, axes, more in (("powers", POWER_AND_CUT_AXES, {}), ("drawn", SURFACE_AXES, SPECKLED)):
         (directory / name).mkdir()
         axes = {"target.range": ["1 km", "4 km", "9 km"]} if name == "drawn" else axes
-        stores[name] = stored(directory / name, axes, **more)
+        stores[name] = run_into_store(directory / name, axes, **more)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
-            canvas, "save", lambda sheet, file, source="": sheets.setdefault(file.stem, sheet)
+            canvas, "save_sheet", lambda sheet, file, source="": sheets.setdefault(file.stem, sheet)
         )
         for name in ("grid", "scene"):
-            draw(stores[name])
+            draw_figures(stores[name])
         patch.setattr(
-            canvas, "save", lambda sheet, file, source="": sheets.setdefault("drawn", sheet)
+            canvas, "save_sheet", lambda sheet, file, source="": sheets.setdefault("drawn", sheet)
         )
-        draw(stores["drawn"])
+        draw_figures(stores["drawn"])
         patch.setattr(
-            canvas, "save", lambda sheet, file, source="": sheets.setdefault("shot", sheet)
+            canvas, "save_sheet", lambda sheet, file, source="": sheets.setdefault("shot", sheet)
         )
-        shot_figure.report(study({}), {}, directory, noise=True, seed=3)
-    with canvas.style():
+        shot_spectra.write_shot_report(spec_over_axes({}), {}, directory, draws_noise=True, seed=3)
+    with canvas.uniform_style():
         opened = sweep.open(stores["powers"])
         less = opened.assign(pd_up=opened.pd_up * 0.999, pd_shot=opened.pd_shot * 0.99)
-        chart = comparison.figure(comparison.compared(opened, less))
-        sheets["comparison"] = sheet_of(chart, "T", "")
-    for name, page in (("grid", writing._grid_page), ("scene", writing._scene_page)):
+        chart = comparison.difference_chart(comparison.tabulated_differences(opened, less))
+        sheets["comparison"] = draw_chart(chart, "T", "")
+    for name, page in (("grid", study_report._grid_report), ("scene", study_report._scene_report)):
         items = (i for s in page(stores[name]).sections for i in s.items)
         plots = [item for item in items if isinstance(item, Plot)]
         sheets |= {f"{name}: {plot.heading}": plot.figure for plot in reversed(plots)}

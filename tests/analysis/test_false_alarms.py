@@ -3,25 +3,36 @@ import csv
 import numpy as np
 import pytest
 import xarray as xr
-from drawn_studies import CUTS, INSTRUMENT, POWERS, SURFACE, stored, study
+from stored_studies import (
+    CUT_AXIS,
+    INSTRUMENT,
+    POWER_AND_CUT_AXES,
+    SURFACE_AXES,
+    run_into_store,
+    spec_over_axes,
+)
 
 from sweep.analysis import tables
-from sweep.analysis.opening import open as open_store
-from sweep.analysis.selection import Points, beyond, cuts
+from sweep.analysis.datasets import open as open_store
+from sweep.analysis.selection import PointSelection, select_beyond, study_cuts
 
 PRINTED = ((4.45e-9, 4.31e-9, 4.25e-9), (4.88e-9, 4.48e-9, 4.37e-9), (5.34e-9, 4.62e-9, 4.45e-9))
 
 
 @pytest.fixture(scope="module")
 def power(tmp_path_factory):
-    path = stored(tmp_path_factory.mktemp("power"), POWERS)
-    return Points.of(open_store(path)), study(POWERS), open_store(path)
+    path = run_into_store(tmp_path_factory.mktemp("power"), POWER_AND_CUT_AXES)
+    return (
+        PointSelection.from_dataset(open_store(path)),
+        spec_over_axes(POWER_AND_CUT_AXES),
+        open_store(path),
+    )
 
 
 @pytest.fixture(scope="module")
 def entries(power):
     found, spec, _ = power
-    return tables.false_alarms(found, spec, by="power", printed=PRINTED)
+    return tables.false_alarm_records(found, spec, by="power", printed=PRINTED)
 
 
 def test_rows_are_the_settings_and_columns_the_three_cuts(entries):
@@ -42,9 +53,9 @@ def test_noise_alone_is_the_closed_form_and_knows_nothing_of_power(entries):
 
 
 def test_noise_alone_follows_the_setting_of_its_row():
-    spec = study({"instrument.processing.fft_size": ["2^16", "2^18"], "cut": CUTS})
+    spec = spec_over_axes({"instrument.processing.fft_size": ["2^16", "2^18"], "cut": CUT_AXIS})
     settings = ({"instrument.processing.fft_size": n} for n in (2**16, 2**18))
-    sizes = [tables.reference(spec, setting)[0] for setting in settings]
+    sizes = [tables.noise_only_reference(spec, setting)[0] for setting in settings]
     assert [size["bins"] for size in sizes] == [2**16, 2**18]
     # 16 times the pairs of bins, to first order in N p = 1e-4
     assert sizes[1]["noise_only"] / sizes[0]["noise_only"] == pytest.approx(16.0, rel=2e-4)
@@ -52,8 +63,8 @@ def test_noise_alone_follows_the_setting_of_its_row():
 
 def test_half_the_bins_give_a_quarter_of_the_alarms():
     processing = INSTRUMENT["processing"] | {"bins_counted": "half"}
-    spec = study({}, instrument=INSTRUMENT | {"processing": processing})
-    found, _ = tables.reference(spec, {})
+    spec = spec_over_axes({}, instrument=INSTRUMENT | {"processing": processing})
+    found, _ = tables.noise_only_reference(spec, {})
     assert found["bins"] == 2**16
     # the model leaves out the bins of the strongest line and its neighbours: 3 of 65,536
     assert found["noise_only"] == pytest.approx(found["closed_form"], rel=2 * 3 / 2**16)
@@ -90,7 +101,7 @@ def leaked(ranges, up, down):
               "pfa_both_chirps": noise * 2e-4}  # fmt: skip
     variables = {name: (["range"], np.asarray(v, float)) for name, v in values.items()}
     dataset = xr.Dataset(variables, {"range": ("range", ranges, {"units": "m"})})
-    (found,) = tables.leakage([Points.of(dataset)])
+    (found,) = tables.leakage_records([PointSelection.from_dataset(dataset)])
     return found
 
 
@@ -117,18 +128,22 @@ def test_points_not_computed_have_no_leakage_to_tell():
 
 
 def test_a_grid_is_cut_where_the_thesis_cuts_it_and_left_whole_without_range_and_angle():
-    grid = study({"target.range": ["1 km", "3.5 km"], "target.grazing_angle": ["15 deg", "30 deg"]})
-    assert [(c.name, c.along) for c in cuts(grid)] == [
+    grid = spec_over_axes(
+        {"target.range": ["1 km", "3.5 km"], "target.grazing_angle": ["15 deg", "30 deg"]}
+    )
+    assert [(c.name, c.varying_name) for c in study_cuts(grid)] == [
         ("15 deg", "range"),
         ("3.5 km", "grazing_angle"),
     ]
-    assert [c.name for c in cuts(study({"instrument.laser.power": ["1 W"]}))] == ["all"]
+    assert [c.name for c in study_cuts(spec_over_axes({"instrument.laser.power": ["1 W"]}))] == [
+        "all"
+    ]
 
 
 def test_the_page_holds_every_figure_in_text_and_csv(power, tmp_path):
     found, spec, _ = power
     page = tables.false_alarm_page(found, spec, by="power", printed=PRINTED, title="Table 4.3")
-    text, table = page.save(tmp_path, "table_4_3")
+    text, table = page.save_files(tmp_path, "table_4_3")
     written = text.read_text()
     assert written.startswith("Table 4.3\n=========")
     assert "3.934721e-09" in written and "4.450e-09" in written and "1.131" in written
@@ -141,15 +156,18 @@ def test_the_page_holds_every_figure_in_text_and_csv(power, tmp_path):
 def test_the_page_of_a_study_that_nobody_printed_has_no_column_for_it(power):
     found, spec, _ = power
     assert (
-        "printed/closed" not in tables.false_alarm_page(found, spec, by="power", title="T").text()
+        "printed/closed"
+        not in tables.false_alarm_page(found, spec, by="power", title="T").to_text()
     )
 
 
 def test_thresholds_have_the_chances_of_table_4_2(tmp_path):
     axes = {"instrument.processing.tnr": [1, 5, 10, 15], "target.range": ["1 km", "3 km"]}
-    found = Points.of(open_store(stored(tmp_path, axes)))
+    found = PointSelection.from_dataset(open_store(run_into_store(tmp_path, axes)))
     printed = (0.8, 0.047, 5.06e-10, 1.17e-21)
-    page = tables.threshold_page(found, study(axes), by="tnr", printed=printed, title="Table 4.2")
+    page = tables.threshold_page(
+        found, spec_over_axes(axes), by="tnr", printed=printed, title="Table 4.2"
+    )
     for record, expected in zip(page.records, (0.807, 4.68e-3, 4.79e-10, 1.07e-21), strict=True):
         assert record["closed_form"] == pytest.approx(expected, rel=2e-3)
         assert record["noise_only"] == pytest.approx(record["closed_form"], rel=1e-12)
@@ -163,8 +181,8 @@ def test_other_axes_than_range_and_angle_make_rows_of_their_own(tmp_path):
         "instrument.processing.fft_size": ["2^16", "2^17"],
         "target.range": {"log": ["10 m", "1 km"], "number": 3},
     }
-    found = Points.of(open_store(stored(tmp_path, axes)))
-    result = tables.false_alarms(found, study(axes), by="power")
+    found = PointSelection.from_dataset(open_store(run_into_store(tmp_path, axes)))
+    result = tables.false_alarm_records(found, spec_over_axes(axes), by="power")
     assert [e["setting"] for e in result][:2] == [
         "power 1 W, FFT size 2^16",
         "power 1 W, FFT size 2^17",
@@ -173,8 +191,8 @@ def test_other_axes_than_range_and_angle_make_rows_of_their_own(tmp_path):
 
 
 def test_surfaces_of_the_same_study_agree_with_the_whole(tmp_path):
-    dataset = open_store(stored(tmp_path, SURFACE))
-    found = Points.of(dataset)
-    near = beyond(found, study(SURFACE), "10 m")
+    dataset = open_store(run_into_store(tmp_path, SURFACE_AXES))
+    found = PointSelection.from_dataset(dataset)
+    near = select_beyond(found, spec_over_axes(SURFACE_AXES), "10 m")
     assert near.size == 23 * 9
-    assert beyond(found, study(SURFACE), "10 m", included=True).size == 24 * 9
+    assert select_beyond(found, spec_over_axes(SURFACE_AXES), "10 m", inclusive=True).size == 24 * 9

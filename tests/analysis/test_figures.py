@@ -1,15 +1,20 @@
 import numpy as np
 import pytest
-from drawn_files import shows
-from drawn_studies import POWERS, SURFACE, stored, study
+from figure_files import has_content
 from matplotlib.text import Text
 from PIL import Image
+from stored_studies import POWER_AND_CUT_AXES, SURFACE_AXES, run_into_store, spec_over_axes
 
 from sweep.analysis import canvas
-from sweep.analysis.charts import SHEET
-from sweep.analysis.figures import Study, default_figures, draw, source
-from sweep.report.page import plot
-from sweep.report.writing import write
+from sweep.analysis.charts import SHEET_LIMITS
+from sweep.analysis.study_figures import (
+    GridResults,
+    default_grid_figures,
+    draw_figures,
+    picture_source,
+)
+from sweep.report.html_page import make_plot
+from sweep.report.study_report import write_report
 
 ASKED = [
     {"kind": "surface", "variable": "pd_shot", "x": "range", "y": "grazing_angle"},
@@ -36,15 +41,15 @@ TOGETHER = {"target.range": ["1 km", "3 km"], "instrument.laser.power": ["1 W", 
 
 @pytest.fixture(scope="module")
 def asked(tmp_path_factory):
-    return stored(tmp_path_factory.mktemp("asked"), SURFACE, figures=ASKED)
+    return run_into_store(tmp_path_factory.mktemp("asked"), SURFACE_AXES, figures=ASKED)
 
 
 def test_every_figure_and_table_of_the_spec_is_made_beside_the_store(asked):
-    files = draw(asked)
+    files = draw_figures(asked)
     directory = asked.with_name("study-figures")
     names = ["pd_shot_surface.png", "along_range.png", "means.txt", "means.csv"]
     assert files == [directory / name for name in names]
-    assert all(map(shows, files))
+    assert all(map(has_content, files))
 
 
 def test_a_table_averages_over_ranges_from_the_least_on(asked, tmp_path):
@@ -52,7 +57,7 @@ def test_a_table_averages_over_ranges_from_the_least_on(asked, tmp_path):
 
     import sweep
 
-    draw(asked, tmp_path)
+    draw_figures(asked, tmp_path)
     dataset = sweep.open(asked)
     with (tmp_path / "means.csv").open() as file:
         records = {record["row"]: record for record in csv.DictReader(file)}
@@ -64,21 +69,23 @@ def test_a_table_averages_over_ranges_from_the_least_on(asked, tmp_path):
 
 
 def test_a_store_cut_short_is_drawn_with_what_it_has(tmp_path):
-    path = stored(tmp_path, SURFACE, figures=ASKED, storage={"block_points": 40})
+    path = run_into_store(tmp_path, SURFACE_AXES, figures=ASKED, storage={"block_points": 40})
     log = path / ".sweep" / "receipts.jsonl"
     log.write_text(log.read_text().splitlines(keepends=True)[0])
     for chunk in (path / "pd_shot" / "c").rglob("*"):
         if chunk.is_file() and chunk.parent.name != "0":
             chunk.unlink()
-    assert all(map(shows, draw(path)))
+    assert all(map(has_content, draw_figures(path)))
 
 
 def test_a_figure_of_values_that_are_not_in_the_grid_says_so(tmp_path, monkeypatch):
     figure = ASKED[1] | {"where": {"grazing_angle": "17 deg"}}
-    path = stored(tmp_path, {"target.range": ["1 km"], **SURFACE}, figures=[figure])
+    path = run_into_store(tmp_path, {"target.range": ["1 km"], **SURFACE_AXES}, figures=[figure])
     sheets = []
-    monkeypatch.setattr(canvas, "save", lambda sheet, file, source="": sheets.append(sheet) or file)
-    draw(path)
+    monkeypatch.setattr(
+        canvas, "save_sheet", lambda sheet, file, source="": sheets.append(sheet) or file
+    )
+    draw_figures(path)
     ((words,),) = (sheet.texts for sheet in sheets)
     assert words.get_text().endswith("no point of the study has grazing angle 17 deg")
 
@@ -86,21 +93,21 @@ def test_a_figure_of_values_that_are_not_in_the_grid_says_so(tmp_path, monkeypat
 @pytest.mark.parametrize(
     "axes,kinds",
     [
-        (SURFACE, ["surface", "surface"]),
+        (SURFACE_AXES, ["surface", "surface"]),
         ({"target.range": ["1 km", "2 km"], "instrument.laser.power": ["1 W"]}, ["slices"] * 2),
-        (POWERS, ["slices"] * 2),
+        (POWER_AND_CUT_AXES, ["slices"] * 2),
         (WINDOWS, ["slices"] * 2 + ["table"] * 2),
         ({}, []),
     ],
 )
 def test_a_study_that_asks_for_nothing_has_the_figures_that_suit_its_axes(axes, kinds):
-    assert [figure.kind for figure in default_figures(study(axes))] == kinds
+    assert [figure.kind for figure in default_grid_figures(spec_over_axes(axes))] == kinds
 
 
 @pytest.mark.parametrize(
     "axes,number",
     [
-        (SURFACE, 2),
+        (SURFACE_AXES, 2),
         ({}, 2),
         ({"along": {"zip": TOGETHER}}, 2),
         (WINDOWS, 6),
@@ -108,24 +115,26 @@ def test_a_study_that_asks_for_nothing_has_the_figures_that_suit_its_axes(axes, 
     ],
 )
 def test_the_usual_figures_of_a_study_are_drawn(axes, number, tmp_path):
-    files = draw(stored(tmp_path, axes))
-    assert len(files) == number and all(map(shows, files))
+    files = draw_figures(run_into_store(tmp_path, axes))
+    assert len(files) == number and all(map(has_content, files))
 
 
 def test_the_default_surface_has_range_across_and_angle_up():
-    turned = dict(reversed(SURFACE.items()))
-    assert [(f.x, f.y) for f in default_figures(study(turned))] == [("range", "grazing_angle")] * 2
+    turned = dict(reversed(SURFACE_AXES.items()))
+    assert [(f.x, f.y) for f in default_grid_figures(spec_over_axes(turned))] == [
+        ("range", "grazing_angle")
+    ] * 2
 
 
 @pytest.mark.parametrize("text", [r"$\frac{1}{$", "costs $5 or $6"])
 def test_a_dollar_in_a_title_is_a_dollar(tmp_path, text):
-    sheets = canvas.sheet(4.0, 2.0), canvas.empty(text)
-    canvas.title(sheets[0], text)
-    canvas.caption(sheets[0], text)
+    sheets = canvas.blank_sheet(4.0, 2.0), canvas.message_sheet(text)
+    canvas.set_title(sheets[0], text)
+    canvas.set_caption(sheets[0], text)
     shown = [found for sheet in sheets for found in sheet.findobj(Text) if found.get_text() == text]
     assert len(shown) == 3 and not any(found.get_parse_math() for found in shown)
     for sheet in sheets:
-        canvas.save(sheet, tmp_path / "sheet.png")
+        canvas.save_sheet(sheet, tmp_path / "sheet.png")
 
 
 WORDS = [
@@ -139,45 +148,50 @@ WORDS = [
 @pytest.mark.parametrize("draws", [{}, {"number": 20}])
 def test_axes_of_words_are_drawn_by_category_in_files_and_pages(draws, tmp_path):
     axes = WINDOWS | {"target.range": ["1 km", "4 km", "9 km"]}
-    path = stored(tmp_path, axes, figures=WORDS, draws=draws)
+    path = run_into_store(tmp_path, axes, figures=WORDS, draws=draws)
     for form in ("png", "svg"):
-        files = draw(path, form=form)
+        files = draw_figures(path, picture_format=form)
         assert len(files) == len(WORDS)
-    assert all(map(shows, draw(path)))
-    figures = Study.of(path)
-    for figure in figures.figures[:1]:
-        (panel,) = figures.chart(figure, SHEET).panels
+    assert all(map(has_content, draw_figures(path)))
+    figures = GridResults.from_store(path)
+    for figure in figures.figure_specs[:1]:
+        (panel,) = figures.make_chart(figure, SHEET_LIMITS).panels
         assert panel.x.kind == "category"
         for line in panel.lines:  # in the order of the study, not of the alphabet
             assert line.x.tolist() == ["rectangular", "hann", "blackman"]
     values = figures.dataset.pd_shot
-    for figure, words in zip(figures.figures[2:], ("x", "y"), strict=True):
-        (panel,) = figures.chart(figure, SHEET).panels
+    for figure, words in zip(figures.figure_specs[2:], ("x", "y"), strict=True):
+        (panel,) = figures.make_chart(figure, SHEET_LIMITS).panels
         assert getattr(panel, words).kind == "category"
         own = (
             values.transpose("range", "window") if words == "x" else values.transpose("window", ...)
         )
-        np.testing.assert_allclose(panel.map.values, own)
-        assert getattr(panel.map, words).tolist() == ["rectangular", "hann", "blackman"]
-        (trace,) = plot(figures.chart(figure, SHEET)).figure.data
+        np.testing.assert_allclose(panel.heat_map.values, own)
+        assert getattr(panel.heat_map, words).tolist() == ["rectangular", "hann", "blackman"]
+        (trace,) = make_plot(figures.make_chart(figure, SHEET_LIMITS)).figure.data
         assert getattr(trace, words).tolist() == ["rectangular", "hann", "blackman"]
-    assert write(path, tmp_path / "page.html").stat().st_size > 1e6
+    assert write_report(path, tmp_path / "page.html").stat().st_size > 1e6
 
 
 def test_levels_are_contours_of_maps_and_lines_across_slices(tmp_path):
     levels = {"levels": [0.5, 0.9]}
     figures = [ASKED[0] | levels, ASKED[1] | levels | {"variable": "pd_shot"}]
-    path = stored(tmp_path, SURFACE, figures=figures)
-    assert all(map(shows, draw(path)))
-    surface, slices = (Study.of(path).chart(f, SHEET) for f in Study.of(path).figures)
-    assert surface.panels[0].map.levels == (0.5, 0.9) and "0.5 and 0.9" in " ".join(surface.caption)
-    levels = [line for line in slices.panels[0].lines if line.look == "level"]
+    path = run_into_store(tmp_path, SURFACE_AXES, figures=figures)
+    assert all(map(has_content, draw_figures(path)))
+    surface, slices = (
+        GridResults.from_store(path).make_chart(f, SHEET_LIMITS)
+        for f in GridResults.from_store(path).figure_specs
+    )
+    assert surface.panels[0].heat_map.contour_levels == (0.5, 0.9) and "0.5 and 0.9" in " ".join(
+        surface.caption
+    )
+    levels = [line for line in slices.panels[0].lines if line.style == "level"]
     assert [line.y[0] for line in levels] == [0.5, 0.9]
-    with canvas.style():
-        sheet = canvas.sheet_of(surface, "", "")
+    with canvas.uniform_style():
+        sheet = canvas.draw_chart(surface, "", "")
     told = {text.get_text() for axes in sheet.axes for text in axes.texts}
     assert told == {"0.5", "0.9"}
-    contours = [trace for trace in plot(surface).figure.data if trace.type == "contour"]
+    contours = [trace for trace in make_plot(surface).figure.data if trace.type == "contour"]
     assert [trace.contours.start for trace in contours] == [0.5, 0.9]
 
 
@@ -187,13 +201,13 @@ def test_levels_that_nothing_reaches_or_across_words_leave_the_map(levels, x, tm
     other = {"range": "window", "window": "range"}[x]
     asked = {"kind": "surface", "variable": "pd_shot", "x": x, "y": other, "levels": levels}
     axes = WINDOWS | {"target.range": ["1 km", "4 km", "9 km"]}
-    assert all(map(shows, draw(stored(tmp_path, axes, figures=[asked]))))
+    assert all(map(has_content, draw_figures(run_into_store(tmp_path, axes, figures=[asked]))))
 
 
 def test_a_picture_says_what_it_was_drawn_from(asked, tmp_path):
-    png, pdf, svg = (draw(asked, tmp_path, form)[0] for form in ("png", "pdf", "svg"))
-    spec = Study.of(asked).spec
-    told = source(spec.id, spec.figures[0])
+    png, pdf, svg = (draw_figures(asked, tmp_path, form)[0] for form in ("png", "pdf", "svg"))
+    spec = GridResults.from_store(asked).spec
+    told = picture_source(spec.id, spec.figures[0])
     with Image.open(png) as image:
-        assert image.info[canvas.SOURCE] == told
+        assert image.info[canvas.PNG_SOURCE_FIELD] == told
     assert told in svg.read_text() and told.encode() in pdf.read_bytes()

@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from sweep.analysis.scenes.navigation import Tally, merge, tally
+from sweep.analysis.scene_results.navigation_errors import ErrorTally, merge_tallies, tally_errors
 from sweep.model.geometry.scanner import corners
 from sweep.model.navigation import velocity
 
@@ -23,8 +23,8 @@ def _draws(n, *, bias=(3.0, -2.0, 0.5), seed=1):
 
 def _of_all(error, variance, available):
     """Tally of all solutions in one cell."""
-    found = tally(error, variance, available, np.zeros(len(error), np.int64), 1)
-    return Tally(*(getattr(found, name)[0] for name in FIELDS))
+    found = tally_errors(error, variance, available, np.zeros(len(error), np.int64), 1)
+    return ErrorTally(*(getattr(found, name)[0] for name in FIELDS))
 
 
 def _units(sizes):
@@ -43,19 +43,19 @@ def test_a_tally_says_what_numpy_says_of_all_draws():
     error, variance, available = _draws(5000)
     result = _of_all(error, variance, available)
     held = error[available]
-    assert result.count == available.sum() and result.attempts == 5000
+    assert result.n_solutions == available.sum() and result.attempts == 5000
     assert result.availability == available.mean()
     np.testing.assert_allclose(result.bias, held.mean(axis=0), rtol=1e-12)
     np.testing.assert_allclose(result.variance, held.var(axis=0, ddof=1), rtol=1e-12)
     np.testing.assert_allclose(result.rmse, np.sqrt((held**2).mean(axis=0)), rtol=1e-12)
-    np.testing.assert_allclose(result.stated, variance[available].mean(axis=0), rtol=1e-12)
+    np.testing.assert_allclose(result.stated_variance, variance[available].mean(axis=0), rtol=1e-12)
 
 
 @pytest.mark.parametrize("sizes", [[2000, 3000], [1, 0, 999, 17, 2500, 1483], [500] * 10])
 def test_merged_tallies_equal_one_pass(sizes):
     parts, (error, variance, available) = _units(sizes)
-    whole, merged = _of_all(error, variance, available), merge(parts)
-    assert merged.attempts == whole.attempts and merged.count == whole.count
+    whole, merged = _of_all(error, variance, available), merge_tallies(parts)
+    assert merged.attempts == whole.attempts and merged.n_solutions == whole.n_solutions
     for name in FIELDS[2:]:
         np.testing.assert_allclose(getattr(merged, name), getattr(whole, name), rtol=1e-12)
 
@@ -63,21 +63,23 @@ def test_merged_tallies_equal_one_pass(sizes):
 def test_tallies_are_merged_in_a_fixed_tree():
     parts, _ = _units([311, 7, 1200, 44, 901, 3, 650])
     a, b, c, d, e, f, g = parts
-    assert _same_bits(merge(parts), ((a + b) + (c + d)) + ((e + f) + g))
+    assert _same_bits(merge_tallies(parts), ((a + b) + (c + d)) + ((e + f) + g))
     arrived = {i: parts[i] for i in (4, 0, 6, 2, 5, 1, 3)}
-    assert _same_bits(merge([arrived[i] for i in sorted(arrived)]), merge(parts))
+    assert _same_bits(merge_tallies([arrived[i] for i in sorted(arrived)]), merge_tallies(parts))
     # another order is the same sum up to rounding only, which is why the order is fixed
-    other = merge(parts[::-1])
-    assert other.count == merge(parts).count
-    np.testing.assert_allclose(other.deviation, merge(parts).deviation, rtol=1e-12)
-    assert not _same_bits(other, merge(parts))
+    other = merge_tallies(parts[::-1])
+    assert other.n_solutions == merge_tallies(parts).n_solutions
+    np.testing.assert_allclose(
+        other.squared_deviation, merge_tallies(parts).squared_deviation, rtol=1e-12
+    )
+    assert not _same_bits(other, merge_tallies(parts))
 
 
 def test_cells_of_altitude_hold_their_own_draws():
     error, variance, available = _draws(3000)
     altitude = np.random.default_rng(2).uniform(0, 700, 3000)
     edges = np.array([100.0, 200.0, 400.0, 500.0])
-    result = tally(error, variance, available, np.digitize(altitude, edges) - 1, 3)
+    result = tally_errors(error, variance, available, np.digitize(altitude, edges) - 1, 3)
     assert result.attempts.shape == (3,) and result.variance.shape == (3, 3)
     for i in range(3):
         here = (altitude >= edges[i]) & (altitude < edges[i + 1])
@@ -94,12 +96,12 @@ def test_what_is_not_there_is_nan_and_never_a_warning():
     error[1:] = np.nan
     here = np.array([True, False, False, False])
     with np.errstate(all="raise"):
-        result = tally(error, variance, here, np.array([0, 0, 1, 1]), 3)
+        result = tally_errors(error, variance, here, np.array([0, 0, 1, 1]), 3)
         result = result + result
         assert result.availability[:2].tolist() == [0.5, 0.0] and np.isnan(result.availability[2])
         assert np.isfinite(result.bias[0]).all() and np.isnan(result.bias[1:]).all()
         assert np.isfinite(result.rmse[0]).all() and np.isnan(result.rmse[1:]).all()
-        assert np.isnan(result.stated[1:]).all()
+        assert np.isnan(result.stated_variance[1:]).all()
         once = _of_all(error, variance, here)
         assert np.isnan(once.variance).all()  # one draw has no spread
 
@@ -114,17 +116,17 @@ def test_dropouts_give_the_availability_of_three_of_four_and_the_stated_variance
     result = _of_all(found.value - moving, stated, found.available)
     expected = pd**4 + 4 * pd**3 * (1 - pd)
     assert abs(result.availability - expected) <= 5 * math.sqrt(expected * (1 - expected) / n)
-    assert (np.abs(result.bias) <= 5 * np.sqrt(result.stated / result.count)).all()
+    assert (np.abs(result.bias) <= 5 * np.sqrt(result.stated_variance / result.n_solutions)).all()
     # draws of three and of four beams mix, so the spread of squares is taken from themselves
     off = found.value[found.available] - moving
-    spread = np.std(off**2, axis=0) / np.sqrt(result.count)
-    assert (np.abs(result.variance - result.stated) <= 5 * spread).all()
-    assert (5 * spread < 0.07 * result.stated).all()  # a variance 7 % off would show
+    spread = np.std(off**2, axis=0) / np.sqrt(result.n_solutions)
+    assert (np.abs(result.variance - result.stated_variance) <= 5 * spread).all()
+    assert (5 * spread < 0.07 * result.stated_variance).all()  # a variance 7 % off would show
     np.testing.assert_allclose(
-        result.rmse**2, result.variance + result.bias**2, rtol=2 / result.count
+        result.rmse**2, result.variance + result.bias**2, rtol=2 / result.n_solutions
     )
 
 
 def test_no_tallies_can_not_be_merged():
     with pytest.raises(ValueError, match="no tally"):
-        merge([])
+        merge_tallies([])

@@ -5,10 +5,10 @@ import pickle
 import numpy as np
 import pytest
 import xarray as xr
-from drawn_studies import study
+from stored_studies import spec_over_axes
 
 import sweep
-from sweep.spec import Spec
+from sweep.spec import GridSpec
 
 RANGES = {"target.range": ["1 km", "2 km", "4 km", "16 km"]}
 POWERS = {"instrument.laser.power": ["1 W", "3 W"]}
@@ -16,12 +16,12 @@ POWERS = {"instrument.laser.power": ["1 W", "3 W"]}
 
 def computed(directory, name, axes, **changes):
     """Path of the store of a study whose instrument has some fields set anew."""
-    mapping = study(axes).to_yaml_mapping() | {"title": name}
+    mapping = spec_over_axes(axes).to_yaml_mapping() | {"title": name}
     for path, value in changes.items():
         section, field = path.split("__")
         mapping["instrument"][section] = mapping["instrument"][section] | {field: value}
     path = directory / f"{name}.zarr"
-    spec = Spec.from_mapping(mapping)
+    spec = GridSpec.from_mapping(mapping)
     sweep.run(spec, store=path, scheduler="none", progress=False)
     return path
 
@@ -293,9 +293,9 @@ def test_contours_of_designs_are_told_apart(tmp_path):
 
 
 def test_studies_whose_intervals_one_lacks_keep_their_own_variables(tmp_path, stores, small):
-    mapping = study(RANGES).to_yaml_mapping() | {"title": "drawn", "draws": {"number": 50}}
+    mapping = spec_over_axes(RANGES).to_yaml_mapping() | {"title": "drawn", "draws": {"number": 50}}
     drawn = tmp_path / "drawn.zarr"
-    spec = Spec.from_mapping(mapping)
+    spec = GridSpec.from_mapping(mapping)
     sweep.run(spec, store=drawn, scheduler="none", progress=False)
     joined = sweep.open([stores["small"], drawn])
     pd = joined.sel(power=1).sweep.detection_probability()

@@ -4,19 +4,19 @@ import shutil
 import numpy as np
 import pytest
 import xarray as xr
-from drawn_studies import POWERS, SURFACE, stored, study
+from stored_studies import POWER_AND_CUT_AXES, SURFACE_AXES, run_into_store, spec_over_axes
 
 import sweep
-from sweep.analysis.opening import NotAStoreError, merged, open_scene, stretches
-from sweep.analysis.opening import open as open_store
-from sweep.analysis.scenes.recording import read_eyepoints
+from sweep.analysis.datasets import NotAStoreError, open_scene, read_slices, sum_batches
+from sweep.analysis.datasets import open as open_store
+from sweep.analysis.scene_results.recordings import read_eyepoints
 from sweep.model.eyepoints import observe
 from sweep.model.outputs import CYCLES, NAVIGATION, OUTPUTS, POINTS, SHOTS, SIMULATED, STATISTICS
 
 
 @pytest.fixture(scope="module")
 def surface(tmp_path_factory):
-    return stored(tmp_path_factory.mktemp("surface"), SURFACE)
+    return run_into_store(tmp_path_factory.mktemp("surface"), SURFACE_AXES)
 
 
 def test_dimensions_and_units_are_those_of_the_spec(surface):
@@ -35,7 +35,7 @@ def test_a_finished_store_says_when_and_that_it_is_whole(surface):
     assert attributes["blocks"] == attributes["blocks_committed"]
     assert attributes["started"] <= attributes["finished"]
     assert np.datetime64(attributes["finished"].removesuffix("+00:00")) > np.datetime64("2020")
-    assert attributes["study_id"] == study(SURFACE).id
+    assert attributes["study_id"] == spec_over_axes(SURFACE_AXES).id
 
 
 @pytest.mark.parametrize("kind", ["grid", "flight"])
@@ -43,7 +43,7 @@ def test_a_store_cut_short_counts_what_is_committed_and_is_not_finished(
     kind, tmp_path, scene_store
 ):
     if kind == "grid":
-        path = stored(tmp_path, SURFACE, storage={"block_points": 50})
+        path = run_into_store(tmp_path, SURFACE_AXES, storage={"block_points": 50})
     else:
         path = shutil.copytree(scene_store, tmp_path / "short.zarr")
     log = path / ".sweep" / "receipts.jsonl"
@@ -59,7 +59,7 @@ def test_a_store_cut_short_counts_what_is_committed_and_is_not_finished(
 
 
 def test_coordinates_of_a_zipped_axis_share_its_dimension(tmp_path):
-    dataset = open_store(stored(tmp_path, POWERS))
+    dataset = open_store(run_into_store(tmp_path, POWER_AND_CUT_AXES))
     assert dataset.pd_shot.dims == ("power", "cut")
     assert dataset.range.dims == dataset.grazing_angle.dims == ("cut",)
     assert set(np.unique(dataset.grazing_angle.where(dataset.range == 5, drop=True))) == {15, 85}
@@ -71,14 +71,16 @@ def test_counts_of_draws_are_summed_over_batches_and_a_batch_not_counted_voids_t
         {"n_detected_shot": (("range", "batch"), counts, {"units": "1"}), "pd": ("range", [1, 2])},
         coords={"batch_draws": ("batch", [10, 10, 7])},
     )
-    result = merged(dataset)
+    result = sum_batches(dataset)
     assert result.n_detected_shot.values.tolist() == [12, -1]
     assert result.n_detected_shot.attrs["units"] == "1"
     assert set(result.dims) == {"range"}
 
 
 def test_a_store_of_draws_opens_with_their_sums(tmp_path):
-    path = stored(tmp_path, {"target.range": ["1 km", "3 km"]}, draws={"number": 25, "batch": 10})
+    path = run_into_store(
+        tmp_path, {"target.range": ["1 km", "3 km"]}, draws={"number": 25, "batch": 10}
+    )
     dataset = open_store(path)
     assert dataset.n_draws.values.tolist() == [25, 25]
     assert "batch" not in dataset.dims
@@ -132,7 +134,7 @@ def test_arrays_are_read_in_chunks_when_they_are_needed(scene_store):
 
 def test_a_finished_store_counts_all_shots_of_all_scanners_draws_and_places(scene_store, spec):
     attributes = open_scene(scene_store).attrs
-    shots = sum(spec.cycles(name) * spec.shots_a_cycle(name) for name in spec.scanners)
+    shots = sum(spec.number_of_cycles(name) * spec.shots_per_cycle(name) for name in spec.scanners)
     assert attributes["points"] == attributes["points_committed"] == shots * 3 * 2
     assert attributes["blocks"] == attributes["blocks_committed"] == 2 * 2 * (3 + 3)
     assert attributes["started"] <= attributes["finished"] != ""
@@ -142,7 +144,7 @@ def test_a_finished_store_counts_all_shots_of_all_scanners_draws_and_places(scen
 def test_stretches_are_whole_chunks_and_cover_all_once(size, most):
     array = xr.DataArray(np.zeros((2, 100)), dims=("power", "shot"))
     array.encoding["preferred_chunks"] = {"power": 1, "shot": 7}
-    parts = stretches(array, "shot", size)
+    parts = read_slices(array, "shot", size)
     covered = np.concatenate([np.arange(100)[part] for part in parts])
     assert covered.tolist() == list(range(100))
     assert all(part.start % 7 == 0 for part in parts)
@@ -150,19 +152,19 @@ def test_stretches_are_whole_chunks_and_cover_all_once(size, most):
 
 
 def test_eyepoints_read_back_are_those_cast_anew_bit_for_bit(scene_store, spec):
-    world, tree = spec.world(), open_scene(scene_store)
+    world, tree = spec.build_scene(), open_scene(scene_store)
     index = np.array([3, 77, 130, 311])
     for name in spec.scanners:
         found = read_eyepoints(scene_store, tree[name].to_dataset(), index)
         cast = observe(
             index,
-            flight=spec.flight(),
-            scanner=spec.scan(name),
+            flight=spec.build_flight(),
+            scanner=spec.scan_pattern(name),
             caster=world.caster,
             beam_divergence=spec.instrument.laser.beam_divergence,
             number=spec.footprint.beamlets,
-            pattern=spec.pattern,
-            bodies=world.bodies,
+            pattern=spec.beamlet_pattern,
+            bodies=world.body_flights,
         )
         for field, array in cast._asdict().items():
             equal_nan = array.dtype.kind == "f"

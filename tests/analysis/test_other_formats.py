@@ -6,11 +6,11 @@ import matplotlib
 import numpy as np
 import pytest
 import xarray as xr
-from drawn_studies import study
+from stored_studies import spec_over_axes
 
 import sweep
-from sweep.storage.opening import software_versions
-from sweep.tasks.accuracy.measure import measure
+from sweep.storage.store_format import parse_software_versions
+from sweep.tasks.accuracy.measurement import measure_accuracy
 
 matplotlib.use("agg")
 
@@ -47,7 +47,9 @@ def grids(tmp_path_factory):
     directory, stores = tmp_path_factory.mktemp("grids"), {}
     for name, (axes, sections) in GRIDS.items():
         stores[name] = directory / f"{name}.zarr"
-        sweep.run(study(axes, **sections), store=stores[name], scheduler="none", progress=False)
+        sweep.run(
+            spec_over_axes(axes, **sections), store=stores[name], scheduler="none", progress=False
+        )
     return stores
 
 
@@ -76,7 +78,7 @@ def test_a_join_goes_through_netcdf_and_answers_per_design(grids, engine, tmp_pa
 @pytest.mark.parametrize("engine", ENGINES)
 def test_what_accuracy_costs_goes_into_netcdf(engine, tmp_path):
     store = tmp_path / "cost.zarr"
-    assert measure(study(RANGES), store_path=store, points=3, progress=False)
+    assert measure_accuracy(spec_over_axes(RANGES), store_path=store, n_points=3, progress=False)
     dataset = xr.open_zarr(store)
     assert flat(dataset)
     dataset.to_netcdf(tmp_path / "cost.nc", engine=engine)
@@ -124,8 +126,8 @@ def test_the_map_of_a_store_of_an_earlier_version_gets_its_group(scene_store, mo
 
 def test_software_is_told_alike_by_stores_of_this_version_and_of_earlier_ones():
     versions = {"numba": "0.60", "numpy": "2.1.0rc1"}
-    assert software_versions({"software": versions}) == versions
-    assert software_versions({"software": "numba 0.60, numpy 2.1.0rc1"}) == versions
+    assert parse_software_versions({"software": versions}) == versions
+    assert parse_software_versions({"software": "numba 0.60, numpy 2.1.0rc1"}) == versions
 
 
 @pytest.mark.parametrize(

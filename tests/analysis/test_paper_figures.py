@@ -2,10 +2,10 @@
 
 import matplotlib
 import pytest
-from drawn_studies import SURFACE, stored
+from stored_studies import SURFACE_AXES, run_into_store
 
 from sweep.analysis import canvas
-from sweep.analysis.figures import draw
+from sweep.analysis.study_figures import draw_figures
 
 ASKED = [
     {"kind": "surface", "name": "surface", "variable": "pd_shot", "x": "range",
@@ -19,24 +19,24 @@ BEGINNINGS = {"png": b"\x89PNG", "pdf": b"%PDF", "svg": b"<?xml"}
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory):
-    return stored(tmp_path_factory.mktemp("paper"), SURFACE, figures=ASKED)
+    return run_into_store(tmp_path_factory.mktemp("paper"), SURFACE_AXES, figures=ASKED)
 
 
 @pytest.fixture(scope="module")
 def drawn(store, tmp_path_factory):
     """Surface and slices as files by form."""
     folder = tmp_path_factory.mktemp("drawn")
-    return {form: draw(store, folder, form) for form in canvas.FORMATS}
+    return {form: draw_figures(store, folder, form) for form in canvas.PICTURE_FORMATS}
 
 
-@pytest.mark.parametrize("form", canvas.FORMATS)
+@pytest.mark.parametrize("form", canvas.PICTURE_FORMATS)
 def test_the_same_store_gives_the_same_bytes_whatever_the_day_and_the_style(
     form, store, drawn, tmp_path, monkeypatch
 ):
     first = drawn[form]
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "86400")
     with matplotlib.rc_context({"font.size": 20, "lines.linewidth": 5, "svg.hashsalt": "other"}):
-        again = draw(store, tmp_path / "again", form)
+        again = draw_figures(store, tmp_path / "again", form)
     assert [file.name for file in first] == [f"surface.{form}", f"slices.{form}"]
     for a, b in zip(first, again, strict=True):
         assert a.read_bytes() == b.read_bytes()
@@ -61,4 +61,4 @@ def test_pdf_holds_whole_fonts(drawn):
 
 def test_another_suffix_is_refused(tmp_path):
     with pytest.raises(KeyError):
-        canvas.save(canvas.empty("x"), tmp_path / "x.bmp")
+        canvas.save_sheet(canvas.message_sheet("x"), tmp_path / "x.bmp")

@@ -3,13 +3,13 @@
 from pathlib import Path
 
 import numpy as np
-import promise_drawn
 import pytest
+import tolerance_of_draws
 
 from sweep.model.outputs import PROMISED
 from sweep.spec import load
-from sweep.tasks.accuracy.rungs import WRITTEN, Rung
-from sweep.tasks.grid_study import GridStudy
+from sweep.tasks.accuracy.settings import AS_WRITTEN_KIND, AccuracySetting
+from sweep.tasks.studies.grid_study import GridStudy
 
 ROOT = Path(__file__).parents[2]
 DRAWS = 4000
@@ -24,11 +24,13 @@ FEW = {
 @pytest.fixture(scope="module")
 def few():
     shipped = load(ROOT / "experiments" / "speckled_target.yaml")
-    return Rung(name="", kind=WRITTEN, overrides=FEW | {"figures": []}).of(shipped)
+    return AccuracySetting(name="", kind=AS_WRITTEN_KIND, overrides=FEW | {"figures": []}).apply_to(
+        shipped
+    )
 
 
 def test_exact_means_are_those_of_many_draws(few):
-    means, off = promise_drawn.exact(few)
+    means, off = tolerance_of_draws.exact_means(few)
     study = GridStudy(few)
     found = study.evaluate(0)
     assert study.grid.n_blocks == 1 and off < 1e-12
@@ -41,11 +43,13 @@ def test_exact_means_are_those_of_many_draws(few):
 def test_coverage_is_that_of_the_points_where_draws_decide():
     error = np.tile([0.0, 0.02, 0.04, 0.2], (4, 25))
     decided = np.tile([False, True, True, True], (4, 25))
-    row = promise_drawn.Drawn(0.1, error, np.full_like(error, 0.1), decided, np.ones(100), 1.0)
-    share, sigmas = promise_drawn.covered(row, 0.95)
+    row = tolerance_of_draws.DrawnResults(
+        0.1, error, np.full_like(error, 0.1), decided, np.ones(100), 1.0
+    )
+    share, sigmas = tolerance_of_draws.coverage(row, 0.95)
     assert share == pytest.approx(2 / 3)
     assert sigmas == pytest.approx((2 / 3 - 0.95) / np.sqrt(0.95 * 0.05 / 75))
-    told = list(promise_drawn.verdicts("it", [row], 0.95))
+    told = list(tolerance_of_draws.missed_tolerances("it", [row], 0.95))
     assert len(told) == 5 and "75.0%" in told[0]
-    (cells,) = promise_drawn.rows_of([row], 0.95)
+    (cells,) = tolerance_of_draws.table_rows([row], 0.95)
     assert cells[2:6] == ["75.00%", "75", "66.67%", "66.7% (-11.3)"]

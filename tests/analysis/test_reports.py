@@ -5,13 +5,13 @@ import csv
 import numpy as np
 import pytest
 import xarray as xr
-from drawn_scenes import cut_short, flown
+from stored_scenes import copy_without_last_cycles, run_flight_into_store
 
 import sweep
-from sweep.analysis.reports import COLUMNS, quantised, reported
+from sweep.analysis.scene_results.interface_reports import REPORT_COLUMNS, make_reports, quantise
 from sweep.model.pairing import TRUE, UNCONFIRMED
 from sweep.spec import SpecError
-from sweep.spec.scene import Interface
+from sweep.spec.scene_sections import Interface
 
 FALL = 2.5
 """Rate at which the closing speed of made shots grows [m/s^2]."""
@@ -38,17 +38,19 @@ def made(n=2000, beams=2, every=5e-3, *, noise=0.0, seed=1):
 
 def test_the_default_reports_every_shot_as_it_is():
     shots = made(noise=0.3)
-    found = reported(shots, interface())
+    found = make_reports(shots, interface())
     for name in ("time", "beam", "range", "radial_velocity", "range_standard_error"):
         assert np.array_equal(found[name], shots[name]), name
     assert np.array_equal(found["true_range"], shots["beam_range"])
-    assert found["valid"].all() and (found["shots"] == 1).all() and list(found) == list(COLUMNS)
+    assert (
+        found["valid"].all() and (found["shots"] == 1).all() and list(found) == list(REPORT_COLUMNS)
+    )
 
 
 @pytest.mark.parametrize("quantum", ["2 mm", "1.953125 mm", "0.3 m"])
 def test_values_are_multiples_of_the_quantum_and_off_by_half_of_it_at_most(quantum):
     shots, q = made(noise=0.3), float(quantum.split()[0]) * (1e-3 if "mm" in quantum else 1)
-    found = reported(shots, interface(range_quantum=quantum))["range"]
+    found = make_reports(shots, interface(range_quantum=quantum))["range"]
     steps = np.rint(found / q)
     assert np.array_equal(found, steps * q)
     assert np.abs(found - shots["range"]).max() <= q / 2 * (1 + 1e-9)
@@ -58,7 +60,7 @@ def test_the_quantum_adds_its_deviation_in_square():
     """q / sqrt(12) of a uniform error; the variance of n squares of it has 4/5 of a normal's."""
     n, q, noise = 200_000, 0.5, 0.2
     shots = made(n, noise=noise)
-    found = reported(shots, interface(radial_velocity_quantum=f"{q} m/s"))
+    found = make_reports(shots, interface(radial_velocity_quantum=f"{q} m/s"))
     told = found["radial_velocity_standard_error"]
     assert told == pytest.approx(np.hypot(noise, q / np.sqrt(12)))
     error = found["radial_velocity"] - shots["beam_radial_velocity"]
@@ -69,7 +71,7 @@ def test_the_quantum_adds_its_deviation_in_square():
 def test_limits_flag_those_beyond_and_no_others(quantum):
     shots = made(noise=0.3)
     limits = {"min_range": "2600 m", "max_range": "2800.1 m"}
-    found = reported(shots, interface(**limits, range_quantum=quantum))
+    found = make_reports(shots, interface(**limits, range_quantum=quantum))
     beyond = (shots["range"] < 2600) | (shots["range"] > 2800.1)
     assert 100 < beyond.sum() < beyond.size - 100
     assert np.array_equal(found["range_saturated"] == 1, beyond)
@@ -81,14 +83,14 @@ def test_limits_flag_those_beyond_and_no_others(quantum):
 
 
 def test_a_limit_that_is_no_multiple_moves_to_the_next():
-    values, beyond = quantised(np.array([1.0, 1.1, 9.9, 12.0]), 0.5, 1.1, 9.9)
+    values, beyond = quantise(np.array([1.0, 1.1, 9.9, 12.0]), 0.5, 1.1, 9.9)
     assert values.tolist() == [1.0, 1.0, 10.0, 10.0] and beyond.tolist() == [1, 0, 0, 1]
 
 
 @pytest.mark.parametrize(("rate", "each"), [("20 Hz", 5), ("10 Hz", 10), ("100 Hz", 1)])
 def test_the_rate_gives_its_number_of_reports(rate, each):
     """2,000 shots of 2 beams, 10 s: as many reports of each beam as the rate has periods."""
-    found = reported(made(), interface(rate=rate))
+    found = make_reports(made(), interface(rate=rate))
     number = round(float(rate.split()[0]) * 10)
     assert found["time"].size == 2 * number and (found["shots"] == each).all()
     assert np.array_equal(np.bincount(found["beam"]), [number, number])
@@ -96,7 +98,7 @@ def test_the_rate_gives_its_number_of_reports(rate, each):
 
 def test_a_mean_of_n_shots_has_their_mean_time_and_an_error_less_by_the_root_of_n():
     shots = made(100_000, noise=0.2)
-    found = reported(shots, interface(rate="10 Hz"))
+    found = make_reports(shots, interface(rate="10 Hz"))
     error = found["radial_velocity"] - found["true_radial_velocity"]
     assert found["radial_velocity_standard_error"] == pytest.approx(0.2 / np.sqrt(10))
     assert error.std() == pytest.approx(0.2 / np.sqrt(10), rel=5 / np.sqrt(2 * error.size))
@@ -109,7 +111,7 @@ def test_the_last_is_the_last_valid_shot_of_the_period():
     shots = made(400, noise=0.2)
     shots["flags"][np.random.default_rng(2).random(400) < 0.5] = 0
     shots["flags"][::7] |= UNCONFIRMED
-    found = reported(shots, interface(rate="20 Hz", value="last"))
+    found = make_reports(shots, interface(rate="20 Hz", value="last"))
     for row, (beam, period) in enumerate((b, p) for p in range(40) for b in range(2)):
         there = [
             i for i in range(400)
@@ -126,15 +128,15 @@ def test_the_last_is_the_last_valid_shot_of_the_period():
 def test_a_report_needs_its_number_of_valid_shots():
     shots = made(400)
     shots["flags"][np.random.default_rng(3).random(400) < 0.5] = 0
-    found = reported(shots, interface(rate="20 Hz", valid_shots=3))
+    found = make_reports(shots, interface(rate="20 Hz", valid_shots=3))
     assert np.array_equal(found["valid"] == 1, found["shots"] >= 3)
     assert np.isfinite(found["range"][found["shots"] > 0]).all() and not found["valid"].all()
 
 
 @pytest.mark.parametrize("value", ["mean", "last"])
 def test_the_latency_moves_the_stamp_and_makes_an_error_of_acceleration_times_it(value):
-    prompt = reported(made(), interface(rate="20 Hz", value=value))
-    late = reported(made(), interface(rate="20 Hz", value=value, latency="40 ms"))
+    prompt = make_reports(made(), interface(rate="20 Hz", value=value))
+    late = make_reports(made(), interface(rate="20 Hz", value=value, latency="40 ms"))
     assert late["time"] - prompt["time"] == pytest.approx(0.04)
     error = late["radial_velocity"] - late["true_radial_velocity"]
     there = np.isfinite(error)  # the last shots of the flight tell no later truth
@@ -163,17 +165,17 @@ def test_reports_of_a_store_are_those_of_its_first_returns(scene_store, tmp_path
     with file.open(newline="") as text:
         header, *rows = csv.reader(text)
     assert header[:3] == ["time [s]", "beam", "range [m]"]
-    for name, column in zip(COLUMNS, np.array(rows, float).T, strict=True):
+    for name, column in zip(REPORT_COLUMNS, np.array(rows, float).T, strict=True):
         assert np.array_equal(column, slow[name], equal_nan=True), name
 
 
 def test_a_specs_interface_is_the_stores_and_no_part_of_its_id(tmp_path):
     given = {"axes": {}, "draws": {"number": 1}, "interface": {"rate": "2 Hz", "latency": "10 ms"}}
-    store = flown(tmp_path, **given)
+    store = run_flight_into_store(tmp_path, **given)
     found = sweep.reports(store, scanner="square")
     assert found.sizes["report"] == pytest.approx(4 * 2 * float(np.ptp(found.time.values)), abs=8)
     assert sweep.open_scene(store).sweep.spec.interface.latency == 0.01
-    short = cut_short(store, tmp_path)
+    short = copy_without_last_cycles(store, tmp_path)
     assert 0 < sweep.reports(short, scanner="square").sizes["report"] < found.sizes["report"]
 
 

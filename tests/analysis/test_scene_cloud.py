@@ -3,25 +3,31 @@
 import numpy as np
 import pytest
 import xarray as xr
-from drawn_scenes import SLOPE, cut_short
 from mpl_toolkits.mplot3d import proj3d
+from stored_scenes import GROUND_SLOPE, copy_without_last_cycles
 
 from sweep.analysis import canvas
-from sweep.analysis.opening import opened
-from sweep.analysis.scenes import colours, pictures, recording
-from sweep.analysis.scenes.pictures import Ground
-from sweep.analysis.scenes.recording import AXES, Cloud, Thinned, gathered, place
+from sweep.analysis.datasets import open_tree
+from sweep.analysis.scene_results import cloud_figures, point_styles, recordings
+from sweep.analysis.scene_results.cloud_figures import HeightMap
+from sweep.analysis.scene_results.recordings import (
+    WORLD_AXES,
+    PointCloud,
+    ThinnedRows,
+    find_axis_position,
+    gather_cloud,
+)
 from sweep.model.pairing import TRUE
 
 
 @pytest.fixture(scope="module")
 def tree(scene_store):
-    return opened(scene_store)
+    return open_tree(scene_store)
 
 
 @pytest.fixture(scope="module")
 def weak(tree, spec):
-    return place(spec, {"power": "0.3 mW"}).recording(tree, "pair")
+    return find_axis_position(spec, {"power": "0.3 mW"}).recording(tree, "pair")
 
 
 @pytest.fixture(scope="module")
@@ -34,98 +40,112 @@ def drawn(found, tree, **options):
         "quantity": "range", "surfaces": ["ground", "block"], "view": "above", "ground": None,
         "title": "A cloud", "remarks": [],
     }  # fmt: skip
-    sheet = pictures.cloud_sheet(found, **(wanted | options))
+    sheet = cloud_figures.draw_cloud_sheet(found, **(wanted | options))
     sheet.canvas.draw()
     return sheet
 
 
 def small_cloud(points, **changes):
     """A cloud of points given as columns x, y, z, all true."""
-    table = dict(zip(AXES, np.asarray(points, float), strict=True))
+    table = dict(zip(WORLD_AXES, np.asarray(points, float), strict=True))
     number = table["x"].size
     table |= {"range": np.arange(number, dtype=float), "flags": np.full(number, TRUE, np.uint8)}
-    box = {axis: (float(table[axis].min()) - 1, float(table[axis].max()) + 1) for axis in AXES}
+    box = {
+        axis: (float(table[axis].min()) - 1, float(table[axis].max()) + 1) for axis in WORLD_AXES
+    }
     parts = {
-        "points": table, "path": {}, "rows": Thinned(number), "lost": Thinned(0), "outside": 0,
+        "points": table,
+        "path": {},
+        "rows": ThinnedRows(number),
+        "lost": ThinnedRows(0),
+        "outside": 0,
         "box": box,
-    }  # fmt: skip
-    parts["rows"].add(table)
-    return Cloud(**(parts | changes))
+    }
+    parts["rows"].append(table)
+    return PointCloud(**(parts | changes))
 
 
 def test_dropouts_are_the_computed_shots_without_a_point_in_the_draw(weak, arrays):
-    found = gathered(weak, ["range"], ranges="quantised", draw=1, dropouts=True)
+    found = gather_cloud(weak, ["range"], ranges="quantised", draw=1, with_dropouts=True)
     none = (arrays.flags.values == 0).all(axis=-1)
     assert 20 < none.sum() < none.size - 20
-    assert found.lost.total == none.sum()
-    assert found.rows.total == (arrays.flags.values > 0).sum()
+    assert found.thinned_dropouts.n_total == none.sum()
+    assert found.thinned_points.n_total == (arrays.flags.values > 0).sum()
     aimed = (
         arrays.platform_position.values
         + arrays.beam_range.values[:, None] * arrays.beam_direction.values
     )[none]
-    for k, axis in enumerate(AXES):
+    for k, axis in enumerate(WORLD_AXES):
         assert np.array_equal(found.dropouts[axis], aimed[:, k])
 
 
 @pytest.mark.parametrize("geometry", [True, False])
 def test_shots_that_are_not_computed_are_no_dropouts(scene_store, spec, tmp_path, arrays, geometry):
-    short = opened(cut_short(scene_store, tmp_path, geometry=geometry))
-    weak = place(spec, {"power": "0.3 mW"}).recording(short, "pair")
-    found = gathered(weak, ["range"], ranges="quantised", draw=1, dropouts=True)
+    short = open_tree(copy_without_last_cycles(scene_store, tmp_path, with_geometry=geometry))
+    weak = find_axis_position(spec, {"power": "0.3 mW"}).recording(short, "pair")
+    found = gather_cloud(weak, ["range"], ranges="quantised", draw=1, with_dropouts=True)
     none = (arrays.flags.values == 0).all(axis=-1)
-    assert found.lost.total == none[:256].sum() > 0
+    assert found.thinned_dropouts.n_total == none[:256].sum() > 0
 
 
 @pytest.mark.parametrize(("power", "draw"), [("0.3 mW", 0), ("1 W", 1)])
 def test_the_box_holds_true_points_dropouts_and_path_and_counts_false_points_beyond(
     scene_store, tree, spec, power, draw
 ):
-    at = place(spec, {"power": power})
-    found = gathered(
-        at.recording(tree, "pair"), ["snr"], ranges="interpolated", draw=draw, dropouts=True,
-        path=True,
+    at = find_axis_position(spec, {"power": power})
+    found = gather_cloud(
+        at.recording(tree, "pair"), ["snr"], ranges="interpolated", draw=draw, with_dropouts=True,
+        with_path=True,
     )  # fmt: skip
-    arrays = xr.open_zarr(scene_store, group="pair", chunks=None).isel(**at.index, draw=draw)
+    arrays = xr.open_zarr(scene_store, group="pair", chunks=None).isel(**at.axis_indices, draw=draw)
     true = (arrays.flags.values & TRUE) > 0
     position = arrays.position.values
-    for k, axis in enumerate(AXES):
+    for k, axis in enumerate(WORLD_AXES):
         low, high = found.box[axis]
         for inside in (position[true][:, k], found.dropouts[axis], found.path[axis]):
             assert ((low < inside) & (inside < high)).all()
-    box = np.array([found.box[axis] for axis in AXES])
+    box = np.array([found.box[axis] for axis in WORLD_AXES])
     others = position[(arrays.flags.values > 0) & ~true]
     beyond = ((others < box[:, 0]) | (others > box[:, 1])).any(axis=1).sum()
-    assert found.outside == beyond > 0
-    assert found.points["x"].size == found.rows.total - beyond
+    assert found.n_outside == beyond > 0
+    assert found.points["x"].size == found.thinned_points.n_total - beyond
     assert np.array_equal(found.path["z"], arrays.platform_position.values[:, 2])
 
 
 def test_crops_cut_points_and_dropouts_and_the_picture(weak):
     crops = {"x": (-30.0, 25.0), "time": (1.0, 5.0)}
-    found = gathered(weak, ["range"], ranges="quantised", crops=crops, dropouts=True)
-    every = gathered(weak, ["range"], ranges="quantised", dropouts=True)
-    assert 0 < found.rows.total < every.rows.total and 0 < found.lost.total < every.lost.total
+    found = gather_cloud(weak, ["range"], ranges="quantised", crops=crops, with_dropouts=True)
+    every = gather_cloud(weak, ["range"], ranges="quantised", with_dropouts=True)
+    assert (
+        0 < found.thinned_points.n_total < every.thinned_points.n_total
+        and 0 < found.thinned_dropouts.n_total < every.thinned_dropouts.n_total
+    )
     for table in (found.points, found.dropouts):
         assert table["x"].min() >= -30 and table["x"].max() <= 25
-    room = max(high - low for low, high in found.box.values()) * recording.MARGIN
+    room = max(high - low for low, high in found.box.values()) * recordings.BOX_MARGIN_FRACTION
     assert found.box["x"][0] >= -30 - room and found.box["x"][1] <= 25 + room
-    assert gathered(weak, ["range"], ranges="quantised", crops={"x": (1e5, np.inf)}) is None
+    assert gather_cloud(weak, ["range"], ranges="quantised", crops={"x": (1e5, np.inf)}) is None
 
 
 def test_many_points_are_thinned_and_the_foot_says_so(weak, tree):
-    whole = gathered(weak, ["shot"], ranges="quantised")
-    found = gathered(weak, ["shot"], ranges="quantised", most=50)
-    assert found.rows.every == 2 ** int(np.ceil(np.log2(whole.rows.total / 50)))
+    whole = gather_cloud(weak, ["shot"], ranges="quantised")
+    found = gather_cloud(weak, ["shot"], ranges="quantised", points_max=50)
+    assert found.thinned_points.step == 2 ** int(
+        np.ceil(np.log2(whole.thinned_points.n_total / 50))
+    )
     said = drawn(found, tree, quantity="shot").get_supxlabel()
-    assert f"{whole.rows.total:,} points, one in {found.rows.every} of them shown" in said
+    assert (
+        f"{whole.thinned_points.n_total:,} points, one in {found.thinned_points.step} of them shown"
+        in said
+    )
 
 
 @pytest.mark.parametrize(
     ("view", "axes"), [("above", ("x", "y")), ("side", ("x", "z")), ("front", ("y", "z"))]
 )
 def test_views_along_an_axis_show_the_other_two_to_one_scale(weak, tree, view, axes):
-    found = gathered(weak, ["range"], ranges="quantised", dropouts=True, path=True)
-    sheet = drawn(found, tree, view=view, ground=Ground.of(tree))
+    found = gather_cloud(weak, ["range"], ranges="quantised", with_dropouts=True, with_path=True)
+    sheet = drawn(found, tree, view=view, ground=HeightMap.from_tree(tree))
     picture = sheet.axes[0]
     true = (found.points["flags"] & TRUE) > 0
     (shown,) = (c.get_offsets() for c in picture.collections if c.zorder == 3)
@@ -138,9 +158,11 @@ def test_views_along_an_axis_show_the_other_two_to_one_scale(weak, tree, view, a
 
 def test_the_nearest_points_lie_on_top():
     found = small_cloud([[0, 0, 0], [0, 0, 0], [5.0, 9.0, 1.0]])
-    scale = colours.chosen("range", found.points["range"], trusted=np.ones(3, bool), surfaces=[])
+    scale = point_styles.choose_colours(
+        "range", found.points["range"], is_trusted=np.ones(3, bool), surfaces=[]
+    )
     colour = drawn(found, None).axes[0].collections[0].get_facecolors()
-    assert np.allclose(colour, scale.of(np.array([2.0, 0.0, 1.0])))
+    assert np.allclose(colour, scale.map_values(np.array([2.0, 0.0, 1.0])))
 
 
 @pytest.mark.parametrize("view", ["oblique", (20.0, 60.0), (-130.0, 5.0)])
@@ -157,7 +179,7 @@ def test_a_view_at_an_angle_has_one_scale_fits_the_sheet_and_fills_it(view):
     frame = units[1:]
     scale = np.sqrt((frame**2).sum() / 2)
     assert frame.T @ frame == pytest.approx(scale**2 * np.eye(2), abs=1e-6 * scale**2)
-    corners = np.array(np.meshgrid(*(found.box[axis] for axis in AXES))).reshape(3, -1)
+    corners = np.array(np.meshgrid(*(found.box[axis] for axis in WORLD_AXES))).reshape(3, -1)
     x, y, _ = proj3d.proj_transform(*corners, axes.get_proj())
     pixels = axes.transData.transform(np.column_stack([x, y]))
     size = sheet.get_size_inches() * sheet.dpi
@@ -168,39 +190,47 @@ def test_a_view_at_an_angle_has_one_scale_fits_the_sheet_and_fills_it(view):
 
 def test_velocities_of_both_signs_have_a_scale_centred_on_zero_and_of_one_sign_do_not():
     true = np.ones(3, bool)
-    both = colours.chosen("radial_velocity", np.array([-1, 0, 4.0]), trusted=true, surfaces=[])
-    one = colours.chosen("radial_velocity", np.array([1, 2, 4.0]), trusted=true, surfaces=[])
+    both = point_styles.choose_colours(
+        "radial_velocity", np.array([-1, 0, 4.0]), is_trusted=true, surfaces=[]
+    )
+    one = point_styles.choose_colours(
+        "radial_velocity", np.array([1, 2, 4.0]), is_trusted=true, surfaces=[]
+    )
     assert (both.norm.vmin, both.norm.vmax) == (-4, 4)
-    assert both.cmap is colours.BOTH_SIGNS
+    assert both.cmap is point_styles.DIVERGING_COLOUR_MAP
     assert (one.norm.vmin, one.norm.vmax) == (1, 4)
     assert both.label == "radial velocity (m/s)"
-    middle = both.of(np.array([0.0]))[0, :3]
-    assert all(middle.sum() < both.of(np.array([v]))[0, :3].sum() for v in (-4.0, 4.0))
+    middle = both.map_values(np.array([0.0]))[0, :3]
+    assert all(middle.sum() < both.map_values(np.array([v]))[0, :3].sum() for v in (-4.0, 4.0))
 
 
 def test_false_and_lonely_values_do_not_stretch_a_scale_but_are_told():
     values = np.concatenate([np.linspace(100, 200, 1000), [5000.0, -7.0]])
     trusted = np.arange(values.size) < 1000
-    scale = colours.chosen("range", values, trusted=trusted, surfaces=[])
+    scale = point_styles.choose_colours("range", values, is_trusted=trusted, surfaces=[])
     assert (scale.norm.vmin, scale.norm.vmax, scale.extend) == (100, 200, "both")
-    lonely = colours.chosen("range", values, trusted=np.ones(1002, bool), surfaces=[])
-    assert lonely.norm.vmin > 99 and lonely.norm.vmax < 201
-    assert colours.chosen("range", values[:1000], trusted=trusted[:1000], surfaces=[]).extend == (
-        "neither"
+    lonely = point_styles.choose_colours(
+        "range", values, is_trusted=np.ones(1002, bool), surfaces=[]
     )
+    assert lonely.norm.vmin > 99 and lonely.norm.vmax < 201
+    assert point_styles.choose_colours(
+        "range", values[:1000], is_trusted=trusted[:1000], surfaces=[]
+    ).extend == ("neither")
 
 
 def test_surfaces_and_kinds_of_points_have_names_and_colours_of_their_own():
     values = np.array([0, 1, -1, 1.0])
-    names = colours.chosen(
-        "surface", values, trusted=np.ones(4, bool), surfaces=["ground", "block"]
+    names = point_styles.choose_colours(
+        "surface", values, is_trusted=np.ones(4, bool), surfaces=["ground", "block"]
     )
-    assert names.names == {-1: "none", 0: "ground", 1: "block"}
-    paint = names.of(values)
+    assert names.label_by_number == {-1: "none", 0: "ground", 1: "block"}
+    paint = names.map_values(values)
     assert len(np.unique(paint, axis=0)) == 3 and np.array_equal(paint[1], paint[3])
-    assert len(set(canvas.LINES)) == len(canvas.LINES)
-    kinds = colours.chosen("flags", np.array([0, 4.0]), trusted=np.ones(2, bool), surfaces=[])
-    assert list(kinds.names.values()) == ["true", "sidelobe"]
+    assert len(set(canvas.LINE_COLOURS)) == len(canvas.LINE_COLOURS)
+    kinds = point_styles.choose_colours(
+        "flags", np.array([0, 4.0]), is_trusted=np.ones(2, bool), surfaces=[]
+    )
+    assert list(kinds.label_by_number.values()) == ["true", "sidelobe"]
 
 
 def test_far_off_coordinates_are_read_against_a_round_number():
@@ -214,30 +244,32 @@ def test_far_off_coordinates_are_read_against_a_round_number():
 
 def test_the_ground_of_the_store_is_the_slope_with_the_block(tree):
     for x, y, height in (
-        (-60.0, 20.0, -60 * SLOPE),
-        (-20.0, -20.0, -20 * SLOPE),
+        (-60.0, 20.0, -60 * GROUND_SLOPE),
+        (-20.0, -20.0, -20 * GROUND_SLOPE),
         (20.0, 0.0, 20.0),
     ):
-        part = Ground.of(tree).cropped((x - 0.5, x + 0.5), (y - 0.5, y + 0.5), most=3)
+        part = HeightMap.from_tree(tree).crop((x - 0.5, x + 0.5), (y - 0.5, y + 0.5), nodes_max=3)
         assert part.height[1, 1] == pytest.approx(height, abs=1e-6)
 
 
 def test_cropped_ground_of_even_slope_is_that_slope_at_every_node():
     x, y = np.linspace(0, 100, 11), np.linspace(-50, 50, 6)
-    ground = Ground(x, y, 3 + 0.2 * x - 0.1 * y[:, None])
-    part = ground.cropped((13.0, 57.0), (-500.0, 11.0), most=23)
+    ground = HeightMap(x, y, 3 + 0.2 * x - 0.1 * y[:, None])
+    part = ground.crop((13.0, 57.0), (-500.0, 11.0), nodes_max=23)
     assert (part.x[0], part.x[-1], part.y[0], part.y[-1]) == (13, 57, -50, 11)
     assert part.x.size <= 23 and part.y.size == 23
     np.testing.assert_allclose(part.height, 3 + 0.2 * part.x - 0.1 * part.y[:, None], rtol=1e-12)
-    assert ground.cropped((200.0, 300.0), (0.0, 10.0)) is None
+    assert ground.crop((200.0, 300.0), (0.0, 10.0)) is None
 
 
 def test_slopes_towards_the_light_are_brighter_and_walls_are_left_open():
     x = y = np.linspace(0, 10, 21)
-    towards = Ground(x, y, 0.3 * (x - y[:, None])).shade()  # rises to the south-east, faces the sun
-    away = Ground(x, y, 0.3 * (y[:, None] - x)).shade()
-    level = Ground(x, y, np.zeros((21, 21))).shade()
+    towards = HeightMap(
+        x, y, 0.3 * (x - y[:, None])
+    ).hillshade()  # rises to the south-east, faces the sun
+    away = HeightMap(x, y, 0.3 * (y[:, None] - x)).hillshade()
+    level = HeightMap(x, y, np.zeros((21, 21))).hillshade()
     assert (towards > level).all() and (level > away).all()
     step = np.where(x > 5, 10.0, 0.0) + 0 * y[:, None]
-    kept = np.isfinite(Ground(x, y, step).without_walls().height)
+    kept = np.isfinite(HeightMap(x, y, step).mask_walls().height)
     assert not kept[:, 10].any() and kept[:, :9].all() and kept[:, 13:].all()

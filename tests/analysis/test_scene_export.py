@@ -8,13 +8,13 @@ import pytest
 import rasterio
 import trimesh
 import xarray as xr
-from drawn_scenes import FAR, cut_short, flown
+from stored_scenes import GROUND_CENTRE, copy_without_last_cycles, run_flight_into_store
 
-from sweep.analysis.export import COLUMNS, PointTable, export, write_las
-from sweep.analysis.opening import NotAStoreError, opened
-from sweep.analysis.scenes.recording import Recording
+from sweep.analysis.datasets import NotAStoreError, open_tree
+from sweep.analysis.scene_results.point_export import POINT_COLUMNS, PointTable, export, write_las
+from sweep.analysis.scene_results.recordings import Recording
 from sweep.model.pairing import TRUE
-from sweep.scenes.map_projection import projection_in_metres
+from sweep.scenes.map_projection import metric_projection_wkt
 from sweep.spec import SpecError
 
 
@@ -25,7 +25,7 @@ def expected(store, *, scanner="pair", power=1, draw=1, ranges="interpolated"):
     shot, place = np.nonzero(there)
     suffix = "_interpolated" if ranges == "interpolated" else ""
     reach = arrays[f"range{suffix}"].values[there]
-    position = arrays.platform_position.values[shot] + np.array(FAR)
+    position = arrays.platform_position.values[shot] + np.array(GROUND_CENTRE)
     position = position + reach[:, None] * arrays.beam_direction.values[shot]
     columns = dict(zip("xyz", position.T, strict=True))
     columns |= {"range": reach, "shot": shot, "return_number": place + 1}
@@ -60,7 +60,7 @@ def same(found, wanted, name):
 
 
 def test_the_columns_of_files_are_those_expected(scene_store):
-    assert set(expected(scene_store)) == set(COLUMNS)
+    assert set(expected(scene_store)) == set(POINT_COLUMNS)
 
 
 @pytest.mark.parametrize("ranges", ["interpolated", "quantised"])
@@ -136,7 +136,7 @@ def test_a_csv_file_has_units_in_its_header_and_digits_that_give_the_same_number
 
 
 def test_what_is_not_computed_yet_is_left_out(scene_store, tmp_path):
-    short = cut_short(scene_store, tmp_path)
+    short = copy_without_last_cycles(scene_store, tmp_path)
     file = tmp_path / "short.ply"
     number = export(short, file, scanner="pair", draw=1, where={"power": "1 W"})
     assert number == (expected(scene_store)["shot"] < 256).sum()
@@ -144,12 +144,12 @@ def test_what_is_not_computed_yet_is_left_out(scene_store, tmp_path):
 
 
 def test_a_single_scanner_and_place_need_not_be_named(tmp_path, scene_store):
-    from drawn_scenes import MAPPING
+    from stored_scenes import SCENE_MAPPING
 
-    path = MAPPING["platform"]["path"] | {"from": ["30 m", "5 m", "170 m"]}
-    store = flown(
+    path = SCENE_MAPPING["platform"]["path"] | {"from": ["30 m", "5 m", "170 m"]}
+    store = run_flight_into_store(
         tmp_path,
-        scanners={"one": MAPPING["scanners"]["square"]},
+        scanners={"one": SCENE_MAPPING["scanners"]["square"]},
         axes={},
         draws={"number": 1},
         platform={"path": path, "attitude": {"kind": "nadir"}},
@@ -181,7 +181,7 @@ def test_all_mistakes_are_told_at_once_with_what_to_take_instead(scene_store, tm
 def test_a_file_that_can_not_be_finished_leaves_the_old_one(scene_store, tmp_path, monkeypatch):
     file = tmp_path / "cloud.ply"
     file.write_text("old")
-    monkeypatch.setattr(PointTable, "parts", lambda self: iter([1 / 0]))
+    monkeypatch.setattr(PointTable, "iter_rows", lambda self: iter([1 / 0]))
     with pytest.raises(ZeroDivisionError):
         export(scene_store, file, scanner="pair", where={"power": "1 W"})
     assert file.read_text() == "old" and list(tmp_path.iterdir()) == [file]
@@ -192,7 +192,7 @@ def test_las_steps_grow_only_where_points_lie_farther_apart_than_its_integers_re
     scene_store, tmp_path, half, step
 ):
     """2^31 steps of 0.1 mm to either side of the offset are 214.7 km."""
-    group = opened(scene_store).children["square"].to_dataset(inherit=False).isel(power=1).load()
+    group = open_tree(scene_store).children["square"].to_dataset(inherit=False).isel(power=1).load()
     there = group.flags.values[:, 0] > 0
     position = np.full(group.position.shape, np.nan)
     position[:, 0][there] = np.linspace(-half, half, there.sum())[:, None] * [1.0, 0.1, 0.0]
@@ -230,13 +230,13 @@ def test_times_and_projections_of_a_scenes_files(tmp_path):
     rows = "".join(f"{first[:-4]}{i}.25, {4 * i}, 0, {300 - i}\n" for i in range(4))
     (tmp_path / "path.csv").write_text(f"time [s], x [m], y [m], z [m]\n{rows}")
     ground = {"kind": "plane", "size": "3 km", "reflectance": 0.1}
-    store = flown(
+    store = run_flight_into_store(
         tmp_path, axes={}, draws={"number": 1},
         scanners={"one": {"kind": "corners", "angle": "7.5 deg", "rate": "2 Hz"}},
         scene={"origin": "ground", "objects": {"ground": ground}},
         platform={"path": {"kind": "waypoints", "file": "path.csv"}},
     )  # fmt: skip
-    tree = opened(store)
+    tree = open_tree(store)
     assert tree.attrs["time_origin"] == first and tree.attrs["projection"] == ""
     assert tree["one"].time.values[0] == 0
     export(store, tmp_path / "cloud.las")
@@ -254,7 +254,7 @@ def test_only_projections_in_metres_are_those_of_a_scene(tmp_path, crs, metres_p
     corner = rasterio.Affine(1, 0, 5, 0, -1, 5)
     with rasterio.open(tmp_path / "a.tif", "w", driver="GTiff", crs=crs, transform=corner, **shape):
         pass
-    assert bool(projection_in_metres(tmp_path / "a.tif", metres_per_unit)) == stated
+    assert bool(metric_projection_wkt(tmp_path / "a.tif", metres_per_unit)) == stated
 
 
 def test_a_projection_is_that_of_coordinates_as_they_are_exported(tmp_path):
@@ -264,7 +264,7 @@ def test_a_projection_is_that_of_coordinates_as_they_are_exported(tmp_path):
     path = tmp_path / "a.tif"
     with rasterio.open(path, "w", driver="GTiff", crs="EPSG:32613+6360", transform=corner, **shape):
         pass
-    assert projection_in_metres(path, (1.001, 1.0)) == ""
-    stated = projection_in_metres(path, (1.0, 1.0))
+    assert metric_projection_wkt(path, (1.001, 1.0)) == ""
+    stated = metric_projection_wkt(path, (1.0, 1.0))
     assert rasterio.crs.CRS.from_wkt(stated) == rasterio.crs.CRS.from_epsg(32613)
-    assert "foot" not in stated and projection_in_metres(path) == stated
+    assert "foot" not in stated and metric_projection_wkt(path) == stated

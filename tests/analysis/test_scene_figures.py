@@ -5,19 +5,19 @@ import json
 import numpy as np
 import pytest
 import xarray as xr
-from drawn_scenes import cut_short, flown
+from stored_scenes import copy_without_last_cycles, run_flight_into_store
 
-from sweep.analysis import figures
-from sweep.analysis.figures import SceneStudy, default_scene_figures, draw
-from sweep.analysis.opening import NotAStoreError, opened
-from sweep.analysis.scenes import pictures
-from sweep.analysis.scenes.recording import place
+from sweep.analysis import study_figures
+from sweep.analysis.datasets import NotAStoreError, open_tree
+from sweep.analysis.scene_results import cloud_figures
+from sweep.analysis.scene_results.recordings import find_axis_position
+from sweep.analysis.study_figures import SceneResults, default_scene_figures, draw_figures
 from sweep.model.pairing import TRUE
 
 
 def test_a_study_that_asks_for_none_gets_clouds_by_range_and_velocity_and_navigation(scene_store):
-    usual = default_scene_figures(opened(scene_store))
-    assert [figure.stem for figure in usual] == [
+    usual = default_scene_figures(open_tree(scene_store))
+    assert [figure.file_stem for figure in usual] == [
         "square_range_cloud", "square_radial_velocity_cloud", "pair_range_cloud",
         "pair_radial_velocity_cloud", "velocity_all_navigation", "altitude_all_navigation",
     ]  # fmt: skip
@@ -26,53 +26,57 @@ def test_a_study_that_asks_for_none_gets_clouds_by_range_and_velocity_and_naviga
 def test_a_store_cut_short_is_drawn_as_far_as_it_is_and_says_how_far(
     scene_store, tmp_path, monkeypatch
 ):
-    short = cut_short(scene_store, tmp_path)
+    short = copy_without_last_cycles(scene_store, tmp_path)
     committed = (scene_store / ".sweep" / "receipts.jsonl").read_text().splitlines(keepends=True)
     left = [line for line in committed if json.loads(line)["block"] % 3 != 2]
     (short / ".sweep" / "receipts.jsonl").write_text("".join(left))
-    assert SceneStudy.of(short).note.endswith("16 of 24 blocks computed")
-    usual = figures.default_scene_figures
-    monkeypatch.setattr(figures, "default_scene_figures", lambda tree: usual(tree)[4:5])
-    assert [file.name for file in draw(short)] == ["velocity_all_navigation.png"]
+    assert SceneResults.from_store(short).source_note.endswith("16 of 24 blocks computed")
+    usual = study_figures.default_scene_figures
+    monkeypatch.setattr(study_figures, "default_scene_figures", lambda tree: usual(tree)[4:5])
+    assert [file.name for file in draw_figures(short)] == ["velocity_all_navigation.png"]
 
 
 def test_spectra_need_the_eyepoints_beside_the_store(tmp_path):
     directory = tmp_path / "own"
     directory.mkdir()
-    store = flown(directory, figures=[{"kind": "shot_spectra", "shot": 0}], draws={"number": 1})
+    store = run_flight_into_store(
+        directory, figures=[{"kind": "shot_spectra", "shot": 0}], draws={"number": 1}
+    )
     alone = store.rename(tmp_path / "moved.zarr")
     with pytest.raises(NotAStoreError, match="eyepoints of the study are not at"):
-        draw(alone)
+        draw_figures(alone)
 
 
 def test_a_quantity_of_shots_is_shown_for_every_shot_and_one_of_points_for_every_point(
     scene_store, spec, tmp_path
 ):
-    weak = place(spec, {"power": "0.3 mW"}).recording(opened(scene_store), "pair")
+    weak = find_axis_position(spec, {"power": "0.3 mW"}).recording(open_tree(scene_store), "pair")
     arrays = xr.open_zarr(scene_store, group="pair", chunks=None).isel(power=0, draw=0).load()
     options = {"draw": 0, "ranges": "quantised", "time": None}
-    shots = weak.rows(["time", "pd_shot", "beam"], 10**6, **options)
-    assert np.array_equal(shots.rows()["pd_shot"], arrays.pd_shot.values)
-    points = weak.rows(["time", "radial_velocity", "beam"], 10**6, **options)
+    shots = weak.thinned_rows(["time", "pd_shot", "beam"], 10**6, **options)
+    assert np.array_equal(shots.to_columns()["pd_shot"], arrays.pd_shot.values)
+    points = weak.thinned_rows(["time", "radial_velocity", "beam"], 10**6, **options)
     there = arrays.flags.values > 0
-    assert np.array_equal(points.rows()["radial_velocity"], arrays.radial_velocity.values[there])
-    short = opened(cut_short(scene_store, tmp_path, geometry=False))
-    less = place(spec, {"power": "0.3 mW"}).recording(short, "pair")
-    shots = less.rows(["time", "pd_shot", "beam"], 10**6, **options)
-    assert np.array_equal(shots.rows()["pd_shot"], arrays.pd_shot.values[:256])
+    assert np.array_equal(
+        points.to_columns()["radial_velocity"], arrays.radial_velocity.values[there]
+    )
+    short = open_tree(copy_without_last_cycles(scene_store, tmp_path, with_geometry=False))
+    less = find_axis_position(spec, {"power": "0.3 mW"}).recording(short, "pair")
+    shots = less.thinned_rows(["time", "pd_shot", "beam"], 10**6, **options)
+    assert np.array_equal(shots.to_columns()["pd_shot"], arrays.pd_shot.values[:256])
     interval = 2.0, 3.0
-    some = weak.rows(["time", "pd_shot", "beam"], 10**6, **(options | {"time": interval}))
+    some = weak.thinned_rows(["time", "pd_shot", "beam"], 10**6, **(options | {"time": interval}))
     inside = (arrays.time.values >= 2) & (arrays.time.values <= 3)
-    assert np.array_equal(some.rows()["pd_shot"], arrays.pd_shot.values[inside])
+    assert np.array_equal(some.to_columns()["pd_shot"], arrays.pd_shot.values[inside])
 
 
 def test_a_scatter_shows_the_values_with_units_and_counts_false_points_beyond(scene_store, spec):
-    strong = place(spec, {"power": "1 W"}).recording(opened(scene_store), "pair")
-    found = strong.rows(["time", "range", "snr"], 10**6, ranges="interpolated")
-    sheet = pictures.scatter_sheet(
+    strong = find_axis_position(spec, {"power": "1 W"}).recording(open_tree(scene_store), "pair")
+    found = strong.thinned_rows(["time", "range", "snr"], 10**6, ranges="interpolated")
+    sheet = cloud_figures.draw_scatter_sheet(
         found, x="time", y="range", colour="snr", surfaces=[], title="T", remarks=["told"]
     )
-    table, axes = found.rows(), sheet.axes[0]
+    table, axes = found.to_columns(), sheet.axes[0]
     true = (table["flags"] & TRUE) > 0
     expected = np.column_stack([table["time"], table["range"]])
     assert np.array_equal(axes.collections[0].get_offsets(), expected[true])

@@ -5,29 +5,29 @@ import shutil
 import numpy as np
 import pytest
 import xarray as xr
-from drawn_scenes import SLOPE, cut_short
+from stored_scenes import GROUND_SLOPE, copy_without_last_cycles
 
-from sweep.analysis.opening import opened
-from sweep.analysis.scenes.recording import (
-    KINDS,
-    QUANTITIES,
+from sweep.analysis.datasets import open_tree
+from sweep.analysis.scene_results.recordings import (
+    POINT_KINDS,
+    QUANTITY_BY_NAME,
     UNLIMITED,
-    Thinned,
-    confined,
-    kinds,
-    place,
-    shown,
+    ThinnedRows,
+    find_axis_position,
+    point_kinds,
+    select_within,
+    to_shown_units,
 )
 from sweep.analysis.selection import parameters_at
 from sweep.model.pairing import FLAGS, TRUE
 from sweep.spec import SpecError
-from sweep.spec.figures import QUANTITIES as OF_SPECS
+from sweep.spec.figure_sections import FIGURE_QUANTITIES as OF_SPECS
 
 
 @pytest.fixture
 def weak(scene_store, spec):
     """What the square saw at the lower power."""
-    return place(spec, {"power": "0.3 mW"}).recording(opened(scene_store), "square")
+    return find_axis_position(spec, {"power": "0.3 mW"}).recording(open_tree(scene_store), "square")
 
 
 @pytest.fixture(scope="module")
@@ -36,12 +36,12 @@ def arrays(scene_store):
 
 
 def all_points(recording, names, **options):
-    parts = [recording.points(names, part, **options) for part in recording.stretches()]
+    parts = [recording.points(names, part, **options) for part in recording.shot_slices()]
     return {name: np.concatenate([part[name] for part in parts]) for name in names}
 
 
 def test_every_quantity_of_specs_can_be_shown():
-    assert set(OF_SPECS) == set(QUANTITIES)
+    assert set(OF_SPECS) == set(QUANTITY_BY_NAME)
 
 
 @pytest.mark.parametrize("draw", [0, 2])
@@ -73,24 +73,24 @@ def test_altitude_is_the_height_over_the_slope_at_the_start_of_the_cycle(weak, a
     part = slice(0, weak.shots)
     position = arrays.platform_position.values
     start = np.arange(weak.shots) // 4 * 4
-    below = SLOPE * position[:, 0]
+    below = GROUND_SLOPE * position[:, 0]
     beside = np.abs(position[start, 0] - 20) > 20.5  # not over the block
-    found = weak.of_shots("altitude", part)
+    found = weak.shot_values("altitude", part)
     assert beside.sum() > 100
     assert found[beside] == pytest.approx((position[:, 2] - below)[start][beside], abs=1e-6)
 
 
 def test_beams_aim_at_the_slope_or_at_the_block(weak):
-    x, y, z = weak.aims(slice(0, weak.shots)).T
-    on_slope = np.abs(z - SLOPE * x) < 0.5
+    x, y, z = weak.aim_points(slice(0, weak.shots)).T
+    on_slope = np.abs(z - GROUND_SLOPE * x) < 0.5
     on_block = (np.abs(x - 20) < 20.01) & (np.abs(y) < 15.01) & (np.abs(z) < 20.01)
     assert (on_slope | on_block).all() and on_slope.any() and on_block.any()
 
 
 def test_what_is_not_computed_has_no_points_and_no_stretch(scene_store, spec, tmp_path):
-    at = place(spec, {"power": "1 W"})
-    whole = at.recording(opened(scene_store), "square")
-    short = at.recording(opened(cut_short(scene_store, tmp_path)), "square")
+    at = find_axis_position(spec, {"power": "1 W"})
+    whole = at.recording(open_tree(scene_store), "square")
+    short = at.recording(open_tree(copy_without_last_cycles(scene_store, tmp_path)), "square")
     found = all_points(whole, ["time", "x", "shot"])
     less = all_points(short, ["time", "x", "shot"])
     kept = found["shot"] < 256
@@ -99,76 +99,83 @@ def test_what_is_not_computed_has_no_points_and_no_stretch(scene_store, spec, tm
 
 
 def test_stretches_outside_of_an_interval_of_time_are_not_read(weak, monkeypatch):
-    from sweep.analysis.scenes import recording as module
+    from sweep.analysis.scene_results import recordings as module
 
-    every = module.stretches
-    monkeypatch.setattr(module, "stretches", lambda array, dim: every(array, dim, 64))
-    assert [part.start for part in weak.stretches()] == [0, 128, 256]
+    every = module.read_slices
+    monkeypatch.setattr(module, "read_slices", lambda array, dim: every(array, dim, 64))
+    assert [part.start for part in weak.shot_slices()] == [0, 128, 256]
     time = weak.read("time", slice(0, weak.shots))
     asked = float(time[130]), float(time[200])
-    assert [part.start for part in weak.stretches(asked)] == [128]
+    assert [part.start for part in weak.shot_slices(asked)] == [128]
 
 
 def test_rows_within_limits_are_kept_and_those_without_a_value_are_not():
     table = {"x": np.array([0.0, 1.0, np.nan, 3.0]), "y": np.arange(4.0)}
-    assert confined(table, {"x": (0.5, np.inf)})["y"].tolist() == [1, 3]
-    assert confined(table, {"x": UNLIMITED, "y": (-np.inf, 2)})["y"].tolist() == [0, 1]
-    assert confined(table, {}) is table
+    assert select_within(table, {"x": (0.5, np.inf)})["y"].tolist() == [1, 3]
+    assert select_within(table, {"x": UNLIMITED, "y": (-np.inf, 2)})["y"].tolist() == [0, 1]
+    assert select_within(table, {}) is table
 
 
 @pytest.mark.parametrize("cuts", [[1000], [1, 2, 3, 994], [7] * 142 + [6], [500, 0, 500]])
 def test_thinning_keeps_every_2nd_or_4th_row_however_the_rows_come(cuts):
-    thinned, first = Thinned(130), 0
+    thinned, first = ThinnedRows(130), 0
     for size in cuts:
-        thinned.add({"n": np.arange(first, first + size)})
+        thinned.append({"n": np.arange(first, first + size)})
         first += size
-    assert thinned.total == 1000 and thinned.every == 8
-    assert thinned.rows()["n"].tolist() == list(range(0, 1000, 8))
+    assert thinned.n_total == 1000 and thinned.step == 8
+    assert thinned.to_columns()["n"].tolist() == list(range(0, 1000, 8))
 
 
 def test_few_rows_are_not_thinned_and_none_are_none():
-    thinned = Thinned(10)
-    assert thinned.rows() == {}
-    thinned.add({"n": np.arange(10)})
-    assert thinned.every == 1 and thinned.rows()["n"].size == 10
+    thinned = ThinnedRows(10)
+    assert thinned.to_columns() == {}
+    thinned.append({"n": np.arange(10)})
+    assert thinned.step == 1 and thinned.to_columns()["n"].size == 10
 
 
 def test_flags_say_one_kind_each_and_ratios_are_shown_in_decibels():
     flags = np.array([0, TRUE, FLAGS["sidelobe"] | FLAGS["unconfirmed"], FLAGS["false_alarm"]])
-    names = list(KINDS)
-    assert [names[i] if i >= 0 else "" for i in kinds(flags)] == [
+    names = list(POINT_KINDS)
+    assert [names[i] if i >= 0 else "" for i in point_kinds(flags)] == [
         "", "true", "sidelobe", "false_alarm",
     ]  # fmt: skip
-    assert shown("snr", np.array([1.0, 100.0, 0.0]))[:2].tolist() == [0, 20]
-    assert np.isnan(shown("snr", np.array([0.0]))).all()
+    assert to_shown_units("snr", np.array([1.0, 100.0, 0.0]))[:2].tolist() == [0, 20]
+    assert np.isnan(to_shown_units("snr", np.array([0.0]))).all()
 
 
 def test_a_place_is_the_first_that_fits_and_says_what_it_left_open(spec):
-    first, strong = place(spec, {}), place(spec, {"power": ["1 W", "1000 mW"]})
-    assert (first.index, first.left_open) == ({"power": 0}, ("power",))
-    assert (strong.index, strong.left_open) == ({"power": 1}, ())
-    assert strong.words == "power 1000 mW"
-    assert parameters_at(spec, strong.index)["instrument.laser.power"] == 1.0
-    assert parameters_at(spec, first.index)["instrument.laser.power"] == pytest.approx(0.3e-3)
+    first, strong = (
+        find_axis_position(spec, {}),
+        find_axis_position(spec, {"power": ["1 W", "1000 mW"]}),
+    )
+    assert (first.axis_indices, first.open_axes) == ({"power": 0}, ("power",))
+    assert (strong.axis_indices, strong.open_axes) == ({"power": 1}, ())
+    assert strong.label == "power 1000 mW"
+    assert parameters_at(spec, strong.axis_indices)["instrument.laser.power"] == 1.0
+    assert parameters_at(spec, first.axis_indices)["instrument.laser.power"] == pytest.approx(
+        0.3e-3
+    )
 
 
 def test_places_that_are_none_are_refused_with_what_there_is(spec):
     with pytest.raises(SpecError) as caught:
-        place(spec, {"powr": "1 W", "power": "2 W"})
+        find_axis_position(spec, {"powr": "1 W", "power": "2 W"})
     text = str(caught.value)
     assert "did you mean 'power'?" in text
     assert "where.power: is no value of this study (you wrote 2 W); it has 0.3 mW, 1000 mW" in text
     with pytest.raises(SpecError, match=r"where\.power"):
-        place(spec, {"power": "much"})
+        find_axis_position(spec, {"power": "much"})
 
 
 def test_shots_are_computed_draw_by_draw_as_their_chunks_are_there(scene_store, spec, tmp_path):
     copy = shutil.copytree(scene_store, tmp_path / "holes.zarr")
     (copy / ".sweep" / "receipts.jsonl").unlink()  # what is committed has to be there
     (copy / "square" / "flags" / "c" / "0" / "1" / "1" / "0").unlink()  # shots 128 to 255, draw 2
-    whole, tree = slice(0, 316), opened(copy)
-    weak, strong = (place(spec, {"power": power}).recording(tree, "square") for power in
-                    ("0.3 mW", "1 W"))  # fmt: skip
-    assert np.flatnonzero(~weak.computed(whole, 2)).tolist() == list(range(128, 256))
-    assert weak.computed(whole, 1).all() and strong.computed(whole, 2).all()
-    assert not weak.computed(slice(150, 160), 2).any()
+    whole, tree = slice(0, 316), open_tree(copy)
+    weak, strong = (
+        find_axis_position(spec, {"power": power}).recording(tree, "square")
+        for power in ("0.3 mW", "1 W")
+    )
+    assert np.flatnonzero(~weak.computed_shots(whole, 2)).tolist() == list(range(128, 256))
+    assert weak.computed_shots(whole, 1).all() and strong.computed_shots(whole, 2).all()
+    assert not weak.computed_shots(slice(150, 160), 2).any()

@@ -4,11 +4,15 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from sweep.analysis import shot_figure
-from sweep.analysis.opening import opened
-from sweep.analysis.scenes.recording import place, read_eyepoints, several_surfaces
+from sweep.analysis import shot_spectra
+from sweep.analysis.datasets import open_tree
+from sweep.analysis.scene_results.recordings import (
+    find_axis_position,
+    find_multi_surface_shot,
+    read_eyepoints,
+)
 from sweep.analysis.selection import parameters_at
-from sweep.analysis.shot_figure import Group, Segment, simulated_shot
+from sweep.analysis.shot_spectra import BinGroup, SegmentSpectrum, simulate_prepared_shot
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.catalogue import names_of
 from sweep.model.eyepoints import prepare_eyepoints
@@ -17,7 +21,7 @@ from sweep.model.pairing import TRUE
 
 @pytest.fixture(scope="module")
 def recording(scene_store, spec):
-    return place(spec, {"power": "1 W"}).recording(opened(scene_store), "pair")
+    return find_axis_position(spec, {"power": "1 W"}).recording(open_tree(scene_store), "pair")
 
 
 @pytest.fixture(scope="module")
@@ -27,10 +31,10 @@ def arrays(scene_store):
 
 def one(scene_store, spec, recording, number, seed=None):
     eyepoints = read_eyepoints(scene_store, recording.dataset, np.array([number]))
-    parameters = parameters_at(spec, place(spec, {"power": "1 W"}).index)
+    parameters = parameters_at(spec, find_axis_position(spec, {"power": "1 W"}).axis_indices)
     effects = names_of(int(recording.read("effects", slice(number, number + 1))[0]))
     prepared = prepare_eyepoints(eyepoints, parameters, spec.surfaces(), effects)
-    return eyepoints, simulated_shot(prepared, parameters, seed=seed)
+    return eyepoints, simulate_prepared_shot(prepared, parameters, seed=seed)
 
 
 def test_the_shot_of_several_surfaces_is_the_first_with_true_points_of_two(recording, arrays):
@@ -49,18 +53,18 @@ def test_the_shot_of_several_surfaces_is_the_first_with_true_points_of_two(recor
                 }
             ) == 2
         )  # fmt: skip
-        assert several_surfaces(recording, draw) == first
+        assert find_multi_surface_shot(recording, draw) == first
 
 
 def test_without_true_points_of_two_surfaces_several_groups_will_do(scene_store, spec):
-    square = place(spec, {"power": "1 W"}).recording(opened(scene_store), "square")
+    square = find_axis_position(spec, {"power": "1 W"}).recording(open_tree(scene_store), "square")
     values = square.dataset.load()
     alike = square.dataset.assign(surface=xr.zeros_like(values.surface))
     seen = type(square)("square", alike)
     expected = int(np.flatnonzero(values.surfaces_seen.values >= 2)[0])
-    assert several_surfaces(seen) == expected
+    assert find_multi_surface_shot(seen) == expected
     none = alike.assign(surfaces_seen=xr.zeros_like(values.surfaces_seen))
-    assert several_surfaces(type(square)("square", none)) is None
+    assert find_multi_surface_shot(type(square)("square", none)) is None
 
 
 @pytest.mark.parametrize("number", [5, 120, 250])
@@ -73,16 +77,16 @@ def test_a_shot_drawn_again_has_the_statistics_that_the_store_holds(
 
 
 def test_two_surfaces_have_a_peak_each_where_their_own_range_beats(scene_store, spec, recording):
-    number = several_surfaces(recording)
+    number = find_multi_surface_shot(recording)
     eyepoints, shot = one(scene_store, spec, recording, number)
-    sheet = shot_figure.scene_shot_sheet(
+    sheet = shot_spectra.draw_scene_shot_sheet(
         shot, eyepoints, ["ground", "block"], title="T", remarks=["told"]
     )
     up, close = shot.segments[0], sheet.axes[1]
     marks = {line.get_label(): line for line in close.lines if line.get_marker() == "|"}
     assert set(marks) == {"ground", "block"}
     bin_ = 600e6 / 2**15
-    peaks = [up.frequency[group.peak] for group in up.groups]
+    peaks = [up.frequency[group.peak_index] for group in up.bin_groups]
     hit = eyepoints.surface[0] >= 0
     for surface, name in enumerate(("ground", "block")):
         own = hit & (eyepoints.surface[0] == surface)
@@ -103,8 +107,8 @@ def test_views_reach_over_all_detections_but_not_to_those_far_away():
 
     signal = np.full(4000, 1e-9)
     signal[1000] = 1.0
-    groups = tuple(Group(k, k, k) for k in (950, 1000, 1140, 3900))
-    segment = Segment(
+    groups = tuple(BinGroup(k, k, k) for k in (950, 1000, 1140, 3900))
+    segment = SegmentSpectrum(
         "up-chirp",
         1,
         np.arange(4000),
@@ -117,5 +121,5 @@ def test_views_reach_over_all_detections_but_not_to_those_far_away():
         1.0,
         1.0,
     )
-    view = shot_figure.around_detections(segment)
+    view = shot_spectra.detection_view(segment)
     assert 900 < view.start < 950 and 1140 < view.stop < 1200

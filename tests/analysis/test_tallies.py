@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sweep.analysis import selection
-from sweep.analysis.selection import Points, Statistics, statistics
+from sweep.analysis.selection import PointSelection, Statistics, compute_statistics
 
 floats = st.floats(-1e300, 1e300, allow_nan=False)
 some = st.lists(
@@ -21,20 +21,20 @@ some = st.lists(
 @given(values=some, cut=st.integers(1, 9))
 def test_a_mean_is_the_exact_one_but_for_rounding(values, cut):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(selection, "PIECE", cut)
-        found = Statistics.of(np.array(values))
+        patch.setattr(selection, "VALUES_PER_SUM", cut)
+        found = Statistics.from_values(np.array(values))
     exact, size = sum(map(Fraction, values)), sum(abs(Fraction(v)) for v in values)
     assert abs(Fraction(found.mean) * len(values) - exact) <= size * len(values) * Fraction(
         1, 2**51
     )
-    assert (found.least, found.largest) == (min(values), max(values))
+    assert (found.minimum, found.maximum) == (min(values), max(values))
 
 
 def test_values_that_are_not_finite_count_for_nothing():
     values = xr.Dataset({"v": ("x", [np.nan, 2.0, np.inf, -np.inf])})
-    (found,) = statistics([Points.of(values)], "v")
-    assert (found.number, found.mean, found.least, found.largest) == (1, 2.0, 2.0, 2.0)
-    assert math.isnan(Statistics.of(np.array([np.nan])).mean)
+    (found,) = compute_statistics([PointSelection.from_dataset(values)], "v")
+    assert (found.n_finite, found.mean, found.minimum, found.maximum) == (1, 2.0, 2.0, 2.0)
+    assert math.isnan(Statistics.from_values(np.array([np.nan])).mean)
 
 
 @settings(max_examples=20)
@@ -45,12 +45,16 @@ def test_groups_hold_their_own_points_whatever_the_pieces(chunks, seed):
     along = rng.integers(0, 3, 7)
     dataset = xr.Dataset({"v": (("y", "x"), values)}, {"kind": ("y", along)})
     cut = dataset.chunk(dict(zip("yx", chunks, strict=True)))
-    groups = [part for _, part in Points.of(cut).where("x", [1, 2, 5, 8]).apart("kind")]
+    groups = [
+        part for _, part in PointSelection.from_dataset(cut).sel("x", [1, 2, 5, 8]).group_by("kind")
+    ]
     for (kind, part), found in zip(
-        Points.of(dataset).apart("kind"), statistics(groups, "v"), strict=True
+        PointSelection.from_dataset(dataset).group_by("kind"),
+        compute_statistics(groups, "v"),
+        strict=True,
     ):
         own = values[along == kind][:, [1, 2, 5, 8]]
-        assert found.number == np.isfinite(own).sum()
+        assert found.n_finite == np.isfinite(own).sum()
         assert found.mean == pytest.approx(np.nanmean(own), rel=1e-14)
         assert found.median == np.nanmedian(own)
         assert part.size == 9 * (along == kind).sum()

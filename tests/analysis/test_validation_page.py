@@ -4,11 +4,11 @@ import re
 from pathlib import Path
 
 import pytest
-import validation
+import validation_page
 
 import sweep
 from sweep.model.noise_only import bin_probability
-from sweep.spec import Spec, load
+from sweep.spec import GridSpec, load
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "validation.md").read_text()
@@ -36,16 +36,16 @@ def thinned(tmp_path, monkeypatch):
         spec = load(ROOT / "experiments" / f"{name}.yaml")
         mapping = spec.to_yaml_mapping()
         mapping["axes"] |= FEW if name == "threshold" else {"cut": {"zip": [FEW_CUTS]}}
-        few = Spec.from_mapping(mapping, base=ROOT / "experiments")
+        few = GridSpec.from_mapping(mapping, base=ROOT / "experiments")
         sweep.run(few, store=tmp_path / f"{name}.zarr", scheduler="none", progress=False)
 
-    monkeypatch.setattr(validation, "results", lambda name: tmp_path / f"{name}.zarr")
+    monkeypatch.setattr(validation_page, "store_path", lambda name: tmp_path / f"{name}.zarr")
     return make
 
 
 def test_table_4_2_is_what_its_study_computes(thinned):
     thinned("threshold")
-    assert rows("Table 4.2", validation.thresholds()) == rows("Table 4.2")
+    assert rows("Table 4.2", validation_page.table_4_2()) == rows("Table 4.2")
     assert [float(row[3]) for row in rows("Table 4.2")] == [0.8, 0.047, 5.06e-10, 1.17e-21]
 
 
@@ -55,7 +55,7 @@ def test_table_4_2_is_what_its_study_computes(thinned):
 def test_tables_of_shots_are_what_their_studies_compute(number, name, thinned):
     """All but the last column, leakage, which is a mean over the whole study's points."""
     thinned(name)
-    found = rows(f"Table {number}", validation.alarms(name, number))
+    found = rows(f"Table {number}", validation_page.shot_alarm_table(name, number))
     assert len(found) == 9
     assert [row[:-1] for row in found] == [row[:-1] for row in rows(f"Table {number}")]
 
@@ -75,16 +75,18 @@ def test_what_explains_a_printed_number_follows_from_it():
         1.1 * closed: r"its noise is 1\.81 % above",
     }
     for printed, words in told.items():
-        assert re.match(words, validation.why(5.0, printed, closed))
+        assert re.match(words, validation_page.explain_printed_alarm(5.0, printed, closed))
     # TNR is a ratio of magnitudes, whose squares grow with the noise's variance
     assert bin_probability(5.0 / 1.0181**0.5) == pytest.approx(1.1 * closed, rel=5e-3)
 
 
 def test_bins_that_verdicts_are_held_against_are_the_published_ones():
     parameters = load(ROOT / "experiments" / "single_shot_2000m.yaml").parameters()
-    assert validation.range_bin(parameters) == pytest.approx(
+    assert validation_page.range_bin_width(parameters) == pytest.approx(
         0.3431, abs=1e-4
     )  # as the thesis has it
-    assert validation.velocity_bin(parameters) == pytest.approx(3.55e-3, abs=5e-6)
+    assert validation_page.velocity_bin_width(parameters) == pytest.approx(3.55e-3, abs=5e-6)
     padded = parameters | {"instrument.processing.fft_size": 2**18}
-    assert validation.range_bin(padded) == validation.range_bin(parameters) / 2
+    assert (
+        validation_page.range_bin_width(padded) == validation_page.range_bin_width(parameters) / 2
+    )

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from drawn_studies import study
+from stored_studies import spec_over_axes
 
 import sweep
 from sweep.model.effects import noise_sources
@@ -18,9 +18,9 @@ from sweep.model.outputs import (
     RUNNING_OUTPUTS,
     SPECTRA_OUTPUTS,
 )
-from sweep.spec import Draws, Spec
+from sweep.spec import Draws, GridSpec
 from sweep.spec.sections import Detector
-from sweep.tasks.spectra_export import TOLD
+from sweep.tasks.studies.spectra_export import VARIABLE_ATTRIBUTES
 
 DRAWS_PAGE, DETECTORS, EFFECTS_PAGE = (
     (Path(__file__).parents[2] / "docs" / f"{name}.md").read_text(encoding="utf-8")
@@ -51,8 +51,10 @@ def named(page):
 
 
 def test_the_spec_of_draws_promises_the_defaults():
-    spec = Spec.from_mapping(study({}).to_yaml_mapping() | shown(DRAWS_PAGE), base=Path("."))
-    assert spec.draws.adaptive and spec.accuracy == study({}).accuracy
+    spec = GridSpec.from_mapping(
+        spec_over_axes({}).to_yaml_mapping() | shown(DRAWS_PAGE), base=Path(".")
+    )
+    assert spec.draws.is_adaptive and spec.accuracy == spec_over_axes({}).accuracy
 
 
 def test_every_field_and_every_array_of_draws_is_listed():
@@ -65,10 +67,10 @@ def test_every_field_and_every_array_of_draws_is_listed():
 
 
 def test_the_spec_of_detectors_is_one():
-    written, mapping = shown(DETECTORS), study({}).to_yaml_mapping()
+    written, mapping = shown(DETECTORS), spec_over_axes({}).to_yaml_mapping()
     mapping["instrument"]["processing"] |= written["instrument"]["processing"]
     mapping |= {"draws": written["draws"], "axes": written["axes"], "figures": []}
-    assert Spec.from_mapping(mapping, base=Path(".")).axes[0].name == "detector"
+    assert GridSpec.from_mapping(mapping, base=Path(".")).axes[0].name == "detector"
 
 
 def test_every_field_estimator_and_array_of_detectors_is_listed():
@@ -79,7 +81,7 @@ def test_every_field_estimator_and_array_of_detectors_is_listed():
     about = named(DETECTORS.partition("## What is drawn")[2].partition("## False alarms")[0])
     assert {name for name in about if name != "array"} <= stored
     exported = named(DETECTORS.partition("try code outside of a study")[2])
-    assert set(exported) == set(TOLD) - {"draw", "segment", "frequency"}
+    assert set(exported) == set(VARIABLE_ATTRIBUTES) - {"draw", "segment", "frequency"}
 
 
 def test_every_effect_is_listed_in_the_order_in_which_it_acts():
@@ -95,8 +97,12 @@ def test_every_field_that_an_effect_brings_is_listed_with_it():
 
 
 def test_the_spec_of_effects_is_one_that_can_be_written():
-    spec = Spec.from_mapping(study({}).to_yaml_mapping() | shown(EFFECTS_PAGE), base=Path("."))
-    assert spec.modes()["leakage"] == "on" and spec.modes()["footprint_phase"] == "off"
+    spec = GridSpec.from_mapping(
+        spec_over_axes({}).to_yaml_mapping() | shown(EFFECTS_PAGE), base=Path(".")
+    )
+    assert (
+        spec.effect_modes()["leakage"] == "on" and spec.effect_modes()["footprint_phase"] == "off"
+    )
     assert spec.accuracy.tolerance == 1e-3
 
 
@@ -104,7 +110,7 @@ def test_the_code_that_reads_flags_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     store = Path("results/quickstart.zarr")
     store.parent.mkdir()
-    sweep.run(study({"target.range": ["1 km", "4 km"]}), store=store, scheduler="none",
+    sweep.run(spec_over_axes({"target.range": ["1 km", "4 km"]}), store=store, scheduler="none",
               progress=False)  # fmt: skip
     (code,) = [block for block in blocks("python", EFFECTS_PAGE) if "flag_masks" in block]
     exec(code, {})

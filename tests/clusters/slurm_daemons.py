@@ -15,11 +15,11 @@ import time
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
-NODES = ("n1", "n2")
+NODE_NAMES = ("n1", "n2")
 PROGRAMS = ("munged", "slurmctld", "slurmd", "sbatch", "scancel", "squeue", "sinfo")
 START_SECONDS = 30
 
-CONFIGURATION = """\
+CONFIGURATION_TEMPLATE = """\
 ClusterName=test
 SlurmctldHost={host}(127.0.0.1)
 SlurmctldPort={ports[0]}
@@ -52,71 +52,73 @@ PartitionName=main Nodes=n1,n2 Default=YES MaxTime=INFINITE State=UP
 """
 
 
-def missing() -> str:
+def reason_slurm_is_missing() -> str:
     """Why SLURM can't be started here; empty where it can."""
     if os.geteuid() != 0:
         return "SLURM's daemons need root"
-    absent = [name for name in PROGRAMS if not program(name)]
+    absent = [name for name in PROGRAMS if not find_program(name)]
     return f"not installed: {', '.join(absent)}" if absent else ""
 
 
-def program(name: str) -> str | None:
+def find_program(name: str) -> str | None:
     """Path of a program, also of one that is for administrators."""
     return shutil.which(name, path=f"{os.environ['PATH']}:/usr/sbin:/sbin:/usr/bin")
 
 
 @contextmanager
-def slurm():
+def run_slurm_daemons():
     """Environment for SLURM's commands, while its daemons run."""
     with ExitStack() as stack:
         directory = Path(tempfile.mkdtemp(prefix="sweep-slurm-", dir="/tmp"))
         stack.callback(shutil.rmtree, directory, ignore_errors=True)
-        configuration = _configure(directory)
+        configuration = _write_configuration(directory)
         environment = {**os.environ, "SLURM_CONF": str(configuration)}
-        stack.enter_context(_daemon(directory, "munged", *_munge(directory)))
-        _wait(lambda: (directory / "munge.socket").exists(), directory)
-        conf = ("-D", "-f", str(configuration))
-        stack.enter_context(_daemon(directory, "slurmctld", *conf, "-i"))
-        for node in NODES:
-            stack.enter_context(_daemon(directory, "slurmd", *conf, "-N", node))
+        stack.enter_context(_run_daemon(directory, "munged", *_munge_options(directory)))
+        _wait_until(lambda: (directory / "munge.socket").exists(), directory)
+        config_options = ("-D", "-f", str(configuration))
+        stack.enter_context(_run_daemon(directory, "slurmctld", *config_options, "-i"))
+        for node in NODE_NAMES:
+            stack.enter_context(_run_daemon(directory, "slurmd", *config_options, "-N", node))
         stack.callback(_cancel_all, environment)
-        _wait(lambda: _idle(environment) == len(NODES), directory)
+        _wait_until(lambda: _count_idle_nodes(environment) == len(NODE_NAMES), directory)
         yield environment
 
 
-def _configure(directory: Path) -> Path:
+def _write_configuration(directory: Path) -> Path:
     directory.chmod(0o755)
-    for name in ("state", *(f"spool-{node}" for node in NODES)):
+    for name in ("state", *(f"spool-{node}" for node in NODE_NAMES)):
         (directory / name).mkdir()
     key = directory / "munge.key"
     key.touch(mode=0o600)
     key.write_bytes(secrets.token_bytes(128))
     with ExitStack() as stack:
         sockets = [stack.enter_context(socket.socket()) for _ in range(3)]
-        for each in sockets:
-            each.bind(("127.0.0.1", 0))
-        ports = [each.getsockname()[1] for each in sockets]
+        for bound_socket in sockets:
+            bound_socket.bind(("127.0.0.1", 0))
+        ports = [bound_socket.getsockname()[1] for bound_socket in sockets]
     configuration = directory / "slurm.conf"
     host = socket.gethostname().split(".")[0]
-    configuration.write_text(CONFIGURATION.format(directory=directory, host=host, ports=ports))
+    configuration.write_text(
+        CONFIGURATION_TEMPLATE.format(directory=directory, host=host, ports=ports)
+    )
     return configuration
 
 
-def _munge(directory: Path) -> list[str]:
+def _munge_options(directory: Path) -> list[str]:
     files = {"socket": "socket", "key-file": "key", "pid-file": "pid", "log-file": "log",
              "seed-file": "seed"}  # fmt: skip
     return [
         "--foreground",
-        *(f"--{option}={directory}/munge.{end}" for option, end in files.items()),
+        *(f"--{option}={directory}/munge.{suffix}" for option, suffix in files.items()),
     ]
 
 
 @contextmanager
-def _daemon(directory: Path, name: str, *options: str):
+def _run_daemon(directory: Path, name: str, *options: str):
     """A daemon in the foreground, ended by its process id, its jobs with it."""
     with open(directory / "daemons.out", "a") as out:
         child = subprocess.Popen(
-            [program(name), *options],
+            [find_program(name), *options],
             stdin=subprocess.DEVNULL,
             stdout=out,
             stderr=out,
@@ -136,33 +138,33 @@ def _daemon(directory: Path, name: str, *options: str):
             os.killpg(child.pid, signal.SIGKILL)
 
 
-def command(environment, *words: str) -> str:
+def run_command(environment, *words: str) -> str:
     """What one of SLURM's commands prints."""
-    done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=30)
-    return done.stdout
+    process = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=30)
+    return process.stdout
 
 
-def jobs(environment) -> list[str]:
+def running_job_ids(environment) -> list[str]:
     """Ids of the jobs that run."""
-    return command(environment, "squeue", "-h", "-t", "R", "-o", "%i").split()
+    return run_command(environment, "squeue", "-h", "-t", "R", "-o", "%i").split()
 
 
-def _idle(environment) -> int:
-    return command(environment, "sinfo", "-h", "-N", "-o", "%t").split().count("idle")
+def _count_idle_nodes(environment) -> int:
+    return run_command(environment, "sinfo", "-h", "-N", "-o", "%t").split().count("idle")
 
 
 def _cancel_all(environment) -> None:
-    for signals in ((), ("-s", "KILL")):
-        for job in command(environment, "squeue", "-h", "-o", "%i").split():
-            command(environment, "scancel", *signals, job)
+    for signal_options in ((), ("-s", "KILL")):
+        for job in run_command(environment, "squeue", "-h", "-o", "%i").split():
+            run_command(environment, "scancel", *signal_options, job)
         deadline = time.monotonic() + 5
-        while command(environment, "squeue", "-h", "-o", "%i").split():
+        while run_command(environment, "squeue", "-h", "-o", "%i").split():
             if time.monotonic() > deadline:
                 break
             time.sleep(0.2)
 
 
-def _wait(condition, directory: Path) -> None:
+def _wait_until(condition, directory: Path) -> None:
     deadline = time.monotonic() + START_SECONDS
     while not condition():
         if time.monotonic() > deadline:

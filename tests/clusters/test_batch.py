@@ -11,10 +11,10 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from small import quiet, receipts, small, tree
+from small_studies import file_digests, receipt_blocks, run_serially, small_spec
 
-from sweep.spec import cluster_of
-from sweep.tasks.clusters import batch
+from sweep.spec import cluster_config_from_mapping
+from sweep.tasks.engine.deploy import jobqueue
 
 BATCH = {
     "workers": {"least": 3, "most": 40},
@@ -34,12 +34,12 @@ BATCH = {
 
 
 def described(kind, **changes):
-    return cluster_of({"kind": kind, **BATCH, **changes})
+    return cluster_config_from_mapping({"kind": kind, **BATCH, **changes})
 
 
 def script_of(cluster) -> list[str]:
-    job = {"slurm": batch.SLURMJob, "pbs": batch.PBSJob}[cluster.kind]
-    options = batch.options(cluster)
+    job = {"slurm": jobqueue.SLURMJob, "pbs": jobqueue.PBSJob}[cluster.kind]
+    options = jobqueue.jobqueue_options(cluster)
     for name in ("n_workers", "scheduler_options"):
         options.pop(name)
     return job("tls://10.0.0.5:8786", name="sweep-1", **options).job_script().splitlines()
@@ -86,7 +86,7 @@ def test_a_jobs_workers_are_those_of_the_file(here, kind):
 
 @pytest.mark.parametrize("walltime", [60.0, 600.0, 3600.0, 7200.0, 86400.0, 14 * 86400.0])
 def test_workers_leave_before_their_job_ends_and_not_all_at_once(walltime):
-    lifetime, stagger = batch.lifetime_of(walltime)
+    lifetime, stagger = jobqueue.worker_lifetime(walltime)
     last, first = lifetime + stagger, lifetime - stagger
     assert walltime - last >= min(60.0, walltime / 4) - 1e-9
     assert 0.4 * walltime < first < last < walltime
@@ -97,12 +97,12 @@ def test_workers_leave_before_their_job_ends_and_not_all_at_once(walltime):
     ("seconds", "text"), [(60, "00:01:00"), (7265.4, "02:01:05"), (360000, "100:00:00")]
 )
 def test_times_are_written_as_batch_systems_read_them(seconds, text):
-    assert batch.clock(seconds) == text
+    assert jobqueue.walltime_text(seconds) == text
 
 
 @pytest.mark.parametrize(("workers", "jobs"), [(1, 1), (8, 1), (9, 2), (40, 5)])
 def test_workers_come_in_whole_jobs(workers, jobs):
-    assert batch.jobs(described("pbs"), workers) == jobs
+    assert jobqueue.count_jobs(described("pbs"), workers) == jobs
 
 
 #: Takes a job, as PBS does, and runs it here; once it has run one it refuses the next.
@@ -135,7 +135,7 @@ def played_pbs(here, monkeypatch):
         (programs / name).write_text(text.format(directory=here))
         (programs / name).chmod(0o755)
     monkeypatch.setenv("PATH", f"{programs}:{os.environ['PATH']}")
-    monkeypatch.setattr(batch, "PAUSE", 0.2)
+    monkeypatch.setattr(jobqueue, "RESUBMIT_PAUSE", 0.2)
     yield here
     for pid in here.glob("job-*.pid"):
         subprocess.run([programs / "qdel", pid.stem.removeprefix("job-")], check=True)
@@ -150,7 +150,7 @@ def test_a_job_lost_and_one_refused_are_made_up_for(played_pbs, undisturbed):
 
     def kill_the_first() -> None:
         deadline = time.monotonic() + 100
-        while not receipts(played_pbs / "played.zarr"):
+        while not receipt_blocks(played_pbs / "played.zarr"):
             assert time.monotonic() < deadline
             time.sleep(0.05)
         subprocess.run(["qdel", "1.server"], check=True)
@@ -163,16 +163,20 @@ def test_a_job_lost_and_one_refused_are_made_up_for(played_pbs, undisturbed):
     }  # fmt: skip
     killer.start()
     with config.set({"distributed.deploy.lost-worker-timeout": "200ms"}):
-        outcome = quiet(small(), Path("played.zarr"), cluster=cluster, evaluate=evaluate)
+        outcome = run_serially(
+            small_spec(), Path("played.zarr"), cluster=cluster, evaluate=evaluate
+        )
     killer.join()
     assert outcome.complete
-    assert tree(outcome.store) == tree(undisturbed)
+    assert file_digests(outcome.store) == file_digests(undisturbed)
     assert int((played_pbs / "count").read_text()) >= 3  # the first, the refused, another
     assert (played_pbs / "deleted").read_text().split()[-1] == "3"  # none is left in the queue
 
 
 def test_ctrl_c_stays_what_it_is_where_batch_systems_are_used():
-    code = "import signal, sweep.tasks.clusters.batch; print(signal.getsignal(signal.SIGINT))"
+    code = (
+        "import signal, sweep.tasks.engine.deploy.jobqueue; print(signal.getsignal(signal.SIGINT))"
+    )
     told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert told.stdout.strip() == str(signal.default_int_handler)
 
@@ -183,14 +187,14 @@ def test_a_batch_system_is_used_from_any_thread(tmp_path):
 import sys
 from concurrent.futures import ThreadPoolExecutor
 sys.path.insert(0, {str(Path(__file__).parents[1] / "tasks")!r})
-from small import small
+from small_studies import small_spec
 import sweep
-from sweep.tasks.progress import ClusterError
+from sweep.tasks.engine.progress import ClusterError
 
 cluster = {{"kind": "slurm", "worker": {{"memory": "1 GB"}}, "job": {{"walltime": "10 min"}},
            "scheduler": {{"host": "127.0.0.1", "dashboard": "127.0.0.1:0"}}, "workers": 1}}
 with ThreadPoolExecutor(1) as pool:
-    asked = pool.submit(sweep.run, small(), store="s.zarr", cluster=cluster, progress=False)
+    asked = pool.submit(sweep.run, small_spec(), store="s.zarr", cluster=cluster, progress=False)
     try:
         asked.result()
     except ClusterError as error:

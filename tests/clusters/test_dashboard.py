@@ -6,15 +6,15 @@ import urllib.request
 
 import psutil
 import pytest
-from small import Said, small
+from small_studies import RecordingProgress, small_spec
 
-from sweep.spec import SpecError, cluster_of, load_cluster
-from sweep.spec.clusters import Bounds
-from sweep.tasks import cluster as clusters
-from sweep.tasks.clusters import machines
+from sweep.spec import SpecError, cluster_config_from_mapping, load_cluster_config
+from sweep.spec.cluster_config import WorkerBounds
 from sweep.tasks.driver import run
-from sweep.tasks.progress import ClusterError
-from sweep.tasks.session import RunOptions
+from sweep.tasks.engine import cluster_connection as clusters
+from sweep.tasks.engine.deploy import local_ssh
+from sweep.tasks.engine.progress import ClusterError
+from sweep.tasks.engine.session import RunOptions
 
 PAGES = ("status", "info/main/workers.html", "json/counts.json", "metrics", "statics/", "health")
 """Pages of a scheduler or a worker of Dask."""
@@ -22,9 +22,9 @@ PAGES = ("status", "info/main/workers.html", "json/counts.json", "metrics", "sta
 
 def reached(**section):
     """Cluster of one worker in this process, with a section `scheduler`, and what is said."""
-    told = Said()
-    described = cluster_of({"kind": "local", "workers": 1, "scheduler": section})
-    return clusters.connected(described, most=1, processes=False, say=told.say), told
+    told = RecordingProgress()
+    described = cluster_config_from_mapping({"kind": "local", "workers": 1, "scheduler": section})
+    return clusters.connect_cluster(described, max_workers=1, processes=False, say=told.say), told
 
 
 def pages_by_port():
@@ -74,44 +74,46 @@ def test_a_dashboard_that_is_asked_for_listens_to_this_machine_alone(written):
 )
 def test_a_dashboard_for_other_machines_is_refused(written):
     with pytest.raises(SpecError, match=r"scheduler\.dashboard: .*write a port, such as 8787"):
-        cluster_of({"kind": "local", "scheduler": {"dashboard": written}})
+        cluster_config_from_mapping({"kind": "local", "scheduler": {"dashboard": written}})
 
 
 def test_a_dashboard_has_the_port_asked_for_or_any_where_that_is_taken():
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         port = taken.getsockname()[1]
-        asked = cluster_of({"kind": "local", "scheduler": {"dashboard": port}}).scheduler
-        assert machines.dashboard(asked) == "127.0.0.1:0"
-    assert machines.dashboard(asked) == f"127.0.0.1:{port}"
+        asked = cluster_config_from_mapping(
+            {"kind": "local", "scheduler": {"dashboard": port}}
+        ).scheduler
+        assert local_ssh.dashboard_address(asked) == "127.0.0.1:0"
+    assert local_ssh.dashboard_address(asked) == f"127.0.0.1:{port}"
 
 
 def test_schedulers_of_jobs_and_of_ssh_have_none_either():
     section = {"host": "10.0.0.5"}
     asked = {"kind": "slurm", "workers": 2, "worker": {"memory": "4 GB"},
              "job": {"walltime": "1 h"}, "scheduler": section}  # fmt: skip
-    options = machines.scheduler_options(cluster_of(asked).scheduler)
+    options = local_ssh.scheduler_options(cluster_config_from_mapping(asked).scheduler)
     assert options["dashboard"] is False and options["dashboard_address"] == "127.0.0.1:0"
     asked["scheduler"] = section | {"dashboard": 0}
-    options = machines.scheduler_options(cluster_of(asked).scheduler)
+    options = local_ssh.scheduler_options(cluster_config_from_mapping(asked).scheduler)
     assert options["dashboard"] is True and options["dashboard_address"] == "127.0.0.1:0"
 
 
 def test_a_run_asks_for_a_dashboard_by_an_option(tmp_path):
-    place = RunOptions(workers=1, dashboard=True).place(small())
+    place = RunOptions(workers=1, dashboard=True).resolve_cluster(small_spec())
     assert place.scheduler.dashboard == "8787"
-    assert RunOptions(dashboard=True).place(small()).workers is None
-    assert RunOptions(workers=1).place(small()).scheduler.dashboard == "none"
+    assert RunOptions(dashboard=True).resolve_cluster(small_spec()).workers is None
+    assert RunOptions(workers=1).resolve_cluster(small_spec()).scheduler.dashboard == "none"
     given = {"kind": "local", "workers": 2, "scheduler": {"dashboard": "9000"}}
-    kept = RunOptions(cluster=given, dashboard=True).place(small())
-    assert kept.scheduler.dashboard == "9000" and kept.workers == Bounds(2, 2)
+    kept = RunOptions(cluster=given, dashboard=True).resolve_cluster(small_spec())
+    assert kept.scheduler.dashboard == "9000" and kept.workers == WorkerBounds(2, 2)
     for elsewhere in ("none", "tcp://10.0.0.5:8786"):
         with pytest.raises(ClusterError, match="leave out dashboard=True"):
-            run(small(), store=tmp_path / "a.zarr", scheduler=elsewhere, dashboard=True)
+            run(small_spec(), store=tmp_path / "a.zarr", scheduler=elsewhere, dashboard=True)
 
 
 def test_the_example_of_a_local_cluster_has_no_dashboard():
     from pathlib import Path
 
-    described = load_cluster(Path(__file__).parents[2] / "deploy" / "local.yaml")
-    assert not machines.shows_dashboard(described.scheduler)
+    described = load_cluster_config(Path(__file__).parents[2] / "deploy" / "local.yaml")
+    assert not local_ssh.shows_dashboard(described.scheduler)

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import pytest
 import yaml
-from small import quiet, small, tree
+from small_studies import file_digests, run_serially, small_spec
 
-from sweep.spec import cluster_of, load_cluster
-from sweep.spec.clusters import Bounds
-from sweep.tasks.clusters import kubernetes, machines
-from sweep.tasks.progress import ClusterError
+from sweep.spec import cluster_config_from_mapping, load_cluster_config
+from sweep.spec.cluster_config import WorkerBounds
+from sweep.tasks.engine.deploy import kubernetes, local_ssh
+from sweep.tasks.engine.progress import ClusterError
 
 pytest.importorskip("dask_kubernetes", reason="the extra sweep[kubernetes] is not installed")
 
@@ -28,8 +28,8 @@ AUTOSCALERS = "/apis/kubernetes.dask.org/v1/namespaces/lidar/daskautoscalers"
 
 def asked(**changes):
     mapping = yaml.safe_load((DEPLOY / "kubernetes.yaml").read_text()) | changes
-    cluster = cluster_of(mapping)
-    return kubernetes.resource(cluster, cluster.workers)["spec"]
+    cluster = cluster_config_from_mapping(mapping)
+    return kubernetes.cluster_resource(cluster, cluster.workers)["spec"]
 
 
 def container(part):
@@ -54,10 +54,10 @@ def test_the_file_becomes_a_resource_of_the_operator():
 
 
 def test_workers_between_bounds_have_an_autoscaler_and_others_none():
-    cluster = load_cluster(DEPLOY / "kubernetes.yaml")
-    scaler = kubernetes.autoscaler(cluster, cluster.workers)
+    cluster = load_cluster_config(DEPLOY / "kubernetes.yaml")
+    scaler = kubernetes.autoscaler_resource(cluster, cluster.workers)
     assert scaler["spec"] == {"cluster": "sweep", "minimum": 4, "maximum": 200}
-    assert kubernetes.autoscaler(cluster, Bounds(4, 4)) is None
+    assert kubernetes.autoscaler_resource(cluster, WorkerBounds(4, 4)) is None
 
 
 @contextmanager
@@ -161,9 +161,9 @@ def free_port() -> int:
 
 
 def test_a_study_in_pods_with_tls_leaves_nothing_behind(tmp_path, undisturbed, monkeypatch):
-    files = machines.make_certificates(tmp_path / "tls")
-    monkeypatch.setattr(kubernetes, "PORT", free_port())
-    monkeypatch.setattr(kubernetes, "host", lambda _: "127.0.0.1")
+    files = local_ssh.make_certificates(tmp_path / "tls")
+    monkeypatch.setattr(kubernetes, "SCHEDULER_PORT", free_port())
+    monkeypatch.setattr(kubernetes, "scheduler_host", lambda _: "127.0.0.1")
     mapping = {
         "kind": "kubernetes", "namespace": "lidar", "image": "sweep", "secret": "sweep-tls",
         "workers": {"least": 1, "most": 2}, "worker": {"memory": "1 GB"},
@@ -171,9 +171,9 @@ def test_a_study_in_pods_with_tls_leaves_nothing_behind(tmp_path, undisturbed, m
     }  # fmt: skip
     with api_server(tmp_path / "tls") as (port, requests):
         monkeypatch.setenv("KUBECONFIG", str(kubeconfig(tmp_path, port)))
-        outcome = quiet(small(), tmp_path / "pods.zarr", cluster=mapping)
+        outcome = run_serially(small_spec(), tmp_path / "pods.zarr", cluster=mapping)
         assert outcome.complete
-        assert tree(outcome.store) == tree(undisturbed)
+        assert file_digests(outcome.store) == file_digests(undisturbed)
         changes = [each for each in requests if each[0] != "GET"]
     assert changes == [
         ("POST", CLUSTERS), ("POST", AUTOSCALERS),
@@ -185,5 +185,5 @@ def test_no_kubernetes_is_told_in_words(tmp_path, monkeypatch):
     monkeypatch.setenv("KUBECONFIG", str(kubeconfig(tmp_path, free_port())))
     cluster = DEPLOY / "kubernetes.yaml"
     with pytest.raises(ClusterError, match="Kubernetes starts no workers"):
-        quiet(small(), tmp_path / "none.zarr", cluster=cluster)
+        run_serially(small_spec(), tmp_path / "none.zarr", cluster=cluster)
     assert not (tmp_path / "none.zarr").exists()

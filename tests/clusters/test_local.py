@@ -10,22 +10,22 @@ from pathlib import Path
 import dask
 import psutil
 import pytest
-from small import receipts, small, tree
+from small_studies import file_digests, receipt_blocks, small_spec
 
-from sweep.tasks import scheduler, session
-from sweep.tasks.clusters import machines
 from sweep.tasks.driver import run
-from sweep.tasks.progress import Progress
+from sweep.tasks.engine import dispatcher, session
+from sweep.tasks.engine.deploy import local_ssh
+from sweep.tasks.engine.progress import Progress
 
 SCRIPT = """
 import sys
 import sweep
-from small import small
+from small_studies import small_spec
 
 def evaluate(study, block):
     return study.evaluate(block)
 
-spec = small()
+spec = small_spec()
 outcome = sweep.run(spec, store=sys.argv[1], workers=1, evaluate=evaluate, progress=False)
 print(outcome.complete)
 """
@@ -48,7 +48,7 @@ def test_a_script_without_a_guard_runs_and_workers_import_nothing_from_where_it_
         env={**os.environ, "PYTHONPATH": str(path)}, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert ended.stdout == "True\n" and ended.returncode == 0, ended.stderr
-    assert tree(tmp_path / "s.zarr") == tree(undisturbed)
+    assert file_digests(tmp_path / "s.zarr") == file_digests(undisturbed)
     assert not (tmp_path / "imported").exists()
 
 
@@ -56,8 +56,8 @@ def test_a_script_without_a_guard_runs_and_workers_import_nothing_from_where_it_
 def test_a_frozen_worker_holds_up_neither_a_run_nor_its_end(
     undisturbed, tmp_path, monkeypatch, workers
 ):
-    monkeypatch.setattr(machines, "FROZEN", "1 s")  # ten heartbeats at least
-    monkeypatch.setattr(scheduler, "LEASE", 1.0)
+    monkeypatch.setattr(local_ssh, "WORKER_TTL", "1 s")  # ten heartbeats at least
+    monkeypatch.setattr(dispatcher, "LEASE_SECONDS", 1.0)
     pid = tmp_path / "pid"
 
     def evaluate(study, block):
@@ -67,10 +67,10 @@ def test_a_frozen_worker_holds_up_neither_a_run_nor_its_end(
         return study.evaluate(block)
 
     outcome = run(
-        small(), store=tmp_path / "s.zarr", workers=workers, evaluate=evaluate, progress=False
+        small_spec(), store=tmp_path / "s.zarr", workers=workers, evaluate=evaluate, progress=False
     )
-    assert outcome.complete and tree(outcome.store) == tree(undisturbed)
-    assert sorted(receipts(outcome.store)) == list(range(12))
+    assert outcome.complete and file_digests(outcome.store) == file_digests(undisturbed)
+    assert sorted(receipt_blocks(outcome.store)) == list(range(12))
     assert not psutil.pid_exists(int(pid.read_text()))
 
 
@@ -93,9 +93,9 @@ class Ending(Progress):
 
 
 def test_workers_are_started_again_where_none_is_left(undisturbed, tmp_path, monkeypatch):
-    monkeypatch.setattr(session, "ABSENT", 1.0)
-    monkeypatch.setattr(scheduler, "SLOTS_AGE", 0.1)
-    clusters, start = [], machines.start_here
+    monkeypatch.setattr(session, "NO_WORKER_WARNING_AFTER", 1.0)
+    monkeypatch.setattr(dispatcher, "SLOT_COUNT_AGE_MAX", 0.1)
+    clusters, start = [], local_ssh.start_local_cluster
 
     def started(*given, **options):
         clusters.append(start(*given, **options))
@@ -105,12 +105,12 @@ def test_workers_are_started_again_where_none_is_left(undisturbed, tmp_path, mon
         time.sleep(0.05)  # so that some are left
         return study.evaluate(block)
 
-    monkeypatch.setattr(machines, "start_here", started)
+    monkeypatch.setattr(local_ssh, "start_local_cluster", started)
     told = Ending(clusters)
     with dask.config.set({"distributed.deploy.lost-worker-timeout": "100ms"}):
         outcome = run(
-            small(), store=tmp_path / "s.zarr", workers=2, processes=False, progress=told,
+            small_spec(), store=tmp_path / "s.zarr", workers=2, processes=False, progress=told,
             evaluate=evaluate,
         )  # fmt: skip
     assert any(line.startswith("no worker is left (") for line in told.lines)
-    assert outcome.complete and tree(outcome.store) == tree(undisturbed)
+    assert outcome.complete and file_digests(outcome.store) == file_digests(undisturbed)

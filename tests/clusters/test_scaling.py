@@ -2,12 +2,12 @@
 
 import pytest
 from click.testing import CliRunner
-from small import quiet, small, tree
+from small_studies import file_digests, run_serially, small_spec
 
 from sweep.cli import main
-from sweep.spec import cluster_of
-from sweep.tasks import cluster, session
-from sweep.tasks.progress import ClusterError
+from sweep.spec import cluster_config_from_mapping
+from sweep.tasks.engine import cluster_connection, session
+from sweep.tasks.engine.progress import ClusterError
 
 LOCAL = {"kind": "local", "scheduler": {"dashboard": "127.0.0.1:0"}}
 
@@ -28,26 +28,33 @@ def test_a_cluster_between_bounds_grows_with_the_work(undisturbed, tmp_path):
         return study.evaluate(block)
 
     described = {**LOCAL, "workers": {"least": 1, "most": 2}}
-    outcome = quiet(small(), tmp_path / "grown.zarr", cluster=described, evaluate=evaluate)
+    outcome = run_serially(
+        small_spec(), tmp_path / "grown.zarr", cluster=described, evaluate=evaluate
+    )
     assert outcome.complete
-    assert tree(outcome.store) == tree(undisturbed)
+    assert file_digests(outcome.store) == file_digests(undisturbed)
     assert len(set(log.read_text().split())) >= 2
 
 
 def test_no_more_workers_are_started_than_there_are_blocks():
-    bounds = cluster.Bounds(2, 40)
-    described = cluster_of({**LOCAL, "workers": bounds._asdict()})
-    assert cluster._bounds(described, 9) == (2, 9)
-    assert cluster._bounds(described, 1) == (1, 1)
-    assert cluster._bounds(cluster_of(LOCAL), 10**6) == (cluster.cores(), cluster.cores())
+    bounds = cluster_connection.WorkerBounds(2, 40)
+    described = cluster_config_from_mapping({**LOCAL, "workers": bounds._asdict()})
+    assert cluster_connection._worker_bounds(described, 9) == (2, 9)
+    assert cluster_connection._worker_bounds(described, 1) == (1, 1)
+    assert cluster_connection._worker_bounds(cluster_config_from_mapping(LOCAL), 10**6) == (
+        cluster_connection.cpu_count(),
+        cluster_connection.cpu_count(),
+    )
 
 
 def test_a_number_of_workers_fixes_those_of_a_file_and_none_are_started_elsewhere():
-    described = cluster_of({**LOCAL, "workers": {"least": 2, "most": 40}})
-    assert session._of_workers(described, 7).workers == (7, 7)
-    assert session._of_workers(described, None) is described
+    described = cluster_config_from_mapping({**LOCAL, "workers": {"least": 2, "most": 40}})
+    assert session._with_worker_count(described, 7).workers == (7, 7)
+    assert session._with_worker_count(described, None) is described
     with pytest.raises(ClusterError, match="there already"):
-        session._of_workers(cluster_of({"kind": "scheduler", "address": "tcp://a:1"}), 3)
+        session._with_worker_count(
+            cluster_config_from_mapping({"kind": "scheduler", "address": "tcp://a:1"}), 3
+        )
 
 
 def test_the_command_tells_what_is_wrong_with_a_clusters_file(tmp_path, monkeypatch):

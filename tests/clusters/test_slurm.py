@@ -9,18 +9,18 @@ from contextlib import contextmanager, suppress
 
 import pytest
 import yaml
-from slurm_daemons import command, jobs, missing, slurm
-from small import STUDY, receipts, small_file, tree
+from slurm_daemons import reason_slurm_is_missing, run_command, run_slurm_daemons, running_job_ids
+from small_studies import STUDY_MAPPING, file_digests, receipt_blocks, small_mapping
 
-from sweep.storage.opening import read_receipts
+from sweep.storage.store_format import read_receipt_totals
 from sweep.tasks.driver import run
 
-pytestmark = pytest.mark.skipif(bool(missing()), reason=missing())
+pytestmark = pytest.mark.skipif(bool(reason_slurm_is_missing()), reason=reason_slurm_is_missing())
 
 #: Blocks of a second (nearer, where more bins count, of minutes): time enough for
 #: another job in the place of a killed one.
 SLOW = {
-    **STUDY,
+    **STUDY_MAPPING,
     "footprint": {"beamlets": 109, "speckle": "none"},
     "draws": {"number": 120_000, "method": "noise", "batch": 1000},
     "axes": {"target.range": {"linear": ["2 km", "5 km"], "number": 20}},
@@ -32,7 +32,7 @@ WAIT = 120.0
 
 @pytest.fixture(scope="module")
 def environment():
-    with slurm() as environment:
+    with run_slurm_daemons() as environment:
         yield environment | {"DASK_DISTRIBUTED__DEPLOY__LOST_WORKER_TIMEOUT": "1s"}
 
 
@@ -80,19 +80,19 @@ def wait_for(condition, child) -> None:
 
 def workers(store) -> set[bytes]:
     """Processes that committed blocks."""
-    return read_receipts(store, BLOCKS, since=0.0).workers
+    return read_receipt_totals(store, BLOCKS, since=0.0).workers
 
 
 def test_a_study_in_a_job_ends_as_in_a_plain_loop(here, environment, undisturbed):
-    (here / "small.yaml").write_text(yaml.safe_dump(small_file(), sort_keys=False))
+    (here / "small.yaml").write_text(yaml.safe_dump(small_mapping(), sort_keys=False))
     cluster = yaml.safe_load((here / "slurm.yaml").read_text())
     (here / "slurm.yaml").write_text(yaml.safe_dump(cluster | {"workers": 1}))
     asked = ("--store", "small.zarr", "--cluster", "slurm.yaml")
     with sweep(environment, "run", "small.yaml", *asked) as child:
         output, _ = child.communicate(timeout=WAIT)
     assert child.returncode == 0, output
-    assert tree(here / "small.zarr") == tree(undisturbed)
-    assert jobs(environment) == []
+    assert file_digests(here / "small.zarr") == file_digests(undisturbed)
+    assert running_job_ids(environment) == []
 
 
 @pytest.mark.slow
@@ -101,23 +101,25 @@ def test_jobs_and_driver_killed_the_study_ends_as_in_a_plain_loop(here, environm
     asked = ("--store", "slow.zarr", "--cluster", "slurm.yaml")
     with sweep(environment, "run", "slow.yaml", *asked) as child:
         # Both jobs work, so that the one that is killed takes a worker that the cluster knows.
-        wait_for(lambda: len(workers(store)) == 2 and len(receipts(store)) >= 5, child)
-        before = jobs(environment)
-        command(environment, "scancel", "-s", "KILL", before[0])
-        wait_for(lambda: set(jobs(environment)) - set(before), child)  # another in its place
+        wait_for(lambda: len(workers(store)) == 2 and len(receipt_blocks(store)) >= 5, child)
+        before = running_job_ids(environment)
+        run_command(environment, "scancel", "-s", "KILL", before[0])
+        wait_for(
+            lambda: set(running_job_ids(environment)) - set(before), child
+        )  # another in its place
         os.kill(child.pid, signal.SIGKILL)
-    committed = receipts(store)
+    committed = receipt_blocks(store)
     assert 5 <= len(committed) < BLOCKS
     with sweep(environment, "resume", "slow.zarr", "--cluster", "slurm.yaml") as child:
         output, _ = child.communicate(timeout=WAIT)
         assert child.returncode == 0, output
     assert f"computed {BLOCKS - len(committed)} of {BLOCKS} blocks" in output
-    assert sorted(receipts(store)) == list(range(BLOCKS))
+    assert sorted(receipt_blocks(store)) == list(range(BLOCKS))
     from sweep.spec import load
 
     outcome = run(load("slow.yaml"), store="plain.zarr", scheduler="none", progress=False)
     assert outcome.complete
-    assert tree(store) == tree(here / "plain.zarr")
+    assert file_digests(store) == file_digests(here / "plain.zarr")
 
 
 @pytest.mark.slow

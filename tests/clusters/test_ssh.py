@@ -11,11 +11,11 @@ from pathlib import Path
 
 import asyncssh
 import pytest
-from small import quiet, small, tree
+from small_studies import file_digests, run_serially, small_spec
 
-from sweep.spec import cluster_of
-from sweep.tasks.clusters import machines
-from sweep.tasks.progress import ClusterError
+from sweep.spec import cluster_config_from_mapping
+from sweep.tasks.engine.deploy import local_ssh
+from sweep.tasks.engine.progress import ClusterError
 
 SSH = {
     "kind": "ssh",
@@ -28,18 +28,18 @@ SSH = {
 
 def test_workers_are_dealt_out_evenly():
     hosts = ["a", "b", "c", "d"]
-    cluster = cluster_of({**SSH, "hosts": hosts, "workers": 10})
+    cluster = cluster_config_from_mapping({**SSH, "hosts": hosts, "workers": 10})
     shares = {
         host: each["options"]["kwargs"]["n_workers"]
-        for host, each in machines.ssh_workers(cluster, 10).items()
+        for host, each in local_ssh.ssh_worker_specs(cluster, 10).items()
     }
     assert shares == {"a": 3, "b": 3, "c": 2, "d": 2}
-    assert list(machines.ssh_workers(cluster, 2)) == ["a", "b"]
+    assert list(local_ssh.ssh_worker_specs(cluster, 2)) == ["a", "b"]
 
 
 def test_workers_have_the_threads_of_the_file():
-    cluster = cluster_of({**SSH, "worker": {"memory": "1 GB", "threads": 3}})
-    assert machines.ssh_nanny(cluster)["nthreads"] == 3
+    cluster = cluster_config_from_mapping({**SSH, "worker": {"memory": "1 GB", "threads": 3}})
+    assert local_ssh.ssh_nanny_options(cluster)["nthreads"] == 3
 
 
 @contextmanager
@@ -95,7 +95,7 @@ def server(directory: Path):
 
 
 def test_a_study_over_ssh_with_tls(tmp_path, undisturbed):
-    files = machines.make_certificates(tmp_path / "tls")
+    files = local_ssh.make_certificates(tmp_path / "tls")
     with server(tmp_path) as (port, commands):
         cluster = {
             **SSH, "port": port, "user": "lidar", "identity": str(tmp_path / "user"),
@@ -103,13 +103,13 @@ def test_a_study_over_ssh_with_tls(tmp_path, undisturbed):
             "security": {name: str(path) for name, path in files._asdict().items()},
             "environment": {"MARK": "a value"},
         }  # fmt: skip
-        outcome = quiet(small(), tmp_path / "ssh.zarr", cluster=cluster)
+        outcome = run_serially(small_spec(), tmp_path / "ssh.zarr", cluster=cluster)
         assert outcome.complete
-        assert tree(outcome.store) == tree(undisturbed)
+        assert file_digests(outcome.store) == file_digests(undisturbed)
         (started,) = [words for words in map(shlex.split, commands) if len(words) > 1]
         assert sys.executable in started
         assert any(word.startswith("tls://127.0.0.1:") for word in started)
 
         unknown = {**cluster, "known_hosts": str(tmp_path / "user.pub")}
         with pytest.raises(ClusterError, match="no workers could be started"):
-            quiet(small(), tmp_path / "unknown.zarr", cluster=unknown)
+            run_serially(small_spec(), tmp_path / "unknown.zarr", cluster=unknown)

@@ -8,18 +8,18 @@ from contextlib import suppress
 import pytest
 from click.testing import CliRunner
 from cryptography import x509
-from small import quiet, small, tree
+from small_studies import file_digests, run_serially, small_spec
 
 from sweep.cli import main
-from sweep.spec import cluster_of
-from sweep.tasks import cluster
-from sweep.tasks.clusters import machines
-from sweep.tasks.progress import ClusterError
+from sweep.spec import cluster_config_from_mapping
+from sweep.tasks.engine import cluster_connection
+from sweep.tasks.engine.deploy import local_ssh
+from sweep.tasks.engine.progress import ClusterError
 
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    return machines.make_certificates(tmp_path_factory.mktemp("tls") / "new")
+    return local_ssh.make_certificates(tmp_path_factory.mktemp("tls") / "new")
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,7 @@ def security(files):
 
 
 def local(**sections):
-    return cluster_of({"kind": "local", "workers": 1, **sections})
+    return cluster_config_from_mapping({"kind": "local", "workers": 1, **sections})
 
 
 def test_certificates_are_their_owners_alone_and_good_for_a_year(files):
@@ -67,7 +67,7 @@ def test_the_command_prints_a_section_and_never_overwrites(tmp_path):
     assert made.exit_code == 0
     import yaml
 
-    assert local(**yaml.safe_load(made.output)).certificates() is not None
+    assert local(**yaml.safe_load(made.output)).certificate_paths() is not None
     again = CliRunner().invoke(main, ["certificates", str(tmp_path / "tls")])
     assert again.exit_code == 2
     assert "is there already" in again.output
@@ -80,25 +80,29 @@ def test_all_parts_talk_tls_and_a_client_without_certificates_is_refused(
     from distributed import Security
 
     described = local(security=security, scheduler={"dashboard": "127.0.0.1:0"})
-    monkeypatch.setattr(cluster, "CONNECT_TIMEOUT", 2.0)
-    with cluster.connected(described, most=9, processes=True, say=lambda _: None) as reached:
+    monkeypatch.setattr(cluster_connection, "CONNECT_TIMEOUT", 2.0)
+    with cluster_connection.connect_cluster(
+        described, max_workers=9, processes=True, say=lambda _: None
+    ) as reached:
         client, address = reached.client, reached.client.scheduler.address
         workers = client.scheduler_info()["workers"]
         assert address.startswith("tls://127.0.0.1:")
         assert workers and all(worker.startswith("tls://127.0.0.1:") for worker in workers)
         assert all(w["nanny"].startswith("tls://127.0.0.1:") for w in workers.values())
 
-        outcome = quiet(small(), tmp_path / "tls.zarr", cluster=address_of(address, security))
+        outcome = run_serially(
+            small_spec(), tmp_path / "tls.zarr", cluster=address_of(address, security)
+        )
         assert outcome.complete
-        assert tree(outcome.store) == tree(undisturbed)
+        assert file_digests(outcome.store) == file_digests(undisturbed)
 
         plain = address.replace("tls://", "tcp://")
         with pytest.raises(ClusterError, match="no Dask scheduler answers"):
-            quiet(small(), tmp_path / "plain.zarr", scheduler=plain)
-        others = machines.make_certificates(tmp_path / "others")
+            run_serially(small_spec(), tmp_path / "plain.zarr", scheduler=plain)
+        others = local_ssh.make_certificates(tmp_path / "others")
         stranger = address_of(address, {k: str(v) for k, v in others._asdict().items()})
         with pytest.raises(ClusterError, match="no Dask scheduler answers"):
-            quiet(small(), tmp_path / "stranger.zarr", cluster=stranger)
+            run_serially(small_spec(), tmp_path / "stranger.zarr", cluster=stranger)
         refuses(address, Security(require_encryption=True))
     assert not (tmp_path / "plain.zarr").exists()
 
@@ -116,11 +120,13 @@ def refuses(address: str, security) -> None:
 def test_a_client_that_could_not_connect_is_gone_before_another_is_made(monkeypatch):
     from distributed import Client
 
-    monkeypatch.setattr(cluster, "CONNECT_TIMEOUT", 0.2)
+    monkeypatch.setattr(cluster_connection, "CONNECT_TIMEOUT", 0.2)
     gone, deleted = [], Client.__del__
     monkeypatch.setattr(Client, "__del__", lambda self: (gone.append(self.id), deleted(self)))
     with pytest.raises(ClusterError, match="no Dask scheduler answers") as refused:
-        cluster._reached("tcp://127.0.0.1:1", cluster_of({"kind": "local"}))
+        cluster_connection._connect_client(
+            "tcp://127.0.0.1:1", cluster_config_from_mapping({"kind": "local"})
+        )
     assert len(gone) == 1
     assert refused.value.__cause__ is not None  # nor is it kept by what is told
 
@@ -137,7 +143,9 @@ def test_without_certificates_of_ones_own_nobody_else_gets_in(processes):
     own = psutil.Process()
     before = listening([own, *own.children(recursive=True)])
     described = local(scheduler={"dashboard": "127.0.0.1:0"})
-    with cluster.connected(described, most=9, processes=processes, say=lambda _: None) as reached:
+    with cluster_connection.connect_cluster(
+        described, max_workers=9, processes=processes, say=lambda _: None
+    ) as reached:
         reached.client.wait_for_workers(1)
         found = listening([own, *own.children(recursive=True)]) - before
         address = reached.client.scheduler.address
@@ -161,7 +169,7 @@ def listening(processes) -> set[tuple[str, int]]:
 
 
 def test_certificates_reach_every_role(security):
-    settings = machines.security_settings(local(security=security))
+    settings = local_ssh.security_settings(local(security=security))
     for role in ("client", "scheduler", "worker"):
         assert settings[f"tls_{role}_cert"] == security["certificate"]
         assert settings[f"tls_{role}_key"] == security["key"]

@@ -16,7 +16,7 @@ import yaml
 import sweep
 from sweep.cli import main
 from sweep.model import outputs
-from sweep.spec import load_cluster
+from sweep.spec import load_cluster_config
 
 REPOSITORY = Path(__file__).parents[2]
 DOCS = REPOSITORY / "docs"
@@ -134,7 +134,7 @@ def test_what_a_page_tells_to_run_runs_and_shows_what_comes(page, here):
     for language, text in blocks(page):
         if language == "yaml" and page.parent.name == "deploy":
             over = page.with_name("kubernetes.yaml" if "secret:" in text else "slurm.yaml")
-            assert load_cluster(save(text, yaml.safe_load(over.read_text("utf-8")))).security
+            assert load_cluster_config(save(text, yaml.safe_load(over.read_text("utf-8")))).security
         elif language == "yaml":
             save(text)
         elif language == "sh":
@@ -263,4 +263,4 @@ def test_the_site_builds_without_a_warning(tmp_path):
     assert [name for name in main.commands if f'id="sweep-{name}"' not in commands] == []
     public = {*sweep.__all__} - {"__version__"}
     assert [name for name in public if f'id="sweep.{name}"' not in interface] == []
-    assert 'id="sweep.analysis.opening.SweepAccessor.maximum_range"' in interface
+    assert 'id="sweep.analysis.datasets.SweepAccessor.maximum_range"' in interface

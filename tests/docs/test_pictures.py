@@ -12,7 +12,7 @@ sys.path.insert(0, str(ROOT / "docs"))
 
 import pictures  # noqa: E402
 
-from sweep.analysis.canvas import SOURCE  # noqa: E402
+from sweep.analysis.canvas import PNG_SOURCE_FIELD  # noqa: E402
 
 
 @pytest.mark.parametrize("picture", pictures.PICTURES, ids=lambda picture: picture.file)
@@ -34,7 +34,9 @@ def test_a_picture_of_anything_else_is_out_of_date(change, tmp_path, monkeypatch
     (tmp_path / "quickstart.yaml").write_text(spec)
     if change != "gone":
         with Image.open(ROOT / "docs" / picture.file) as image:
-            assert re.fullmatch(r"study [0-9a-f]{32}, figure [0-9a-f]{16}", image.info[SOURCE])
+            assert re.fullmatch(
+                r"study [0-9a-f]{32}, figure [0-9a-f]{16}", image.info[PNG_SOURCE_FIELD]
+            )
             if change == "none":
                 image.info.clear()
                 image.save(tmp_path / picture.file)
@@ -42,7 +44,7 @@ def test_a_picture_of_anything_else_is_out_of_date(change, tmp_path, monkeypatch
                 (tmp_path / picture.file).write_bytes((ROOT / "docs" / picture.file).read_bytes())
                 assert pictures.is_current(picture)
     if change == "model":
-        monkeypatch.setattr("sweep.spec.study.VERSION", "another")
+        monkeypatch.setattr("sweep.spec.specs.VERSION", "another")
     elif change == "study":
         (tmp_path / "quickstart.yaml").write_text(spec.replace("[0.1 W,", "[0.2 W,"))
     elif change == "figure":

@@ -8,13 +8,13 @@ MOST = 0.02
 
 
 def test_few_sentences_of_any_page_or_module_are_hard_to_read():
-    found = prose.files()
+    found = prose.sentences_by_file()
     pages = sum(len(own) for name, own in found.items() if name.endswith(".md"))
     assert pages > 1500 and sum(map(len, found.values())) > 5000
-    hard = {name: [s for s in own if prose.fault(s)] for name, own in found.items()}
+    hard = {name: [s for s in own if prose.sentence_fault(s)] for name, own in found.items()}
     too_many = {name: each for name, each in hard.items() if len(each) > MOST * len(found[name])}
     assert not too_many, "\n".join(
-        f"{name}: {prose.fault(s)}: {s}" for name, each in too_many.items() for s in each
+        f"{name}: {prose.sentence_fault(s)}: {s}" for name, each in too_many.items() for s in each
     )
 
 
@@ -32,4 +32,4 @@ def test_few_sentences_of_any_page_or_module_are_hard_to_read():
     ],
 )
 def test_a_sentence_at_fault_is_told_from_a_good_one(sentence, why):
-    assert prose.fault(sentence) == why
+    assert prose.sentence_fault(sentence) == why

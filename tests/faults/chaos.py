@@ -38,36 +38,36 @@ from distributed import Nanny, Scheduler
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
-from small import copied, receipts, small, tree
+from small_studies import copy_store, file_digests, receipt_blocks, small_spec
 
 from sweep.storage import locations
-from sweep.tasks import journal, scheduler, store
 from sweep.tasks.driver import extend, resume, run
-from sweep.tasks.grid_study import GridStudy
-from sweep.tasks.verify import pack, verify
+from sweep.tasks.engine import dispatcher, journal, study_store
+from sweep.tasks.studies.grid_study import GridStudy
+from sweep.tasks.studies.store_verification import pack_store, verify
 
-BLOCKS = 12
-PATIENCE = 120.0
+N_BLOCKS = 12
+LEG_TIMEOUT = 120.0
 """Seconds that a leg of a study may take; beyond, it hangs."""
 
 BEFORE_WRITE, BETWEEN_CHUNKS, IN_A_FILE, AFTER_WRITE = (
     "before a write", "between chunks", "in a file", "after a write",
 )  # fmt: skip
 BEFORE_COMMIT, IN_COMMIT, AFTER_COMMIT = "before a commit", "in a commit", "after a commit"
-WRITES = (BEFORE_WRITE, BETWEEN_CHUNKS, IN_A_FILE, AFTER_WRITE)
-COMMITS = (BEFORE_COMMIT, IN_COMMIT, AFTER_COMMIT)
-ANYWHERE, REPLACING = "at any change", "as it is replaced"
-CHANGES = (ANYWHERE, REPLACING, REPLACING)
+WRITE_MOMENTS = (BEFORE_WRITE, BETWEEN_CHUNKS, IN_A_FILE, AFTER_WRITE)
+COMMIT_MOMENTS = (BEFORE_COMMIT, IN_COMMIT, AFTER_COMMIT)
+AT_ANY_CHANGE, WHILE_REPLACING = "at any change", "as it is replaced"
+CHANGE_MOMENTS = (AT_ANY_CHANGE, WHILE_REPLACING, WHILE_REPLACING)
 """Of a command's changes to the disk, by number; the first ones from a renaming of the store on."""
 
-KILL, POWER = ("SIGKILL",), ("power",)
-ANY_SIGNAL = ("SIGKILL", "SIGTERM", "SIGHUP")
-DURABLE = {"durable": True}
+BY_SIGKILL, BY_POWER_CUT = ("SIGKILL",), ("power",)
+BY_ANY_SIGNAL = ("SIGKILL", "SIGTERM", "SIGHUP")
+DURABLE_OPTIONS = {"durable": True}
 
-MOST_CHANGES = {"extend": 2600, "overwrite": 2600, "repair": 85, "finalize": 400}
+DISK_CHANGES_BY_COMMAND = {"extend": 2600, "overwrite": 2600, "repair": 85, "finalize": 400}
 """Changes of a command to the disk, about."""
 
-LARGER = {"axes.instrument.laser.power": ["1 W", "3 W", "4 W"]}
+EXTENSION_CHANGES = {"axes.instrument.laser.power": ["1 W", "3 W", "4 W"]}
 """What the study is extended by."""
 
 
@@ -78,124 +78,159 @@ class Kill:
     victim: str
     moment: str
     block: int
-    by: str = "SIGKILL"
+    cause: str = "SIGKILL"
 
 
 @dataclass(frozen=True)
-class Kind:
+class KillScenario:
     """A way to be killed."""
 
     name: str
     victim: str
     moments: tuple[str, ...]
     cluster: str  # "" plain loop, "own" of the client, "other" processes
-    share: int  # of the kills
-    a_leg: int = 1  # kills that one leg of a study can take
-    by: tuple[str, ...] = KILL
+    weight: int  # of the kills
+    kills_per_leg: int = 1  # kills that one leg of a study can take
+    causes: tuple[str, ...] = BY_SIGKILL
     command: str = "run"
 
 
-KINDS = (
-    Kind("client, plain loop", "here", WRITES + COMMITS, "", 41),
-    Kind("client with its cluster", "client", COMMITS, "own", 12),
-    Kind("client, its cluster lives on", "client", COMMITS, "lasting", 10),
-    Kind("worker", "here", WRITES, "own", 20, a_leg=4),
-    Kind("worker, frozen", "here", WRITES, "other", 6, a_leg=2, by=("SIGSTOP",)),
-    Kind("nanny", "nanny", WRITES, "other", 9, a_leg=2),
-    Kind("scheduler", "scheduler", WRITES, "other", 8),
-    Kind("client, by SIGTERM or SIGHUP", "here", WRITES + COMMITS, "", 10, by=ANY_SIGNAL[1:]),
-    Kind("extend", "here", CHANGES, "", 25, by=ANY_SIGNAL, command="extend"),
-    Kind("run --overwrite", "here", CHANGES, "", 25, by=ANY_SIGNAL, command="overwrite"),
-    Kind("verify --repair", "here", (ANYWHERE,), "", 25, by=ANY_SIGNAL, command="repair"),
-    Kind("finalize", "here", CHANGES, "", 15, by=ANY_SIGNAL, command="finalize"),
-    Kind("power, run --durable", "here", WRITES + COMMITS, "", 15, by=POWER),
-    Kind("power, extend --durable", "here", CHANGES, "", 15, by=POWER, command="extend"),
-    Kind("power, verify --repair", "here", (ANYWHERE,), "", 10, by=POWER, command="repair"),
-    Kind("power, finalize", "here", CHANGES, "", 10, by=POWER, command="finalize"),
+KILL_SCENARIOS = (
+    KillScenario("client, plain loop", "here", WRITE_MOMENTS + COMMIT_MOMENTS, "", 41),
+    KillScenario("client with its cluster", "client", COMMIT_MOMENTS, "own", 12),
+    KillScenario("client, its cluster lives on", "client", COMMIT_MOMENTS, "lasting", 10),
+    KillScenario("worker", "here", WRITE_MOMENTS, "own", 20, kills_per_leg=4),
+    KillScenario(
+        "worker, frozen", "here", WRITE_MOMENTS, "other", 6, kills_per_leg=2, causes=("SIGSTOP",)
+    ),
+    KillScenario("nanny", "nanny", WRITE_MOMENTS, "other", 9, kills_per_leg=2),
+    KillScenario("scheduler", "scheduler", WRITE_MOMENTS, "other", 8),
+    KillScenario(
+        "client, by SIGTERM or SIGHUP",
+        "here",
+        WRITE_MOMENTS + COMMIT_MOMENTS,
+        "",
+        10,
+        causes=BY_ANY_SIGNAL[1:],
+    ),
+    KillScenario("extend", "here", CHANGE_MOMENTS, "", 25, causes=BY_ANY_SIGNAL, command="extend"),
+    KillScenario(
+        "run --overwrite", "here", CHANGE_MOMENTS, "", 25, causes=BY_ANY_SIGNAL, command="overwrite"
+    ),
+    KillScenario(
+        "verify --repair", "here", (AT_ANY_CHANGE,), "", 25, causes=BY_ANY_SIGNAL, command="repair"
+    ),
+    KillScenario(
+        "finalize", "here", CHANGE_MOMENTS, "", 15, causes=BY_ANY_SIGNAL, command="finalize"
+    ),
+    KillScenario(
+        "power, run --durable", "here", WRITE_MOMENTS + COMMIT_MOMENTS, "", 15, causes=BY_POWER_CUT
+    ),
+    KillScenario(
+        "power, extend --durable",
+        "here",
+        CHANGE_MOMENTS,
+        "",
+        15,
+        causes=BY_POWER_CUT,
+        command="extend",
+    ),
+    KillScenario(
+        "power, verify --repair",
+        "here",
+        (AT_ANY_CHANGE,),
+        "",
+        10,
+        causes=BY_POWER_CUT,
+        command="repair",
+    ),
+    KillScenario(
+        "power, finalize", "here", CHANGE_MOMENTS, "", 10, causes=BY_POWER_CUT, command="finalize"
+    ),
 )
 
 
-class Disk:
+class LoopDisk:
     """A disk of its own in a file in a directory, whose power can be cut."""
 
     def __init__(self, directory: Path) -> None:
-        self._image, self.place = directory / "disk.img", directory / "disk"
-        self.place.mkdir(parents=True)
-        with open(self._image, "wb") as image:
+        self._image_file, self.mount_point = directory / "disk.img", directory / "disk"
+        self.mount_point.mkdir(parents=True)
+        with open(self._image_file, "wb") as image:
             image.truncate(48 << 20)
-        _command("mkfs.ext4", "-q", str(self._image))
-        self.switch_on()
+        _run_command("mkfs.ext4", "-q", str(self._image_file))
+        self.mount()
 
-    def switch_on(self) -> None:
+    def mount(self) -> None:
         """Mount it: what its journal holds is put in its place."""
-        _command("mount", "-o", "loop", str(self._image), str(self.place))
+        _run_command("mount", "-o", "loop", str(self._image_file), str(self.mount_point))
 
-    def cut(self) -> None:
+    def cut_power(self) -> None:
         """Cut its power: nothing that is not on it will be, and no process can use it."""
-        shut_down, without_the_log = 0x8004587D, struct.pack("I", 2)  # EXT4_IOC_SHUTDOWN
-        place = os.open(self.place, os.O_RDONLY)
-        fcntl.ioctl(place, shut_down, without_the_log)
-        os.close(place)
+        shutdown_ioctl, no_log_flush = 0x8004587D, struct.pack("I", 2)  # EXT4_IOC_SHUTDOWN
+        descriptor = os.open(self.mount_point, os.O_RDONLY)
+        fcntl.ioctl(descriptor, shutdown_ioctl, no_log_flush)
+        os.close(descriptor)
 
-    def switch_off(self) -> None:
+    def unmount(self) -> None:
         """Unmount it."""
-        _command("umount", str(self.place))
+        _run_command("umount", str(self.mount_point))
 
 
-def _command(*words: str) -> None:
+def _run_command(*words: str) -> None:
     subprocess.run(words, check=True, capture_output=True)
 
 
-def has_disks(directory: Path) -> bool:
+def can_cut_power(directory: Path) -> bool:
     """True where this machine allows disks of one's own whose power can be cut."""
     try:
-        disk = Disk(directory / "trial")
-        disk.cut()
-        disk.switch_off()
+        disk = LoopDisk(directory / "trial")
+        disk.cut_power()
+        disk.unmount()
     except (OSError, subprocess.CalledProcessError):
         return False
     return True
 
 
-class Arena:
+class ChaosStudy:
     """One study, its store, on a disk of its own if there is one, and notes of what was done."""
 
-    def __init__(self, directory: Path, disk: Disk | None = None) -> None:
+    def __init__(self, directory: Path, disk: LoopDisk | None = None) -> None:
         self.directory, self.disk = directory, disk
-        self.store = (disk.place if disk else directory) / "stores" / "small.zarr"
+        self.store = (disk.mount_point if disk else directory) / "stores" / "small.zarr"
         self.store.parent.mkdir(parents=True)
         self.output = self.store.with_name("small_final.zarr")
-        self.log = directory / "log"
-        self.log.touch()
+        self.log_file = directory / "log"
+        self.log_file.touch()
         self.kills: list[Kill] = []
         self.pids: dict[str, int] = {}
 
-    def note(self, line: str) -> None:
+    def append_log(self, line: str) -> None:
         """Add a line to the log; whole lines, whoever writes."""
-        with open(self.log, "ab", buffering=0) as log:
+        with open(self.log_file, "ab", buffering=0) as log:
             log.write(f"{line}\n".encode())
 
-    def reached(self, moment: str, block: int) -> None:
+    def kill_if_planned(self, moment: str, block: int) -> None:
         """Kill whom the plan says, once."""
         for kill in self.kills:
             if (kill.moment, kill.block) != (moment, block):
                 continue
             try:
-                os.close(os.open(self.mark(kill), os.O_CREAT | os.O_EXCL))
+                os.close(os.open(self.kill_marker(kill), os.O_CREAT | os.O_EXCL))
             except FileExistsError:
                 continue
-            if kill.by == "power":
-                self.disk.cut()
-            cause = signal.SIGKILL if kill.by == "power" else signal.Signals[kill.by]
-            os.kill(self._pid(kill.victim), cause)
+            if kill.cause == "power":
+                self.disk.cut_power()
+            signal_number = signal.SIGKILL if kill.cause == "power" else signal.Signals[kill.cause]
+            os.kill(self._pid(kill.victim), signal_number)
 
-    def mark(self, kill: Kill) -> Path:
+    def kill_marker(self, kill: Kill) -> Path:
         """File that stands for a kill that happened."""
         return self.directory / f"{kill.victim}-{kill.moment}-{kill.block}".replace(" ", "_")
 
-    def done(self) -> list[Kill]:
+    def kills_done(self) -> list[Kill]:
         """Kills that happened in this leg."""
-        return [kill for kill in self.kills if self.mark(kill).exists()]
+        return [kill for kill in self.kills if self.kill_marker(kill).exists()]
 
     def _pid(self, victim: str) -> int:
         if victim == "nanny":
@@ -203,123 +238,135 @@ class Arena:
         return os.getpid() if victim == "here" else self.pids[victim]
 
 
-def evaluate(study, block):
+def evaluate_and_log(study, block):
     """The model, with a note of what is computed."""
-    ARENA[0].note(f"{block} evaluated")
+    CURRENT_STUDY[0].append_log(f"{block} evaluated")
     return study.evaluate(block)
 
 
 _libc = ctypes.CDLL(None)
 PR_SET_PDEATHSIG = 1
 
-ARENA: list[Arena] = []
+CURRENT_STUDY: list[ChaosStudy] = []
 """The one of this process; those that are forked from it inherit it."""
 
 
-def set_changes(arena: Arena) -> None:
+def trap_disk_changes(arena: ChaosStudy) -> None:
     """Have every change to a disk pass by the arena first."""
-    number = {ANYWHERE: 0, REPLACING: -1}  # of the change; from a renaming of the store on
+    change_count_by_moment = {
+        AT_ANY_CHANGE: 0,
+        WHILE_REPLACING: -1,
+    }  # of the change; from a renaming of the store on
     stores = {arena.store, arena.output}
 
-    def trapped(change, *arguments, **options):
-        first = arguments[0]
-        place = Path(os.readlink(f"/proc/self/fd/{first}") if isinstance(first, int) else first)
-        if place.is_absolute() and arena.store.parent not in place.parents:
+    def trapped_change(change, *arguments, **options):
+        first_argument = arguments[0]
+        changed_path = Path(
+            os.readlink(f"/proc/self/fd/{first_argument}")
+            if isinstance(first_argument, int)
+            else first_argument
+        )
+        if changed_path.is_absolute() and arena.store.parent not in changed_path.parents:
             return change(*arguments, **options)
-        if change is rename and stores & {place, Path(arguments[1])}:
-            number[REPLACING] = max(number[REPLACING], 0)
-        for moment in number:
-            if number[moment] >= 0:
-                arena.reached(moment, number[moment])
-                number[moment] += 1
+        if change is rename and stores & {changed_path, Path(arguments[1])}:
+            change_count_by_moment[WHILE_REPLACING] = max(
+                change_count_by_moment[WHILE_REPLACING], 0
+            )
+        for moment in change_count_by_moment:
+            if change_count_by_moment[moment] >= 0:
+                arena.kill_if_planned(moment, change_count_by_moment[moment])
+                change_count_by_moment[moment] += 1
         return change(*arguments, **options)
 
     rename = os.rename
     for name in ("write", "fsync", "rename", "replace", "link", "unlink", "rmdir", "mkdir"):
-        setattr(os, name, partial(trapped, getattr(os, name)))
+        setattr(os, name, partial(trapped_change, getattr(os, name)))
 
 
-def set_traps(arena: Arena) -> None:
+def trap_writes_and_commits(arena: ChaosStudy) -> None:
     """Have all that is written and committed from here on pass by the arena, here and in forks."""
-    ARENA[:] = [arena]
-    if any(kill.moment in CHANGES for kill in arena.kills):
-        set_changes(arena)
-    write, commit, put, append = (
-        store.Arrays.write, journal.Journal.commit, locations.put, os.write,
-    )  # fmt: skip
-    writing: list[int] = []  # the block, and how many of its files are written
+    CURRENT_STUDY[:] = [arena]
+    if any(kill.moment in CHANGE_MOMENTS for kill in arena.kills):
+        trap_disk_changes(arena)
+    write_block, commit_blocks, put_file, os_write = (
+        study_store.BlockWriter.write,
+        journal.Journal.commit,
+        locations.atomic_write_file,
+        os.write,
+    )
+    block_and_files_written: list[int] = []  # the block, and how many of its files are written
 
     def trapped_write(self, block, results):
-        arena.reached(BEFORE_WRITE, block)
-        writing[:] = [block, 0]
-        digest = write(self, block, results)
-        arena.reached(AFTER_WRITE, block)
+        arena.kill_if_planned(BEFORE_WRITE, block)
+        block_and_files_written[:] = [block, 0]
+        digest = write_block(self, block, results)
+        arena.kill_if_planned(AFTER_WRITE, block)
         return digest
 
     def trapped_put(file, content, **options):
         path = Path(file)
-        if writing and "c" in path.parts:
-            writing[1] += 1
-            if writing[1] == 5:
-                arena.reached(BETWEEN_CHUNKS, writing[0])
-            if writing[1] == 9 and any(k.moment == IN_A_FILE for k in arena.kills):
-                half = path.with_suffix(f".{os.getpid()}.partial")
-                half.parent.mkdir(parents=True, exist_ok=True)
-                half.write_bytes(content[: len(content) // 2])
-                arena.reached(IN_A_FILE, writing[0])
-                half.unlink()
-        return put(file, content, **options)
+        if block_and_files_written and "c" in path.parts:
+            block_and_files_written[1] += 1
+            if block_and_files_written[1] == 5:
+                arena.kill_if_planned(BETWEEN_CHUNKS, block_and_files_written[0])
+            if block_and_files_written[1] == 9 and any(k.moment == IN_A_FILE for k in arena.kills):
+                half_file = path.with_suffix(f".{os.getpid()}.partial")
+                half_file.parent.mkdir(parents=True, exist_ok=True)
+                half_file.write_bytes(content[: len(content) // 2])
+                arena.kill_if_planned(IN_A_FILE, block_and_files_written[0])
+                half_file.unlink()
+        return put_file(file, content, **options)
 
-    def trapped_commit(self, *committed):
-        blocks = [receipt.block for receipt in committed]
-        reached_by_all(BEFORE_COMMIT, blocks)
-        os.write = partial(half_written, blocks)
+    def trapped_commit(self, *commit_receipts):
+        blocks = [receipt.block for receipt in commit_receipts]
+        kill_at_blocks(BEFORE_COMMIT, blocks)
+        os.write = partial(write_half_and_trap, blocks)
         try:
-            commit(self, *committed)
+            commit_blocks(self, *commit_receipts)
         finally:
-            os.write = append
+            os.write = os_write
         for block in blocks:
-            arena.note(f"{block} committed")
-        reached_by_all(AFTER_COMMIT, blocks)
+            arena.append_log(f"{block} committed")
+        kill_at_blocks(AFTER_COMMIT, blocks)
 
-    def half_written(blocks, log, lines):
-        half = append(log, lines[: len(lines) // 2])
-        reached_by_all(IN_COMMIT, blocks)
-        return half + append(log, lines[half:])
+    def write_half_and_trap(blocks, log, lines):
+        bytes_written = os_write(log, lines[: len(lines) // 2])
+        kill_at_blocks(IN_COMMIT, blocks)
+        return bytes_written + os_write(log, lines[bytes_written:])
 
-    def reached_by_all(moment, blocks):
+    def kill_at_blocks(moment, blocks):
         for block in blocks:
-            arena.reached(moment, block)
+            arena.kill_if_planned(moment, block)
 
-    store.Arrays.write, journal.Journal.commit = trapped_write, trapped_commit
-    locations.put = trapped_put
+    study_store.BlockWriter.write, journal.Journal.commit = trapped_write, trapped_commit
+    locations.atomic_write_file = trapped_put
 
 
-def forked(work: Callable[[], object]) -> int:
+def fork_process(function: Callable[[], object]) -> int:
     """Do something in a process of its own, in a group of its own; its pid."""
     sys.stdout.flush()
     pid = os.fork()
     if pid:
         return pid
-    code = 1
+    exit_code = 1
     try:
         os.setsid()
         _libc.prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-        silence = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(silence, 1)
+        null_device = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null_device, 1)
         if not os.environ.get("CHAOS_LOUD"):
-            os.dup2(silence, 2)
-        work()
-        code = 0
+            os.dup2(null_device, 2)
+        function()
+        exit_code = 0
     except BaseException:
         traceback.print_exc()
     finally:
-        os._exit(code)
+        os._exit(exit_code)
 
 
-def ended(pid: int) -> bool:
+def wait_for_exit(pid: int) -> bool:
     """Wait for a process: whether it ended in time."""
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + LEG_TIMEOUT
     while time.monotonic() < deadline:
         if os.waitpid(pid, os.WNOHANG)[0]:
             return True
@@ -327,7 +374,7 @@ def ended(pid: int) -> bool:
     return False
 
 
-def end(pid: int) -> None:
+def kill_process_group(pid: int) -> None:
     """End a process and all of its group."""
     with suppress(ProcessLookupError):
         os.killpg(pid, signal.SIGKILL)
@@ -335,7 +382,7 @@ def end(pid: int) -> None:
         os.waitpid(pid, 0)
 
 
-def serve_scheduler(file: Path) -> None:
+def run_scheduler(file: Path) -> None:
     """A scheduler, as long as this process lives."""
 
     async def forever() -> None:
@@ -347,9 +394,9 @@ def serve_scheduler(file: Path) -> None:
     asyncio.run(forever())
 
 
-def serve_nanny(arena: Arena, address: str) -> None:
+def run_nanny(arena: ChaosStudy, address: str) -> None:
     """A nanny and its worker, in the arena, as long as this process lives."""
-    set_traps(arena)
+    trap_writes_and_commits(arena)
 
     async def forever() -> None:
         async with Nanny(address, nthreads=1, memory_limit=0, dashboard=False) as nanny:
@@ -359,26 +406,26 @@ def serve_nanny(arena: Arena, address: str) -> None:
 
 
 @contextmanager
-def cluster(arena: Arena, workers: int) -> Iterator[str]:
+def run_cluster(arena: ChaosStudy, workers: int) -> Iterator[str]:
     """A scheduler and nannies, each a process of its own; the scheduler's address."""
     file = arena.directory / f"scheduler-{random.random()}"
-    pids = [forked(lambda: serve_scheduler(file))]
+    pids = [fork_process(lambda: run_scheduler(file))]
     try:
         arena.pids["scheduler"] = pids[0]
-        deadline = time.monotonic() + PATIENCE
+        deadline = time.monotonic() + LEG_TIMEOUT
         while not file.exists():
             assert time.monotonic() < deadline, "no scheduler"
             time.sleep(0.01)
         address = file.read_text()
-        pids += [forked(lambda: serve_nanny(arena, address)) for _ in range(workers)]
+        pids += [fork_process(lambda: run_nanny(arena, address)) for _ in range(workers)]
         yield address
     finally:
         for pid in pids:
-            end(pid)
+            kill_process_group(pid)
 
 
 @dataclass
-class Count:
+class KillOutcomes:
     """What came of the kills of one kind."""
 
     kills: Counter[str] = field(default_factory=Counter)  # by moment
@@ -389,134 +436,170 @@ class Count:
     hanging: int = 0
 
 
-def leg(arena: Arena, scheduler: str | None, command: str = "run") -> Callable[[], object]:
+def make_leg(
+    arena: ChaosStudy, scheduler: str | None, command: str = "run"
+) -> Callable[[], object]:
     """A command on the study, in a process that may be killed."""
 
-    def go_on() -> None:
+    def run_command() -> None:
         arena.pids["client"] = os.getpid()
         tempfile.tempdir = str(arena.directory)
-        set_traps(arena)
-        place = {"scheduler": scheduler} if scheduler else {"workers": 2}
-        how = {"evaluate": evaluate, "progress": False, "durable": bool(arena.disk), **place}
+        trap_writes_and_commits(arena)
+        cluster_options = {"scheduler": scheduler} if scheduler else {"workers": 2}
+        options = {
+            "evaluate": evaluate_and_log,
+            "progress": False,
+            "durable": bool(arena.disk),
+            **cluster_options,
+        }
         path = arena.store
         if command == "extend":
-            extend(path, changes=LARGER, **how)
+            extend(path, changes=EXTENSION_CHANGES, **options)
         elif command == "overwrite":
-            run(other(), store=path, overwrite=True, **how)
+            run(replacing_study(), store=path, overwrite=True, **options)
         elif command == "repair":
             verify(path, repair=True, progress=False)
         elif command == "finalize" and not arena.output.exists():
-            pack(path, arena.output, progress=False)
+            pack_store(path, arena.output, progress=False)
         elif command == "run" and path.exists():
-            resume(path, **how)
+            resume(path, **options)
         elif command == "run":
-            run(small(), store=path, **how)
+            run(small_spec(), store=path, **options)
 
-    return go_on
+    return run_command
 
 
-def other():
+def replacing_study():
     """The study that takes the place of the small one by --overwrite."""
-    return small(footprint={"beamlets": 7, "speckle": "none"})
+    return small_spec(footprint={"beamlets": 7, "speckle": "none"})
 
 
-def set_up(arena: Arena, command: str, undisturbed: Path, dice: random.Random) -> None:
+def set_up_store(arena: ChaosStudy, command: str, undisturbed: Path, rng: random.Random) -> None:
     """Put what a command needs in its place: a complete store, for repair a damaged one."""
     if command == "run":
         return
-    copied(undisturbed, arena.store.parent).rename(arena.store)
+    copy_store(undisturbed, arena.store.parent).rename(arena.store)
     if command == "repair":
-        listed = ".sweep/template.jsonl"
-        names = dice.sample(["pd_up/zarr.json", "range/c/0", "grazing_angle/zarr.json", listed], 3)
+        manifest = ".sweep/template.jsonl"
+        names = rng.sample(["pd_up/zarr.json", "range/c/0", "grazing_angle/zarr.json", manifest], 3)
         for name in ("zarr.json", *names):
             content = bytearray((arena.store / name).read_bytes())
             content[len(content) * 2 // 3] ^= 4
             (arena.store / name).write_bytes(content)
     if arena.disk:
-        store.sync(arena.store)
+        study_store.sync_to_disk(arena.store)
 
 
-def plan(arena: Arena, kind: Kind, dice: random.Random, most: int) -> list[Kill]:
+def plan_kills(
+    arena: ChaosStudy, scenario: KillScenario, rng: random.Random, kills_max: int
+) -> list[Kill]:
     """Kills of the next leg, at blocks that are still to be done."""
-    moment = dice.choice(kind.moments)
-    if moment in CHANGES:
-        number = dice.randrange(MOST_CHANGES[kind.command] if moment == ANYWHERE else 12)
-        return [Kill(kind.victim, moment, number, dice.choice(kind.by))] if most else []
-    left = [block for block in range(BLOCKS) if block not in receipts(arena.store)]
-    ahead = left[: max(4, kind.a_leg * 2)]
-    blocks = dice.sample(ahead, min(kind.a_leg, most, len(ahead)))
+    moment = rng.choice(scenario.moments)
+    if moment in CHANGE_MOMENTS:
+        change_number = rng.randrange(
+            DISK_CHANGES_BY_COMMAND[scenario.command] if moment == AT_ANY_CHANGE else 12
+        )
+        return (
+            [Kill(scenario.victim, moment, change_number, rng.choice(scenario.causes))]
+            if kills_max
+            else []
+        )
+    blocks_left = [block for block in range(N_BLOCKS) if block not in receipt_blocks(arena.store)]
+    next_blocks = blocks_left[: max(4, scenario.kills_per_leg * 2)]
+    blocks = rng.sample(next_blocks, min(scenario.kills_per_leg, kills_max, len(next_blocks)))
     return [
-        Kill(kind.victim, dice.choice(kind.moments), block, dice.choice(kind.by))
+        Kill(scenario.victim, rng.choice(scenario.moments), block, rng.choice(scenario.causes))
         for block in blocks
     ]
 
 
-def torment(
-    kind: Kind, dice: random.Random, most: int, directory: Path, undisturbed: Path
-) -> tuple[Arena, Count]:
+def kill_and_resume(
+    scenario: KillScenario, rng: random.Random, kills_max: int, directory: Path, undisturbed: Path
+) -> tuple[ChaosStudy, KillOutcomes]:
     """One study, killed and resumed until it is done or was killed as often as it may be."""
-    disk = Disk(directory) if kind.by == POWER else None
-    arena, count = Arena(directory, disk), Count(studies=1)
-    set_up(arena, kind.command, undisturbed, dice)
-    with cluster(arena, 2) if kind.cluster == "lasting" else nullcontext() as lasting:
-        for _ in range(2 * most):
-            arena.kills = plan(arena, kind, dice, most - sum(count.kills.values()))
-            if not arena.kills:
+    disk = LoopDisk(directory) if scenario.causes == BY_POWER_CUT else None
+    study, outcomes = ChaosStudy(directory, disk), KillOutcomes(studies=1)
+    set_up_store(study, scenario.command, undisturbed, rng)
+    with (
+        run_cluster(study, 2)
+        if scenario.cluster == "lasting"
+        else nullcontext() as lasting_scheduler
+    ):
+        for _ in range(2 * kills_max):
+            study.kills = plan_kills(study, scenario, rng, kills_max - sum(outcomes.kills.values()))
+            if not study.kills:
                 break
-            _one_leg(arena, kind, count, lasting)
-            count.kills.update(kill.moment for kill in arena.done())
-            if kind.command in ("extend", "overwrite"):  # there is the old one, or the new one
-                (report,) = verify(arena.store, progress=False)
-                count.lost += not (report.sound and report.complete)
-    arena.kills = []
-    _one_leg(arena, replace(kind, cluster=""), count, None)
-    if kind.command == "repair":
-        _one_leg(arena, KINDS[0], count, None)
-    return arena, count
+            _run_leg(study, scenario, outcomes, lasting_scheduler)
+            outcomes.kills.update(kill.moment for kill in study.kills_done())
+            if scenario.command in ("extend", "overwrite"):  # there is the old one, or the new one
+                (report,) = verify(study.store, progress=False)
+                outcomes.lost += not (report.sound and report.complete)
+    study.kills = []
+    _run_leg(study, replace(scenario, cluster=""), outcomes, None)
+    if scenario.command == "repair":
+        _run_leg(study, KILL_SCENARIOS[0], outcomes, None)
+    return study, outcomes
 
 
-def _one_leg(arena: Arena, kind: Kind, count: Count, lasting: str | None) -> None:
+def _run_leg(
+    arena: ChaosStudy, scenario: KillScenario, outcomes: KillOutcomes, lasting_scheduler: str | None
+) -> None:
     for kill in arena.kills:
-        arena.mark(kill).unlink(missing_ok=True)
-    with cluster(arena, 3) if kind.cluster == "other" else nullcontext() as other:
-        scheduler = {"": "none", "own": None, "lasting": lasting, "other": other}[kind.cluster]
-        pid = forked(leg(arena, scheduler, kind.command))
-        count.hanging += not ended(pid)
-        end(pid)
+        arena.kill_marker(kill).unlink(missing_ok=True)
+    with run_cluster(arena, 3) if scenario.cluster == "other" else nullcontext() as other_scheduler:
+        scheduler = {
+            "": "none",
+            "own": None,
+            "lasting": lasting_scheduler,
+            "other": other_scheduler,
+        }[scenario.cluster]
+        pid = fork_process(make_leg(arena, scheduler, scenario.command))
+        outcomes.hanging += not wait_for_exit(pid)
+        kill_process_group(pid)
     if arena.disk:
-        arena.disk.switch_off()
-        arena.disk.switch_on()
+        arena.disk.unmount()
+        arena.disk.mount()
 
 
-def judge(arena: Arena, kind: Kind, count: Count, undisturbed: Path) -> None:
+def check_store(
+    arena: ChaosStudy, scenario: KillScenario, outcomes: KillOutcomes, undisturbed: Path
+) -> None:
     """Hold a study that was tormented against the undisturbed one."""
     committed: set[str] = set()
-    made = arena.output if kind.command == "finalize" else arena.store
-    anew = kind.command == "overwrite"
-    may_race = "SIGSTOP" in kind.by  # two are at the same block, and one commits it
-    for line in arena.log.read_text().splitlines():
-        block, what = line.split()
-        if what == "committed":
+    resulting_store = arena.output if scenario.command == "finalize" else arena.store
+    recomputes_all = scenario.command == "overwrite"
+    may_compute_twice = (
+        "SIGSTOP" in scenario.causes
+    )  # two are at the same block, and one commits it
+    for line in arena.log_file.read_text().splitlines():
+        block, event = line.split()
+        if event == "committed":
             committed.add(block)
         else:
-            count.lost += block in committed and not (anew or may_race)
-    written = Counter(receipts(made))
-    count.lost += len(receipts(undisturbed)) - len(written)
-    count.twice += sum(number > 1 for number in written.values())
-    reports = [report for path in {arena.store, made} for report in verify(path, progress=False)]
-    alone = set(arena.store.parent.iterdir()) == {arena.store, made}
-    whole = all(report.sound and report.complete for report in reports)
-    count.different += not (tree(made) == tree(undisturbed) and alone and whole)
+            outcomes.lost += block in committed and not (recomputes_all or may_compute_twice)
+    receipts_by_block = Counter(receipt_blocks(resulting_store))
+    outcomes.lost += len(receipt_blocks(undisturbed)) - len(receipts_by_block)
+    outcomes.twice += sum(n_receipts > 1 for n_receipts in receipts_by_block.values())
+    reports = [
+        report for path in {arena.store, resulting_store} for report in verify(path, progress=False)
+    ]
+    has_no_leftovers = set(arena.store.parent.iterdir()) == {arena.store, resulting_store}
+    is_intact = all(report.sound and report.complete for report in reports)
+    outcomes.different += not (
+        file_digests(resulting_store) == file_digests(undisturbed)
+        and has_no_leftovers
+        and is_intact
+    )
     if arena.disk:
-        arena.disk.switch_off()
+        arena.disk.unmount()
 
 
-def prepare() -> None:
+def prepare_parent_process() -> None:
     """Load all that the study computes with, so that no fork has to."""
-    study = GridStudy(small())
-    study.compile()
+    study = GridStudy(small_spec())
+    study.compile_kernels()
     study.evaluate(0)
-    scheduler.LEASE = 3.0
+    dispatcher.LEASE_SECONDS = 3.0
     dask.config.set({
         "distributed.worker.multiprocessing-method": "fork",
         "distributed.comm.timeouts.connect": "5s",
@@ -524,68 +607,107 @@ def prepare() -> None:
     })  # fmt: skip
 
 
-def undisturbed_stores(directory: Path) -> dict[str, Path]:
+def make_undisturbed_stores(directory: Path) -> dict[str, Path]:
     """Stores that commands make undisturbed."""
 
-    def make() -> None:
-        run(small(), store=made["run"], scheduler="none", progress=False)
-        extend(made["run"], changes=LARGER, to=made["extend"], scheduler="none", progress=False)
-        run(other(), store=made["overwrite"], scheduler="none", progress=False)
-        pack(made["run"], made["finalize"], progress=False)
+    def make_stores() -> None:
+        run(small_spec(), store=stores["run"], scheduler="none", progress=False)
+        extend(
+            stores["run"],
+            changes=EXTENSION_CHANGES,
+            to=stores["extend"],
+            scheduler="none",
+            progress=False,
+        )
+        run(replacing_study(), store=stores["overwrite"], scheduler="none", progress=False)
+        pack_store(stores["run"], stores["finalize"], progress=False)
 
-    made = {name: directory / f"{name}.zarr" for name in ("run", "extend", "overwrite", "finalize")}
-    assert ended(forked(make))
-    return made | {"repair": made["run"]}
+    stores = {
+        name: directory / f"{name}.zarr" for name in ("run", "extend", "overwrite", "finalize")
+    }
+    assert wait_for_exit(fork_process(make_stores))
+    return stores | {"repair": stores["run"]}
 
 
-def campaign(
-    kills: int, seed: int, *, kinds: tuple[Kind, ...] = KINDS, a_study: int = 4, show: bool = False
-) -> dict[str, Count]:
+def run_campaign(
+    kills: int,
+    seed: int,
+    *,
+    scenarios: tuple[KillScenario, ...] = KILL_SCENARIOS,
+    kills_per_study: int = 4,
+    shows_progress: bool = False,
+) -> dict[str, KillOutcomes]:
     """Kill so often, each study some times at the most, and judge every study."""
-    prepare()
-    dice, counts = random.Random(seed), {kind.name: Count() for kind in kinds}
+    prepare_parent_process()
+    rng, outcomes_by_scenario = (
+        random.Random(seed),
+        {scenario.name: KillOutcomes() for scenario in scenarios},
+    )
     directory = Path(tempfile.mkdtemp(prefix="chaos-"))
-    whole = sum(kind.share for kind in kinds)
+    total_weight = sum(scenario.weight for scenario in scenarios)
     try:
-        expected = undisturbed_stores(directory / "undisturbed")
-        if not has_disks(directory):
-            kinds = tuple(kind for kind in kinds if kind.by != POWER)
+        expected = make_undisturbed_stores(directory / "undisturbed")
+        if not can_cut_power(directory):
+            scenarios = tuple(scenario for scenario in scenarios if scenario.causes != BY_POWER_CUT)
             print("this machine allows no power cuts", file=sys.stderr)
-        for kind in track(kinds, "killing", disable=not show):
-            count, wanted = counts[kind.name], -(-kills * kind.share // whole)
-            while (so_far := sum(count.kills.values())) < wanted:
-                place = directory / f"{kind.name}-{count.studies}".replace(" ", "_")
-                most = min(a_study, wanted - so_far)
-                arena, one = torment(kind, dice, most, place, expected["run"])
-                judge(arena, kind, one, expected[kind.command])
-                _add(count, one)
-                if not (one.lost or one.twice or one.different or one.hanging):
-                    shutil.rmtree(place)
-                if one.hanging or count.studies > 3 * wanted:
+        for scenario in track(scenarios, "killing", disable=not shows_progress):
+            outcomes, kills_wanted = (
+                outcomes_by_scenario[scenario.name],
+                -(-kills * scenario.weight // total_weight),
+            )
+            while (kills_so_far := sum(outcomes.kills.values())) < kills_wanted:
+                study_directory = directory / f"{scenario.name}-{outcomes.studies}".replace(
+                    " ", "_"
+                )
+                kills_max = min(kills_per_study, kills_wanted - kills_so_far)
+                study, study_outcomes = kill_and_resume(
+                    scenario, rng, kills_max, study_directory, expected["run"]
+                )
+                check_store(study, scenario, study_outcomes, expected[scenario.command])
+                _add_outcomes(outcomes, study_outcomes)
+                if not (
+                    study_outcomes.lost
+                    or study_outcomes.twice
+                    or study_outcomes.different
+                    or study_outcomes.hanging
+                ):
+                    shutil.rmtree(study_directory)
+                if study_outcomes.hanging or outcomes.studies > 3 * kills_wanted:
                     break
     finally:
-        if not any(c.lost or c.twice or c.different or c.hanging for c in counts.values()):
+        if not any(
+            result.lost or result.twice or result.different or result.hanging
+            for result in outcomes_by_scenario.values()
+        ):
             shutil.rmtree(directory)
-        elif show:
+        elif shows_progress:
             print(f"what went wrong is in {directory}", file=sys.stderr)
-    return counts
+    return outcomes_by_scenario
 
 
-def _add(count: Count, one: Count) -> None:
-    count.kills += one.kills
+def _add_outcomes(total: KillOutcomes, added: KillOutcomes) -> None:
+    total.kills += added.kills
     for name in ("studies", "lost", "twice", "different", "hanging"):
-        setattr(count, name, getattr(count, name) + getattr(one, name))
+        setattr(total, name, getattr(total, name) + getattr(added, name))
 
 
-def told(counts: dict[str, Count]) -> Table:
+def outcomes_table(outcomes_by_scenario: dict[str, KillOutcomes]) -> Table:
     """The table of a campaign."""
-    moments = (*WRITES, *COMMITS, ANYWHERE, REPLACING)
+    moments = (*WRITE_MOMENTS, *COMMIT_MOMENTS, AT_ANY_CHANGE, WHILE_REPLACING)
     headings = ["killed", *moments, "kills", "studies", "lost", "twice", "not identical"]
     table = Table(*headings, box=None)
-    for name, count in counts.items():
-        numbers = [count.kills[moment] for moment in moments]
-        ends = [sum(numbers), count.studies, count.lost, count.twice, count.different]
-        table.add_row(name, *[str(n) if n else "-" for n in numbers], *map(str, ends))
+    for name, outcomes in outcomes_by_scenario.items():
+        kills_by_moment = [outcomes.kills[moment] for moment in moments]
+        totals = [
+            sum(kills_by_moment),
+            outcomes.studies,
+            outcomes.lost,
+            outcomes.twice,
+            outcomes.different,
+        ]
+        table.add_row(
+            name, *[str(number) if number else "-" for number in kills_by_moment], *map(str, totals)
+        )
     return table
 
 
@@ -597,15 +719,26 @@ def main() -> None:
     parser.add_argument("--only", default="", help="Parts of the names of kinds of kills, a|b.")
     arguments = parser.parse_args()
     begun = time.monotonic()
-    parts = arguments.only.split("|")
-    kinds = tuple(kind for kind in KINDS if any(part in kind.name for part in parts))
-    counts = campaign(arguments.kills, arguments.seed, kinds=kinds, show=True)
-    Console(width=200).print(told(counts))
-    kills = sum(sum(count.kills.values()) for count in counts.values())
-    wrong = sum(c.lost + c.twice + c.different + c.hanging for c in counts.values())
+    name_parts = arguments.only.split("|")
+    scenarios = tuple(
+        scenario
+        for scenario in KILL_SCENARIOS
+        if any(name_part in scenario.name for name_part in name_parts)
+    )
+    outcomes_by_scenario = run_campaign(
+        arguments.kills, arguments.seed, scenarios=scenarios, shows_progress=True
+    )
+    Console(width=200).print(outcomes_table(outcomes_by_scenario))
+    kills = sum(sum(count.kills.values()) for count in outcomes_by_scenario.values())
+    n_faults = sum(
+        result.lost + result.twice + result.different + result.hanging
+        for result in outcomes_by_scenario.values()
+    )
     print(f"{kills} kills, seed {arguments.seed}, {time.monotonic() - begun:.0f} s: ", end="")
-    print("nothing lost, nothing twice, every store identical" if not wrong else "NOT ALL IS WELL")
-    sys.exit(bool(wrong) or kills < arguments.kills)
+    print(
+        "nothing lost, nothing twice, every store identical" if not n_faults else "NOT ALL IS WELL"
+    )
+    sys.exit(bool(n_faults) or kills < arguments.kills)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,10 @@
 import pytest
-from small import quiet, small, tree
+from small_studies import file_digests, run_serially, small_spec
 
 
 @pytest.fixture(scope="session")
 def undisturbed(tmp_path_factory):
     """Files of the small study, run as a plain loop."""
-    return tree(quiet(small(), tmp_path_factory.mktemp("undisturbed") / "small.zarr").store)
+    return file_digests(
+        run_serially(small_spec(), tmp_path_factory.mktemp("undisturbed") / "small.zarr").store
+    )

@@ -5,12 +5,12 @@ import shutil
 import subprocess
 
 import pytest
-from small import receipts, small, tree
+from small_studies import file_digests, receipt_blocks, small_spec
 
 from sweep.tasks.driver import resume, run
-from sweep.tasks.progress import StoreError
-from sweep.tasks.summary import status
-from sweep.tasks.verify import verify
+from sweep.tasks.engine.progress import StoreError
+from sweep.tasks.studies.store_summary import status
+from sweep.tasks.studies.store_verification import verify
 
 
 @pytest.fixture
@@ -34,7 +34,7 @@ def mount(*options: str) -> bool:
 
 def committed_is_whole(store) -> None:
     (report,) = verify(store, progress=False)
-    assert report.sound and report.whole == len(set(receipts(store))) < 12
+    assert report.sound and report.whole == len(set(receipt_blocks(store))) < 12
 
 
 @pytest.mark.parametrize(
@@ -43,36 +43,38 @@ def committed_is_whole(store) -> None:
 def test_a_full_disk_stops_a_study_that_goes_on_when_there_is_room(disk, undisturbed, size, place):
     store = disk / "small.zarr"
     assert mount("-o", f"remount,size={size}", str(disk))
-    outcome = run(small(), store=store, progress=False, **place)
+    outcome = run(small_spec(), store=store, progress=False, **place)
     assert not outcome.complete
     assert "No space left on device" in outcome.stopped and "make room" in outcome.stopped
     committed_is_whole(store)
-    before = receipts(store)
+    before = receipt_blocks(store)
     assert len(before) == outcome.blocks_done
     again = resume(store, progress=False, **place)
     assert not again.complete and "make room" in again.stopped
     assert mount("-o", "remount,size=16M", str(disk))
     assert resume(store, progress=False, scheduler="none").complete
-    assert receipts(store)[: len(before)] == before and sorted(receipts(store)) == list(range(12))
-    assert tree(store) == undisturbed
+    assert receipt_blocks(store)[: len(before)] == before and sorted(receipt_blocks(store)) == list(
+        range(12)
+    )
+    assert file_digests(store) == undisturbed
 
 
 def test_a_disk_that_is_full_from_the_start_is_left_as_it_was(disk):
     with pytest.raises(StoreError, match="can't be made: No space left on device"):
-        run(small(), store=disk / "small.zarr", progress=False, scheduler="none")
+        run(small_spec(), store=disk / "small.zarr", progress=False, scheduler="none")
     assert list(disk.iterdir()) == []
 
 
 def test_a_disk_without_inodes_is_not_told_as_a_full_one(disk):
     store = disk / "small.zarr"
     assert mount("-o", "remount,size=16M,nr_inodes=300", str(disk))
-    outcome = run(small(), store=store, progress=False, scheduler="none")
+    outcome = run(small_spec(), store=store, progress=False, scheduler="none")
     assert not outcome.complete and "No space left" not in outcome.stopped
     assert "(No inodes left on device): remove files from its disk" in outcome.stopped
     committed_is_whole(store)
     other = disk / "other.zarr"
     with pytest.raises(StoreError, match=r"can't be made: No inodes left on device; remove f"):
-        run(small(), store=other, progress=False, scheduler="none")
+        run(small_spec(), store=other, progress=False, scheduler="none")
     assert not other.exists()
     assert mount("-o", "remount,nr_inodes=9000", str(disk))
     assert resume(store, progress=False, scheduler="none").complete
@@ -95,7 +97,7 @@ def test_a_disk_that_becomes_read_only_stops_a_study_that_goes_on_later(disk, un
     store = disk / "small.zarr"
     assert mount("-o", "remount,size=16M", str(disk))
     evaluate = at_block(5, lambda: mount("-o", "remount,ro", str(disk)) or pytest.fail("busy"))
-    outcome = run(small(), store=store, progress=False, scheduler="none", evaluate=evaluate)
+    outcome = run(small_spec(), store=store, progress=False, scheduler="none", evaluate=evaluate)
     assert outcome.blocks_done == 5
     assert "Read-only file system" in outcome.stopped and "for writing" in outcome.stopped
     committed_is_whole(store)
@@ -104,7 +106,7 @@ def test_a_disk_that_becomes_read_only_stops_a_study_that_goes_on_later(disk, un
         resume(store, progress=False, scheduler="none")
     assert mount("-o", "remount,rw", str(disk))
     assert resume(store, progress=False, scheduler="none").complete
-    assert sorted(receipts(store)) == list(range(12)) and tree(store) == undisturbed
+    assert sorted(receipt_blocks(store)) == list(range(12)) and file_digests(store) == undisturbed
 
 
 @pytest.mark.parametrize("place", [{"scheduler": "none"}, {"workers": 2, "processes": False}])
@@ -113,14 +115,16 @@ def test_a_folder_that_vanishes_stops_a_study_that_goes_on_when_it_is_back(
 ):
     store, elsewhere = tmp_path / "small.zarr", tmp_path / "elsewhere.zarr"
     evaluate = at_block(5, lambda: shutil.move(store, elsewhere))
-    outcome = run(small(), store=store, progress=False, evaluate=evaluate, **place)
+    outcome = run(small_spec(), store=store, progress=False, evaluate=evaluate, **place)
     assert "small.zarr is no longer there" in outcome.stopped and not outcome.complete
     with pytest.raises(StoreError, match=r"there is no store|not a Zarr store"):
         resume(store, progress=False, scheduler="none")
     shutil.rmtree(store, ignore_errors=True)  # what another worker was at meanwhile
-    before = receipts(elsewhere)
+    before = receipt_blocks(elsewhere)
     assert before
     shutil.move(elsewhere, store)
     assert resume(store, progress=False, scheduler="none").complete
-    assert receipts(store)[: len(before)] == before and sorted(receipts(store)) == list(range(12))
-    assert tree(store) == undisturbed
+    assert receipt_blocks(store)[: len(before)] == before and sorted(receipt_blocks(store)) == list(
+        range(12)
+    )
+    assert file_digests(store) == undisturbed

@@ -13,11 +13,17 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
-from small import evaluated, logged, receipts, small, tree
+from small_studies import (
+    file_digests,
+    logged_blocks,
+    make_logging_evaluate,
+    receipt_blocks,
+    small_spec,
+)
 
 from sweep.tasks.driver import resume, run
-from sweep.tasks.summary import status
-from sweep.tasks.verify import verify
+from sweep.tasks.studies.store_summary import status
+from sweep.tasks.studies.store_verification import verify
 
 BLOCKS = 12
 SLOW = 0.15
@@ -26,13 +32,13 @@ SLOW = 0.15
 CLIENT = """
 import sys
 from pathlib import Path
-from small import logged, small
+from small_studies import make_logging_evaluate, small_spec
 from sweep.tasks.driver import run
 
 if __name__ == "__main__":
     store, log, slow = sys.argv[1:]
-    evaluate = logged(Path(log), float(slow))
-    outcome = run(small(), store=store, evaluate=evaluate, progress=False, workers=2)
+    evaluate = make_logging_evaluate(Path(log), float(slow))
+    outcome = run(small_spec(), store=store, evaluate=evaluate, progress=False, workers=2)
     print(outcome.stopped)
 """
 
@@ -84,23 +90,23 @@ def wait_for(condition, timeout: float = 120.0) -> None:
 def finish(tmp_path: Path, undisturbed: dict[str, str]) -> None:
     """Resume, and see that the store is the undisturbed one and committed work was not repeated."""
     store = tmp_path / "small.zarr"
-    committed = receipts(store)
+    committed = receipt_blocks(store)
     assert 0 < len(committed) < BLOCKS
     assert not status(store).holder_lives
     log = tmp_path / "resumed"
-    outcome = resume(store, progress=False, scheduler="none", evaluate=logged(log))
+    outcome = resume(store, progress=False, scheduler="none", evaluate=make_logging_evaluate(log))
     assert outcome.complete
-    assert sorted(evaluated(log)) == sorted(set(range(BLOCKS)) - set(committed))
-    assert sorted(receipts(store)) == list(range(BLOCKS))
-    before = Counter(evaluated(tmp_path / "log"))
+    assert sorted(logged_blocks(log)) == sorted(set(range(BLOCKS)) - set(committed))
+    assert sorted(receipt_blocks(store)) == list(range(BLOCKS))
+    before = Counter(logged_blocks(tmp_path / "log"))
     assert all(before[block] == 1 for block in committed)
-    assert tree(store) == undisturbed
+    assert file_digests(store) == undisturbed
 
 
 #: Repairs a store, and dies as the first, second, ... object is about to get its place.
 REPAIRS = """
 import os, sys
-from sweep.tasks.verify import verify
+from sweep.tasks.studies.store_verification import verify
 
 store, replace, deaths = sys.argv[1], os.replace, 0
 
@@ -120,7 +126,7 @@ print(deaths)
 
 def test_a_repair_killed_at_each_object_is_repeated_to_the_undisturbed_bytes(tmp_path, undisturbed):
     store = tmp_path / "small.zarr"
-    run(small(), store=store, scheduler="none", progress=False)
+    run(small_spec(), store=store, scheduler="none", progress=False)
     for name in ("beamlets", "effects", "noise_variance", "pd_up", "snr_up", ""):
         (store / name / "zarr.json").write_bytes(b"damaged")
     with process(sys.executable, "-c", REPAIRS, str(store)) as repairs:
@@ -128,17 +134,17 @@ def test_a_repair_killed_at_each_object_is_repeated_to_the_undisturbed_bytes(tmp
     (report,) = verify(store, repair=True, progress=False)
     assert report.sound
     assert resume(store, progress=False, scheduler="none").complete
-    assert tree(store) == undisturbed
+    assert file_digests(store) == undisturbed
 
 
 @pytest.mark.slow
 def test_ctrl_c_reaches_every_process_and_still_commits_what_runs(tmp_path, undisturbed):
     store = tmp_path / "small.zarr"
     with client_process(tmp_path) as client:
-        wait_for(lambda: len(receipts(store)) >= 2)
+        wait_for(lambda: len(receipt_blocks(store)) >= 2)
         os.killpg(client.pid, signal.SIGINT)
         output, _ = client.communicate(timeout=120)
         assert output.strip().splitlines()[-1] == "interrupted"
         assert "/sweep/" not in output  # no traceback of ours
-    assert set(evaluated(tmp_path / "log")) == set(receipts(store))
+    assert set(logged_blocks(tmp_path / "log")) == set(receipt_blocks(store))
     finish(tmp_path, undisturbed)

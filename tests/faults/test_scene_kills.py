@@ -5,8 +5,8 @@ import signal
 import sys
 
 import pytest
-from small import receipts, tree
-from small_flights import small_scene
+from small_flights import small_scene_spec
+from small_studies import file_digests, receipt_blocks
 from test_kills import process, wait_for
 
 from sweep.storage.locations import eyepoints_path
@@ -14,17 +14,17 @@ from sweep.tasks.driver import resume, run
 
 CLIENT = """
 import sys, time
-from small_flights import small_scene
-from sweep.tasks import eyepoint_study
+from small_flights import small_scene_spec
+from sweep.tasks.studies import eyepoint_study
 from sweep.tasks.driver import run
 
-eyepoint_study.BLOCK_SHOTS = 24
+eyepoint_study.BLOCK_SHOTS_MAX = 24
 
 def slowly(study, block):
     time.sleep(0.1)
     return study.evaluate(block)
 
-run(small_scene(), store=sys.argv[1], scheduler="none", evaluate=slowly, progress=False)
+run(small_scene_spec(), store=sys.argv[1], scheduler="none", evaluate=slowly, progress=False)
 """
 
 
@@ -33,9 +33,9 @@ def plain(tmp_path_factory):
     """Files of the study and of its eyepoints, run as a plain loop."""
     store = tmp_path_factory.mktemp("plain") / "scene.zarr"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sweep.tasks.eyepoint_study.BLOCK_SHOTS", 24)
-        run(small_scene(), store=store, scheduler="none", progress=False)
-    return tree(store.parent)
+        patch.setattr("sweep.tasks.studies.eyepoint_study.BLOCK_SHOTS_MAX", 24)
+        run(small_scene_spec(), store=store, scheduler="none", progress=False)
+    return file_digests(store.parent)
 
 
 @pytest.mark.slow
@@ -43,20 +43,20 @@ def plain(tmp_path_factory):
 def test_a_scenes_client_killed_with_kill_9(tmp_path, monkeypatch, plain, stage):
     store = tmp_path / "killed" / "scene.zarr"
     store.parent.mkdir()
-    eyepoints = eyepoints_path(store, small_scene().geometry_id("three"))
+    eyepoints = eyepoints_path(store, small_scene_spec().geometry_id("three"))
     watched = eyepoints if stage == "casting" else store
     script = tmp_path / "client.py"
     script.write_text(CLIENT)
     with process(sys.executable, str(script), str(store)) as client:
-        wait_for(lambda: len(receipts(watched)) >= 3)
+        wait_for(lambda: len(receipt_blocks(watched)) >= 3)
         os.kill(client.pid, signal.SIGKILL)
         client.wait()
-    before = {path: receipts(path) for path in (eyepoints, store)}
+    before = {path: receipt_blocks(path) for path in (eyepoints, store)}
     assert before[store] == [] if stage == "casting" else len(before[store]) >= 3
-    monkeypatch.setattr("sweep.tasks.eyepoint_study.BLOCK_SHOTS", 24)
+    monkeypatch.setattr("sweep.tasks.studies.eyepoint_study.BLOCK_SHOTS_MAX", 24)
     outcome = resume(store, progress=False, scheduler="none")
     assert outcome.complete and (outcome.rays["three"] == 0) == (stage == "looking")
     for path, committed in before.items():
-        after = receipts(path)
+        after = receipt_blocks(path)
         assert after[: len(committed)] == committed and len(set(after)) == len(after)
-    assert tree(store.parent) == plain
+    assert file_digests(store.parent) == plain

@@ -1,7 +1,7 @@
 """The files that random scenes name, once for all fuzz tests."""
 
 import pytest
-from random_flights import write_files
+from flight_strategies import write_files
 
 
 @pytest.fixture(scope="session")

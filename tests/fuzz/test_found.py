@@ -4,11 +4,11 @@ import re
 
 import numpy as np
 import pytest
+from base_study import base_study_mapping
 from click.testing import CliRunner
-from judging import judge, strictly
-from plain_study import plain
-from smaller import swiftly
-from spoilt_specs import dumped
+from corrupted_specs import to_yaml
+from fast_plans import fast_planning
+from study_checks import check_study, warnings_as_errors
 
 from sweep.cli import main
 from sweep.model.effects.line_width import MOST_BINS, gaussian_shifts
@@ -16,39 +16,39 @@ from sweep.model.effects.noise_sources import SUN_RADIUS, sunlight
 from sweep.model.effects.saturation import MOST_BEYOND
 from sweep.model.unsupported import UnsupportedShot
 from sweep.scenes.terrain import Terrain, smooth
-from sweep.spec import SceneSpec, Spec, SpecError
-from sweep.tasks.grid_study import GridStudy
-from sweep.tasks.plan import plan
+from sweep.spec import GridSpec, SceneSpec, SpecError
+from sweep.tasks.studies.grid_study import GridStudy
+from sweep.tasks.studies.study_plan import plan_study
 
 
 @pytest.fixture(autouse=True)
 def quick():
-    with swiftly():
+    with fast_planning():
         yield
 
 
 def judged(tmp_path, written):
     """A verdict over a study as written."""
-    (tmp_path / "found.yaml").write_text(dumped(written))
-    return judge(tmp_path / "found.yaml")
+    (tmp_path / "found.yaml").write_text(to_yaml(written))
+    return check_study(tmp_path / "found.yaml")
 
 
 def refused(written):
     """The words that a study is refused with."""
     with pytest.raises(SpecError) as caught:
-        Spec.from_mapping(written)
+        GridSpec.from_mapping(written)
     return str(caught.value)
 
 
 def planned(tmp_path, written):
     """`sweep plan` over a study."""
-    (tmp_path / "found.yaml").write_text(dumped(written))
+    (tmp_path / "found.yaml").write_text(to_yaml(written))
     return CliRunner().invoke(main, ["plan", str(tmp_path / "found.yaml")], catch_exceptions=False)
 
 
 def test_direct_detection_with_draws_is_planned_though_it_knows_no_speckle(tmp_path):
-    direct = plain({"instrument.receiver.architecture": "direct", "draws.number": 3})
-    assert plan(Spec.from_mapping(direct)).points == 1
+    direct = base_study_mapping({"instrument.receiver.architecture": "direct", "draws.number": 3})
+    assert plan_study(GridSpec.from_mapping(direct)).n_points == 1
     assert not judged(tmp_path, direct).refusals
     assert "averages over an unknown number" in refused(direct | {"effects": {"speckle": "on"}})
 
@@ -61,7 +61,7 @@ BEYOND = {
 
 @pytest.mark.parametrize("name", BEYOND)
 def test_a_shot_beyond_the_model_is_refused_with_field_limit_value_and_remedy(name, tmp_path):
-    told = planned(tmp_path, plain(BEYOND[name]))
+    told = planned(tmp_path, base_study_mapping(BEYOND[name]))
     assert told.exit_code == 2 and told.stdout == ""
     assert re.search(r"(instrument|target)\.\w+", told.stderr)
     assert "can be simulated: " in told.stderr and re.search(r"\d", told.stderr)
@@ -77,14 +77,14 @@ def test_the_limits_of_the_model_are_where_they_are_said_to_be():
 
 def test_nothing_that_comes_back_has_no_range_error_with_draws_or_without(tmp_path):
     for draws in ({}, {"draws.number": 3}, {"draws.number": 3, "target.roughness": "1 mm"}):
-        dark = plain({"target.reflectance": 0} | draws)
-        results = GridStudy(Spec.from_mapping(dark)).evaluate(0)
+        dark = base_study_mapping({"target.reflectance": 0} | draws)
+        results = GridStudy(GridSpec.from_mapping(dark)).evaluate(0)
         assert np.isnan(results["range_error"]) and np.isnan(results["radial_velocity_error"])
         assert not judged(tmp_path, dark).refusals
 
 
 def test_sunlight_of_the_far_ultraviolet_fades_to_nothing_in_silence():
-    with strictly():
+    with warnings_as_errors():
         light = sunlight(wavelength=[1e-9, 30e-9, 500e-9], distance=1.496e11, elevation=1.57)
     assert light[0] == 0 and 0 < light[1] < 1e-3 * light[2]
     # Wien's limit, where e^u exceeds what 1 could matter to: u = 16.6 at 150 nm.
@@ -96,29 +96,31 @@ def test_sunlight_of_the_far_ultraviolet_fades_to_nothing_in_silence():
 
 def test_nobody_can_be_inside_the_sun():
     near = f"{0.99 * SUN_RADIUS} m"
-    assert "target.sun_distance: must be 0" in refused(plain({"target.sun_distance": near}))
-    Spec.from_mapping(plain({"target.sun_distance": f"{1.01 * SUN_RADIUS} m"}))
+    assert "target.sun_distance: must be 0" in refused(
+        base_study_mapping({"target.sun_distance": near})
+    )
+    GridSpec.from_mapping(base_study_mapping({"target.sun_distance": f"{1.01 * SUN_RADIUS} m"}))
 
 
 @pytest.mark.parametrize("written", ["1e400 m", "-1e9999 W", "9e300 m"])
 def test_a_pure_number_with_a_unit_is_refused_however_large(written):
-    words = refused(plain({"instrument.processing.tnr": written}))
+    words = refused(base_study_mapping({"instrument.processing.tnr": written}))
     assert "is a pure number and takes no unit" in words
 
 
 @pytest.mark.parametrize("unit", ["m*", "m/", "m//", "*m", "m*/s", "m * ", "W/m^2/nm/", "/"])
 def test_an_operator_without_a_unit_to_it_is_no_unit(unit):
     field = "target.solar_irradiance" if "W" in unit else "target.range"
-    assert f"{field}: " in refused(plain({field: f"5 {unit}"}))
+    assert f"{field}: " in refused(base_study_mapping({field: f"5 {unit}"}))
 
 
 def test_a_window_that_scipy_warns_of_or_can_not_make_is_refused():
     for window in ("chebwin(30)", "kaiser_bessel_derived(4)"):
         assert "instrument.processing.window" in refused(
-            plain({"instrument.processing.window": window})
+            base_study_mapping({"instrument.processing.window": window})
         )
-    with strictly():
-        Spec.from_mapping(plain({"instrument.processing.window": "chebwin(60)"}))
+    with warnings_as_errors():
+        GridSpec.from_mapping(base_study_mapping({"instrument.processing.window": "chebwin(60)"}))
 
 
 EXTREME = {
@@ -161,12 +163,12 @@ EXTREME = {
 @pytest.mark.parametrize("name", EXTREME)
 def test_the_ends_of_the_bounds_are_computed_without_a_warning(name, tmp_path):
     beyond = name == "a spread of 1e160 bins"
-    assert planned(tmp_path, plain(EXTREME[name])).exit_code == 2 * beyond
-    assert bool(judged(tmp_path, plain(EXTREME[name])).refusals) == beyond
+    assert planned(tmp_path, base_study_mapping(EXTREME[name])).exit_code == 2 * beyond
+    assert bool(judged(tmp_path, base_study_mapping(EXTREME[name])).refusals) == beyond
 
 
 def test_boulders_lie_within_their_square_on_a_ground_of_one_cell():
-    from sweep.spec.parts import Files
+    from sweep.spec.fields import SpecFiles
 
     rocks = {
         "kind": "boulders", "on": "ground", "law": {"kind": "power", "density": "0.1 m^-2",
@@ -177,7 +179,7 @@ def test_boulders_lie_within_their_square_on_a_ground_of_one_cell():
         {"objects": {"ground": {"kind": "plane", "size": "4 km", "reflectance": 0.1},
                      "rocks": rocks}}
     ).objects  # fmt: skip
-    facets = thing["rocks"].facets(thing["ground"].terrain(Files(".")))
+    facets = thing["rocks"].facets(thing["ground"].terrain(SpecFiles(".")))
     corners = facets.vertices + facets.origin
     corners = corners.reshape(len(facets.faces) // 96, -1, 3)  # 96 faces each
     middles = corners.mean(axis=1)
@@ -188,30 +190,30 @@ def test_boulders_lie_within_their_square_on_a_ground_of_one_cell():
 
 
 def test_boulders_beside_the_ground_are_refused():
-    from sweep.scenes.terrain import square
-    from sweep.spec.grounds import Plane
-    from sweep.spec.parts import Files
+    from sweep.scenes.terrain import square_bounds
+    from sweep.spec.fields import SpecFiles
+    from sweep.spec.ground_sections import PlaneGround
 
-    ground = Plane(kind="plane", size="100 m", reflectance=0.1).terrain(Files("."))
-    assert square(ground, centre=(45.0, 0.0), size=20.0) == (35.0, -10.0, 50.0, 10.0)
+    ground = PlaneGround(kind="plane", size="100 m", reflectance=0.1).build_terrain(SpecFiles("."))
+    assert square_bounds(ground, centre=(45.0, 0.0), size=20.0) == (35.0, -10.0, 50.0, 10.0)
     with pytest.raises(ValueError, match="there is no ground within 10 m"):
-        square(ground, centre=(90.0, 0.0), size=20.0)
+        square_bounds(ground, centre=(90.0, 0.0), size=20.0)
 
 
 def test_a_ground_is_not_blurred_by_more_than_its_own_size():
     """The filter's memory goes by its width: 1e9 m over steps of 6 m took all that there was."""
     ground = Terrain(np.arange(12.0).reshape(3, 4), (10.0, 10.0), np.zeros(3))
-    assert np.ptp(smooth(ground, width=30.0).heights) < np.ptp(ground.heights)
+    assert np.ptp(smooth(ground, standard_deviation=30.0).heights) < np.ptp(ground.heights)
     for width in (31.0, 1e9):
         with pytest.raises(ValueError, match="the ground's 30 m"):
-            smooth(ground, width=width)
+            smooth(ground, standard_deviation=width)
 
 
 def test_a_plan_measures_once_however_late_it_is(monkeypatch):
     """As of a process that is held up between two looks at the clock."""
-    monkeypatch.setattr("sweep.tasks.plan.MEASURING", 0.0)
-    found = plan(Spec.from_mapping(plain({})))
-    assert np.isfinite(found.seconds) and found.seconds > 0
+    monkeypatch.setattr("sweep.tasks.studies.study_plan.POINT_TIMING_SECONDS", 0.0)
+    found = plan_study(GridSpec.from_mapping(base_study_mapping({})))
+    assert np.isfinite(found.wall_seconds) and found.wall_seconds > 0
 
 
 @pytest.mark.parametrize("window", ["hann", "rectangular", "tukey(0.6)"])
@@ -222,7 +224,9 @@ def test_lines_that_lie_next_to_nothing_off_a_bin_are_on_it(window, width):
     A target at rest has its Doppler line on bin 0, and shifts of a narrow Gaussian line about it.
     """
     with_width, without = (
-        GridStudy(Spec.from_mapping(plain(instrument_with(window) | own))).evaluate(0)
+        GridStudy(
+            GridSpec.from_mapping(base_study_mapping(instrument_with(window) | own))
+        ).evaluate(0)
         for own in (
             {"instrument.laser.line_width": width, "effects": {"line_width": "on"}},
             {"effects": {"line_width": "off"}},

@@ -4,21 +4,21 @@ import os
 import resource
 
 import pytest
+from command_checks import check_plan_command
+from corrupted_specs import GARBAGE_TEXTS, ODD_VALUES, CorruptedSpec, corrupted_specs, to_yaml
+from fast_plans import fast_planning
+from flight_checks import check_flight
+from flight_strategies import SECTION_STRATEGIES as FLIGHT_PARTS
+from flight_strategies import flights
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
-from judging import judge
-from judging_commands import judge_command
-from judging_flights import judge_flight
-from random_flights import PARTS as FLIGHT_PARTS
-from random_flights import flights
-from random_studies import PARTS, studies
-from smaller import swiftly
-from spoilt_specs import GARBAGE, ODD, Spoilt, dumped, spoilt
-from written_values import values
+from study_checks import check_study
+from study_strategies import SECTION_STRATEGIES, studies
+from value_strategies import value_strategy
 
-from sweep.spec import SceneSpec, Spec
-from sweep.spec.parts import all_parts, rule_of
-from sweep.spec.rules import File, Numeric, Rule, Special
+from sweep.spec import GridSpec, SceneSpec
+from sweep.spec.fields import reachable_models, rule_of_field
+from sweep.spec.rules import CustomRule, FilePathRule, NumericRule, Rule
 from sweep.units import QuantityError
 
 MANY = int(os.environ.get("FUZZ", 0))
@@ -35,7 +35,7 @@ FEW = settings(
 def quick():
     if MANY:
         resource.setrlimit(resource.RLIMIT_AS, (MOST_MEMORY, MOST_MEMORY))
-    with swiftly():
+    with fast_planning():
         yield
 
 
@@ -47,38 +47,38 @@ def file(folder):
 @settings(FEW, max_examples=MANY * 2 // 3 or 24)
 @given(written=studies())
 def test_a_study_is_computed_to_sane_numbers_or_refused_in_words(file, written):
-    file.write_text(dumped(written), encoding="utf-8")
-    judge(file)
+    file.write_text(to_yaml(written), encoding="utf-8")
+    check_study(file)
 
 
 def test_a_flight_is_computed_to_sane_points_or_refused_in_words(folder):
     @settings(FEW, max_examples=MANY // 3 or 5)
     @given(written=flights(folder))
     def holds(written):
-        (folder / "now.yaml").write_text(dumped(written), encoding="utf-8")
-        judge_flight(folder / "now.yaml")
+        (folder / "now.yaml").write_text(to_yaml(written), encoding="utf-8")
+        check_flight(folder / "now.yaml")
 
     holds()
 
 
 def test_a_spoilt_spec_ends_with_exit_code_2_and_plain_words(folder):
     @settings(FEW, max_examples=MANY or 50)
-    @given(wrong=spoilt(st.one_of(studies(), flights(folder))))
+    @given(wrong=corrupted_specs(st.one_of(studies(), flights(folder))))
     def holds(wrong):
-        judge_command(folder / "spoilt.yaml", wrong)
+        check_plan_command(folder / "spoilt.yaml", wrong)
 
     holds()
 
 
-@pytest.mark.parametrize("text", GARBAGE)
+@pytest.mark.parametrize("text", GARBAGE_TEXTS)
 def test_another_text_in_a_specs_place_is_refused_in_words(file, text):
-    assert judge_command(file, Spoilt(text, "another text")).refusals
+    assert check_plan_command(file, CorruptedSpec(text, "another text")).refusals
 
 
 def _all_fields():
-    for model in all_parts(Spec, SceneSpec):
+    for model in reachable_models(GridSpec, SceneSpec):
         for name, field in model.model_fields.items():
-            rule = rule_of(field)
+            rule = rule_of_field(field)
             if rule is not None:
                 yield pytest.param(model, name, rule, id=f"{model.__name__}.{name}")
 
@@ -89,14 +89,14 @@ ALL_FIELDS = list(_all_fields())
 @pytest.mark.parametrize(("model", "name", "rule"), ALL_FIELDS)
 def test_every_number_has_a_smallest_and_a_largest_value(model, name, rule):
     """What has no bounds ends in overflows and nans: the fuzz goes to both ends of every field."""
-    number = getattr(rule, "of", rule)
-    if isinstance(number, Numeric):
+    number = getattr(rule, "element_rule", rule)
+    if isinstance(number, NumericRule):
         assert (number.at_most or number.below) and (number.at_least or number.above)
 
 
 @pytest.mark.parametrize(("model", "name", "rule"), ALL_FIELDS)
 def test_every_field_refuses_odd_values_in_words_or_takes_them(model, name, rule):
-    for written in ODD:
+    for written in ODD_VALUES:
         try:
             rule.read(written)
         except QuantityError as error:
@@ -105,14 +105,14 @@ def test_every_field_refuses_odd_values_in_words_or_takes_them(model, name, rule
 
 @pytest.mark.parametrize(("model", "name", "rule"), ALL_FIELDS)
 def test_every_rule_has_a_strategy_all_of_whose_values_it_takes(model, name, rule: Rule):
-    if isinstance(rule, File):
-        assert f"{model.__name__}.{name}" in FLIGHT_PARTS.files
+    if isinstance(rule, FilePathRule):
+        assert f"{model.__name__}.{name}" in FLIGHT_PARTS.file_by_field
         return
-    if isinstance(rule, Special):  # figures, which the fuzz leaves alone, and axes
+    if isinstance(rule, CustomRule):  # figures, which the fuzz leaves alone, and axes
         return
 
     @settings(FEW, max_examples=6)
-    @given(values(rule, 300.0))
+    @given(value_strategy(rule, 300.0))
     def holds(written):
         rule.read(written)
 
@@ -121,12 +121,17 @@ def test_every_rule_has_a_strategy_all_of_whose_values_it_takes(model, name, rul
 
 def test_tightened_bounds_are_those_of_fields_that_there_are():
     """A field that is renamed is no longer held to a small cost: this says so first."""
-    known = {f"{m.__name__}.{n}" for m in all_parts(Spec, SceneSpec) for n in m.model_fields}
+    known = {
+        f"{m.__name__}.{n}" for m in reachable_models(GridSpec, SceneSpec) for n in m.model_fields
+    }
     bases = {
         f"{base.__name__}.{n}"
-        for m in all_parts(Spec, SceneSpec)
+        for m in reachable_models(GridSpec, SceneSpec)
         for base in m.__mro__
         for n in getattr(base, "model_fields", ())
     }
-    for parts in (PARTS, FLIGHT_PARTS):
-        assert set(parts.cheap) | parts.dear | set(parts.files) <= known | bases
+    for parts in (SECTION_STRATEGIES, FLIGHT_PARTS):
+        assert (
+            set(parts.tighter_bounds) | parts.costly_defaults | set(parts.file_by_field)
+            <= known | bases
+        )

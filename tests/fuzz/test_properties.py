@@ -11,17 +11,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from base_study import INSTRUMENT
 from hypothesis import HealthCheck, Phase, assume, given, reject, settings
 from hypothesis import strategies as st
-from plain_study import INSTRUMENT
-from random_studies import drop, mended, studies
+from study_strategies import remove_field, studies, without_rejected_parts
 
 from sweep.model.effects.catalogue import EFFECTS
 from sweep.model.threshold import TNR, WAYS
-from sweep.scenes.eyepoint_arrays import from_arrays
-from sweep.spec import SceneSpec, Spec, SpecError, from_stored
-from sweep.tasks.flight_study import FlightStudy
-from sweep.tasks.grid_study import GridStudy
+from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
+from sweep.spec import GridSpec, SceneSpec, SpecError, from_stored
+from sweep.tasks.studies.flight_study import FlightStudy
+from sweep.tasks.studies.grid_study import GridStudy
 
 SOME = settings(
     derandomize=True, deadline=None, database=None, suppress_health_check=list(HealthCheck),
@@ -58,14 +58,14 @@ def steady(written, *paths):
     written["accuracy"] = {"tolerance": 0}
     written["storage"] = {"block_points": 1000}
     for path in (*RANDOM, MASKING, PEAKS, *paths):
-        drop(written, path)
-    return mended(written)
+        remove_field(written, path)
+    return without_rejected_parts(written)
 
 
 def spec_of(written):
     """The study; those that are refused are passed over."""
     try:
-        return Spec.from_mapping(written)
+        return GridSpec.from_mapping(written)
     except SpecError:
         assume(False)
 
@@ -112,7 +112,7 @@ def test_more_light_is_never_worse(path, factors, written):
     written = steady(written, *CLIPPING)
     written["instrument"]["laser"].pop("focus", None)
     if "aperture" in path:
-        drop(written, "instrument.laser.beam_waist")
+        remove_field(written, "instrument.laser.beam_waist")
     base = spec_of(written).parameters()[path] if path != "target.reflectance" else 1
     unit = {"power": " W", "aperture": " m"}.get(path.rsplit(".", 1)[-1], "")
     results = results_of(written | {"axes": {path: [f"{base * f!r}{unit}" for f in factors]}})
@@ -125,7 +125,7 @@ def test_more_light_is_never_worse(path, factors, written):
 def test_a_higher_threshold_detects_less_and_alarms_less(written):
     written = steady(written)
     for way in WAYS:  # that of the axis alone is left
-        drop(written, way)
+        remove_field(written, way)
     axes = {TNR: [0.01, 1, 5, 5.1, 30]}
     results = results_of(written | {"axes": axes})
     for name in ("pd_up", "pd_down", "pd_doppler", "pd_shot", "pfa_bin", "log10_pfa_bin"):
@@ -159,9 +159,9 @@ def test_without_movement_up_and_down_chirp_are_alike(written):
 @settings(SOME)
 @given(written=studies())
 def test_the_same_values_in_other_units_are_the_same_study_bit_for_bit(written):
-    written = mended(written)
+    written = without_rejected_parts(written)
     try:
-        spec = Spec.from_mapping(written)
+        spec = GridSpec.from_mapping(written)
     except SpecError:  # mended as far as that is known
         reject()
     again = from_stored(spec.to_json())
@@ -174,11 +174,11 @@ def test_the_same_values_in_other_units_are_the_same_study_bit_for_bit(written):
 @settings(SOME)
 @given(written=studies(), seed=st.integers(0, 2**63), blocks=st.integers(1, 7))
 def test_neither_seed_nor_blocks_change_what_is_not_random(written, seed, blocks):
-    written = mended(written)
+    written = without_rejected_parts(written)
     written.pop("draws", None)
     other = written | {"seed": seed, "storage": {"block_points": blocks}}
-    ours, theirs = results_of(written | {"storage": {}}), GridStudy(Spec.from_mapping(other))
-    where = theirs.grid.block(theirs.n_blocks - 1)
+    ours, theirs = results_of(written | {"storage": {}}), GridStudy(GridSpec.from_mapping(other))
+    where = theirs.grid.block_slices(theirs.n_blocks - 1)
     for name, values in theirs.evaluate(theirs.n_blocks - 1).items():
         assert np.array_equal(values, ours[name][where], equal_nan=values.dtype.kind == "f"), name
 
@@ -229,10 +229,15 @@ def seen_in(instrument, turn=0.0, shift=(0.0, 0.0, 0.0)):
     spec = SceneSpec.from_mapping(flight_in(instrument, turn, shift))
     study = FlightStudy(spec, Path("nowhere.zarr"))
     (eyepoints,) = study.eyepoint_studies()
-    numbers = np.arange(eyepoints.points)
-    seen = eyepoints.see(numbers)
-    shots, part = from_arrays(seen, eyepoints.weight), study.scanners["cone"].part(0)
-    return seen, study.look(part, seen, shots, study.select(part, shots, numbers), numbers)
+    numbers = np.arange(eyepoints.n_points)
+    seen = eyepoints.cast_cycles(numbers)
+    shots, part = (
+        eyepoints_from_arrays(seen, eyepoints.beamlet_weights),
+        study.scanner_grids["cone"].flight_block(0),
+    )
+    return seen, study.simulate_shots(
+        part, seen, shots, study.select_effects(part, shots, numbers), numbers
+    )
 
 
 @settings(SOME, max_examples=6)

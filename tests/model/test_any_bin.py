@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from engine import every
+from shot_helpers import parametrize_product
 
 from sweep.model import link, philox, shot, truth
 from sweep.model.alarms import first_circular, neighbour_correlation
@@ -179,7 +179,9 @@ def test_both_chirps_in_common_speckle_are_overrated_at_low_thresholds(table_4_1
 
 @pytest.mark.parametrize(
     ("name", "place", "snr"),
-    every(4, ["rectangular", "hann", "hamming"], [100.0, 100.25, 100.475], [40, 143, 1000]),
+    parametrize_product(
+        4, ["rectangular", "hann", "hamming"], [100.0, 100.25, 100.475], [40, 143, 1000]
+    ),
 )
 def test_sidelobes_of_a_fading_line_fade_with_it(name, place, snr):
     """One line in speckle: sidelobes that cross raise pd no further. Drawn, bin by bin."""

@@ -5,7 +5,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from small_scenes import flight, plate
+from small_scenes import level_plate, straight_flight
 
 from sweep.model import beam, shot
 from sweep.model.beam import Beam
@@ -186,11 +186,16 @@ def test_a_flight_sees_a_plane_as_a_grid_does(table_4_1):
         grazing_angle=np.arctan2(4, 3), reflectance=1.0, reflectance_law="lambert",
         radial_velocity=60.0,
     ) | {beam.WAIST: 5e-3, beam.FOCUS: 70.0}  # fmt: skip
-    path = flight(position=(0.0, 0.0, 40.0), velocity=(36.0, 0.0, -48.0))
+    path = straight_flight(position=(0.0, 0.0, 40.0), velocity=(36.0, 0.0, -48.0))
     eyepoints = observe(
-        np.array([0]), flight=path, scanner=fixed(np.array([[0.6, 0.0, -0.8]]), rate=1.0),
-        caster=Caster([plate()]), beam_divergence=0.0, number=37, angles=partial(beam.angles, one),
-    )  # fmt: skip
+        np.array([0]),
+        flight=path,
+        scanner=fixed(np.array([[0.6, 0.0, -0.8]]), rate=1.0),
+        caster=Caster([level_plate()]),
+        beam_divergence=0.0,
+        number=37,
+        angles=partial(beam.angles, one),
+    )
     seen = shot.statistics(prepare_eyepoints(eyepoints, one, [Surface("ground", 1.0, "lambert")]))
     grid = shot.evaluate(one)
     for name in ("snr_up", "snr_doppler", "snr_down"):
@@ -205,10 +210,10 @@ def test_leaves_before_the_focus_dim_and_shine_as_the_overlap_says(table_4_1):
     one = DEFAULTS | table_4_1(coupling="single_mode", beam_divergence=0.0, phases="incoherent") | {
         beam.WAIST: 8e-3, beam.FOCUS: 50.0
     }  # fmt: skip
-    leaf = plate(x=(0.0, 10.0), height=39.0, surface=1)
+    leaf = level_plate(x=(0.0, 10.0), height=39.0, surface=1)
     eyepoints = observe(
-        np.array([0]), flight=flight(position=(-1e-4, 0.0, 50.0)),
-        scanner=fixed(np.array([[0.0, 0.0, -1.0]]), rate=1.0), caster=Caster([plate(), leaf]),
+        np.array([0]), flight=straight_flight(position=(-1e-4, 0.0, 50.0)),
+        scanner=fixed(np.array([[0.0, 0.0, -1.0]]), rate=1.0), caster=Caster([level_plate(), leaf]),
         beam_divergence=0.0, number=109, angles=partial(beam.angles, one),
     )  # fmt: skip
     surfaces = [Surface(name, 1.0, "thesis") for name in ("ground", "leaf")]

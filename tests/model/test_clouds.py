@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from engine import DRAWS, within_5_sigma
-from small_scenes import flight, instrument, observed, plate
+from shot_helpers import DRAWS, is_within_5_sigma
+from small_scenes import level_plate, observe_shots, scene_parameters, straight_flight
 
 from sweep.model import beam, clouds, philox
 from sweep.model.clouds import cloud
@@ -29,14 +29,21 @@ def _keys(index, seed=5):
 
 def _edge(places, *, lift=0.0, velocity=(0.0, 0.0, -20.0)):
     """Nadir shots at places x [m] over ground to x = 30 m and a table, which may rise, from 0."""
-    bodies = [plate(x=(-1e3, 30.0)), plate(x=(0.0, 30.0), surface=1, height=TABLE_HEIGHT)]
+    bodies = [
+        level_plate(x=(-1e3, 30.0)),
+        level_plate(x=(0.0, 30.0), surface=1, height=TABLE_HEIGHT),
+    ]
     seen = [
-        observed(
-            flight(position=(x, 0.0, HEIGHT), velocity=velocity), bodies=bodies,
-            motion=[None, flight(position=(0.0, 0.0, 0.0), velocity=(0.0, 0.0, lift))],
+        observe_shots(
+            straight_flight(position=(x, 0.0, HEIGHT), velocity=velocity),
+            bodies=bodies,
+            body_motion=[
+                None,
+                straight_flight(position=(0.0, 0.0, 0.0), velocity=(0.0, 0.0, lift)),
+            ],
         )
         for x in places
-    ]  # fmt: skip
+    ]
     fields = [np.concatenate(values) for values in zip(*(s[:-1] for s in seen), strict=True)]
     return Eyepoints._make([*fields, seen[0].weight])
 
@@ -47,12 +54,12 @@ def _cloud(seen, parameters, **keywords):
 
 
 def _strong(table_4_1, **changes):
-    return instrument(table_4_1, **({"fft_size": 2**16} | changes))
+    return scene_parameters(table_4_1, **({"fft_size": 2**16} | changes))
 
 
 def _weak(table_4_1, tnr, power=1.6e-3):
     """Light that leaves pd between 0 and 1, and a threshold in so many deviations of noise."""
-    return instrument(table_4_1, fft_size=2**16, power=power, tnr=tnr)
+    return scene_parameters(table_4_1, fft_size=2**16, power=power, tnr=tnr)
 
 
 KIND = TRUE | FALSE_ALARM | MISPAIRED | MISREAD | SIDELOBE
@@ -138,8 +145,11 @@ def test_shots_that_are_computed_together_are_as_alone_whatever_effects_each_has
 
 
 def test_points_lie_along_the_beam_as_commanded(table_4_1):
-    seen = observed(
-        flight(), beams=cone(4, half_angle=0.4), index=np.arange(8), jitter=PointingJitter(1e-3, 1)
+    seen = observe_shots(
+        straight_flight(),
+        beams=cone(4, half_angle=0.4),
+        index=np.arange(8),
+        jitter=PointingJitter(1e-3, 1),
     )
     got = _cloud(seen, _strong(table_4_1))
     apart = got["position"][:, 0, 0] - seen.position
@@ -152,9 +162,9 @@ def test_points_lie_along_the_beam_as_commanded(table_4_1):
 
 def test_two_laws_in_one_footprint_scatter_each_their_own(table_4_1):
     """Equal parts of a tilted beam on two plates at one height: the powers' ratio is cos(i)."""
-    bodies = [plate(y=(-1e4, 0.0)), plate(y=(0.0, 1e4), surface=1)]
+    bodies = [level_plate(y=(-1e4, 0.0)), level_plate(y=(0.0, 1e4), surface=1)]
     beams = cone(1, half_angle=np.radians(60.0))
-    seen = observed(flight(), bodies=bodies, beams=beams)
+    seen = observe_shots(straight_flight(), bodies=bodies, beams=beams)
     shots = prepare_eyepoints(
         seen, _strong(table_4_1), [Surface("a", 0.1, "lommel_seeliger"), Surface("b", 0.1)]
     )
@@ -185,7 +195,7 @@ def test_a_shot_that_sees_nothing_has_the_false_alarms_of_noise_alone(table_4_1,
     assert (got["flags"][:, :, 1:] == 0).all()
     there = got["flags"][:, :, 0] > 0
     assert (got["flags"][:, :, 0][there] & KIND == FALSE_ALARM).all()
-    assert within_5_sigma(there.sum(axis=1), chance**2).all()
+    assert is_within_5_sigma(there.sum(axis=1), chance**2).all()
     assert (got["surface"] == -1).all()
     for name in ("true_range", "true_radial_velocity", "pd"):
         assert np.isnan(got[name]).all(), name
@@ -213,7 +223,7 @@ def test_dropouts_of_two_surfaces_have_their_probabilities(table_4_1, method):
     stronger = counts.argmax(axis=0)
     assert set(stronger) == {0, 1}
     for place, surface in ((0, stronger), (1, 1 - stronger)):
-        assert within_5_sigma(counts[surface, [0, 1]], both[:, place], slack).all()
+        assert is_within_5_sigma(counts[surface, [0, 1]], both[:, place], slack).all()
 
 
 @METHODS
@@ -239,7 +249,7 @@ def test_points_are_as_many_as_peaks_and_false_alarms_make_them(table_4_1, metho
     points = (got["flags"][0] > 0).sum(axis=1)
     expected = tails[0] * tails[1]
     for k in range(1, min(4, len(expected)) + 1):
-        assert within_5_sigma((points >= k).sum(), expected[k] if k < len(expected) else 0.0)
+        assert is_within_5_sigma((points >= k).sum(), expected[k] if k < len(expected) else 0.0)
     assert expected[2] > 0.01
     if place == ON_GROUND:
         # what is neither the true pair nor missing holds a false peak; a false peak takes a true
@@ -343,8 +353,10 @@ def test_each_shot_has_air_of_its_own_that_all_of_its_draws_see(table_4_1, law):
     number = 3000
     air = {"atmosphere.turbulence": "uniform", "atmosphere.structure_constant": 3e-14,
            "atmosphere.scintillation_law": law, "atmosphere.path": "level"}  # fmt: skip
-    p = instrument(table_4_1, fft_size=2**12) | air
-    seen = observed(flight(position=(0.0, 0.0, 300.0)), number=1).some(np.zeros(number, int))
+    p = scene_parameters(table_4_1, fft_size=2**12) | air
+    seen = observe_shots(straight_flight(position=(0.0, 0.0, 300.0)), number=1).some(
+        np.zeros(number, int)
+    )
     effects = set(CORE) - {"signal_shot_noise"}
     still = _cloud(seen.some([0]), p, effects=effects)["snr_up"][0]
     found = _cloud(seen, p, effects=effects | {"scintillation"}, draws=2)
@@ -362,10 +374,12 @@ def test_each_shot_has_air_of_its_own_that_all_of_its_draws_see(table_4_1, law):
 
 def test_a_turning_beam_is_received_beside_where_it_was_sent(table_4_1):
     """Of the echo exp(-2 d^2 / (w_T^2 + w_L^2)) is left, d what the axis moves by meanwhile."""
-    p = DEFAULTS | instrument(table_4_1, fft_size=2**12, coupling="single_mode")
+    p = DEFAULTS | scene_parameters(table_4_1, fft_size=2**12, coupling="single_mode")
     p["instrument.laser.beam_waist"] = 5e-3
     scanner = LineScan(0.4, 40.0, 1e4)
-    seen = observed(flight(position=(0.0, 0.0, HEIGHT)), scanner=scanner, index=[300], number=1)
+    seen = observe_shots(
+        straight_flight(position=(0.0, 0.0, HEIGHT)), scanner=scanner, index=[300], number=1
+    )
     rate, far = seen.turn_rate[0], seen.range[0]
     found, straight = (
         _cloud(seen, p, effects=(*set(CORE) - {"signal_shot_noise"}, *more))["snr_up"][0]

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from engine import DRAWS
 from scipy.spatial.transform import Rotation
-from small_scenes import flight, instrument, observed, plate
+from shot_helpers import DRAWS
+from small_scenes import level_plate, observe_shots, scene_parameters, straight_flight
 
 from sweep.model import navigation, philox
 from sweep.model.clouds import cloud
@@ -14,7 +14,7 @@ from sweep.model.geometry.scanner import BeamCycle, PointingJitter, cone, corner
 from sweep.model.navigation import EXCLUDED, SOLVED, UNDETERMINED, WITHHELD, solve
 from sweep.model.outputs import NAVIGATION
 from sweep.model.pairing import FALSE_ALARM, TRUE, UNCONFIRMED
-from sweep.spec.scene import Navigation
+from sweep.spec.scene_sections import Navigation
 
 MOVING = np.array([12.0, -7.0, -85.0])
 THREE, FOUR = cone(3, half_angle=np.radians(22.5), azimuth=0.2), corners(np.radians(22.5))
@@ -56,8 +56,10 @@ def _seen(beams, *, number=6, path=None, rate=2.0, interval=None, **keywords):
     """Shots of some cycles over level ground."""
     each = len(beams)
     scanner = BeamCycle(beams, [list(range(each))], rate, interval)
-    path = flight(position=(0.0, 0.0, 900.0), velocity=MOVING) if path is None else path
-    return observed(path, scanner=scanner, index=np.arange(number * each), number=1, **keywords)
+    path = straight_flight(position=(0.0, 0.0, 900.0), velocity=MOVING) if path is None else path
+    return observe_shots(
+        path, scanner=scanner, index=np.arange(number * each), number=1, **keywords
+    )
 
 
 def _solved(seen, points, beams, ground_slope=0.0, **keywords):
@@ -75,7 +77,7 @@ def test_true_points_give_the_mean_velocity_and_the_altitude_at_the_start(beams)
     A relative rounding of 2e-16 in ranges and velocities, times condition numbers under 10.
     """
     attitude = Fixed(Rotation.from_euler("xyz", [0.1, -0.2, 0.7]).as_quat(scalar_first=True))
-    path = flight((3.0, 4.0, 900.0), MOVING, attitude, acceleration=(3.0, -6.0, 9.0))
+    path = straight_flight((3.0, 4.0, 900.0), MOVING, attitude, acceleration=(3.0, -6.0, 9.0))
     seen = _seen(beams, path=path)
     got = _solved(seen, _points(seen, draws=2), beams, test_level=0.001)
     each = seen.velocity.reshape(6, -1, 3)
@@ -166,9 +168,9 @@ def test_a_false_beam_is_found_among_sixteen_and_noticed_among_four():
 def test_the_grounds_slope_and_relief_are_passed_on():
     """Free, the plane through sloping ground fits; held level, it does not; relief adds to it."""
     tilted = Rotation.from_euler("y", 0.2)
-    path = flight((0.0, 0.0, 900.0), (0.0, 0.0, 0.0))
-    rest = flight((0.0, 0.0, 0.0), attitude=Fixed(tilted.as_quat(scalar_first=True)))
-    seen = _seen(FOUR, path=path, bodies=[plate()], motion=[rest])
+    path = straight_flight((0.0, 0.0, 900.0), (0.0, 0.0, 0.0))
+    rest = straight_flight((0.0, 0.0, 0.0), attitude=Fixed(tilted.as_quat(scalar_first=True)))
+    seen = _seen(FOUR, path=path, bodies=[level_plate()], motion=[rest])
     points = _points(seen)
     free, usual, held, contradicted = (
         _solved(seen, points, FOUR, ground_slope=slope, relief=relief)
@@ -176,7 +178,7 @@ def test_the_grounds_slope_and_relief_are_passed_on():
             (1e7, 0.0), (Navigation().ground_slope, 0.0), (0.0, 0.0), (0.0, 7.0)
         )
     )  # fmt: skip
-    level = _seen(FOUR, path=path, bodies=[plate()])
+    level = _seen(FOUR, path=path, bodies=[level_plate()])
     rough = _solved(level, _points(level), FOUR, ground_slope=0.0, relief=7.0)
     np.testing.assert_allclose(free["altitude"], 900.0, rtol=1e-12)
     # As a study has it if it says nothing: off by far less than it states.
@@ -219,7 +221,7 @@ def _flown(table_4_1, beams, *, draws=DRAWS, method="probabilities", **changes):
     """Eyepoints and cloud of one cycle, and the velocity of its platform."""
     seen = _seen(beams, number=1, interval=0.0)
     keys = philox.point_keys(np.arange(float(len(beams)))[:, None], domain="cycles", seed=8)
-    parameters = instrument(table_4_1, **({"fft_size": 2**16, "window": "hann"} | changes))
+    parameters = scene_parameters(table_4_1, **({"fft_size": 2**16, "window": "hann"} | changes))
     points = cloud(
         seen, parameters=parameters, surfaces=[Surface("ground", 0.1)], keys=keys, draws=draws,
         method=method, returns=2,
@@ -300,7 +302,7 @@ def test_jitter_spreads_velocity_and_altitude_as_stated():
     Standard errors of beams then are sigma |v_perp| and sigma R tan(angle).
     """
     sigma, number = 2e-4, 5000
-    path = flight(velocity=(60.0, -20.0, 0.0))
+    path = straight_flight(velocity=(60.0, -20.0, 0.0))
     seen = _seen(
         FOUR, number=number, path=path, rate=number / 9.9, interval=0.0,
         jitter=PointingJitter(sigma, 4),

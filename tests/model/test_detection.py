@@ -6,8 +6,8 @@ from functools import partial
 import mpmath
 import numpy as np
 import pytest
-from engine import prepared
 from scipy import stats
+from shot_helpers import prepare_single_category
 
 from sweep.model import shot, truth
 from sweep.model.accuracy import AUTOMATIC
@@ -157,7 +157,7 @@ def test_evaluate_reports_what_brute_force_finds_in_the_truths_spectrum(window, 
             fft_size=1024, tnr=4.0, beamlets=19, leakage_floor=0.0, window=window,
             beam_divergence=1e-3, **changes,
         )  # fmt: skip
-        shots, results = prepared(scene), shot.evaluate(scene)
+        shots, results = prepare_single_category(scene), shot.evaluate(scene)
         sigma, level = float(shots.bin_deviation[0]), float(shots.threshold[0])
         pfa, alarms = np.exp(-0.5 * (level / sigma) ** 2), {}
         for segment, name in ((0, "up"), (2, "down")):
@@ -213,7 +213,7 @@ def within_five_sigma(rate, probability, draws):
 @pytest.mark.parametrize("window", ["rectangular", "hamming"])
 def test_noise_on_the_samples_detects_and_alarms_as_often_as_said(window, table_4_1):
     scene = table_4_1(fft_size=256, beamlets=3, tnr=3.0, window=window, range=1800.0)
-    shots, results = prepared(scene), shot.evaluate(scene)
+    shots, results = prepare_single_category(scene), shot.evaluate(scene)
     record = sum(truth.analytic_record(shots, 0, 0, b, range_walk=False).real for b in range(3))
     rng = np.random.default_rng(51)
     noise = rng.normal(scale=np.sqrt(shots.noise_variance[0]), size=(DRAWS, 256))

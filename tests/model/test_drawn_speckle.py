@@ -8,17 +8,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from drawn_shots import (
-    EFFECTS,
-    LANDER,
+from scatterer_shots import (
+    COMPARED_EFFECTS,
+    LANDER_PARAMETERS,
     draw_shots,
-    facet_of,
+    point_facet,
+    prepare_single_category,
     searched_bins,
-    shots_of,
-    with_threshold,
+    with_signal_over_threshold,
 )
-from engine import every, keys
-from small_scenes import flight, observed
+from shot_helpers import make_point_keys, parametrize_product
+from small_scenes import observe_shots, straight_flight
 
 from sweep.model import beam, speckle_lines
 from sweep.model.clouds import cloud
@@ -41,7 +41,9 @@ def slope(table_4_1, angle, *, ratio, **changes):
         "target.radial_velocity": 6.0, "target.reflectance_law": "thesis",
         PROCESSING + "window": "hann", PROCESSING + "tnr": 10.0,
     }  # fmt: skip
-    return with_threshold(DEFAULTS | table_4_1() | LANDER | own | changes, ratio)
+    return with_signal_over_threshold(
+        DEFAULTS | table_4_1() | LANDER_PARAMETERS | own | changes, ratio
+    )
 
 
 def flown(p, method, draws):
@@ -50,8 +52,8 @@ def flown(p, method, draws):
     along = np.array([np.cos(angle), 0.0, -np.sin(angle)])
     nearer = np.array([-np.sin(angle), 0.0, -np.cos(angle)])  # towards the facet's near side
     velocity = p["target.radial_velocity"] * along + p["target.transverse_velocity"] * nearer
-    seen = observed(
-        flight(position=tuple(-distance * along), velocity=tuple(velocity)),
+    seen = observe_shots(
+        straight_flight(position=tuple(-distance * along), velocity=tuple(velocity)),
         beams=along[None],
         angles=lambda far: beam.angles(p, np.where(np.isfinite(far), far, 1.0)),
     )
@@ -61,19 +63,19 @@ def flown(p, method, draws):
         seen,
         parameters=DEFAULTS | instrument | {sun: p[sun], "footprint.speckle": "developed"},
         surfaces=[Surface("ground", p["target.reflectance"], p["target.reflectance_law"])],
-        keys=keys(1),
+        keys=make_point_keys(1),
         draws=draws,
         method=method,
-        effects=EFFECTS,
+        effects=COMPARED_EFFECTS,
         returns=1,
     )
 
 
 def scatterers_reported(p, draws, seed):
     """Detection of all segments of drawn shots of scatterers, and range and velocity reported."""
-    shots = shots_of(p)
+    shots = prepare_single_category(p)
     # Points are reported for the start of the shot: what the beam slides until then is corrected.
-    resting = replace(facet_of(p, shots), slide=0.0)
+    resting = replace(point_facet(p, shots), footprint_slide_speed=0.0)
     drawn = draw_shots(p, shots, draws=draws, seed=seed, facet=resting)
     tables = interpolator(shots.window, shots.fft_size)
     places, detected = {}, np.ones(draws, bool)
@@ -124,7 +126,7 @@ def test_drawn_bins_have_the_mean_power_and_the_correlation_of_the_closed_form(s
         middle[segment] = -off
         drawn.append(
             speckle_lines.drawn_speckle(
-                fan, 0, middle, (0, 1), key=keys(1)[0], draws=np.arange(number)
+                fan, 0, middle, (0, 1), key=make_point_keys(1)[0], draws=np.arange(number)
             )[:, 0]
         )
     one, other = drawn
@@ -214,7 +216,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize(("case", "rule"), every(3, CASES, ["peak_bin", "any_bin"]))
+@pytest.mark.parametrize(("case", "rule"), parametrize_product(3, CASES, ["peak_bin", "any_bin"]))
 def test_places_wander_as_those_of_scatterers(case, rule, table_4_1):
     angle, changes = CASES[case]
     p = slope(table_4_1, angle, ratio=10.0, **{PROCESSING + "detection": rule}, **changes)
@@ -233,7 +235,9 @@ def test_places_wander_as_those_of_scatterers(case, rule, table_4_1):
 
 @pytest.mark.parametrize(
     ("angle", "rule", "method"),
-    every(5, [5, 7, 10, 20, 30, 60, 90], ["peak_bin", "any_bin"], ["probabilities", "noise"]),
+    parametrize_product(
+        5, [5, 7, 10, 20, 30, 60, 90], ["peak_bin", "any_bin"], ["probabilities", "noise"]
+    ),
 )
 def test_points_on_slopes_are_as_good_as_they_say(angle, rule, method, table_4_1):
     """Standard deviations of scores over draws of detected, confirmed points.
@@ -268,7 +272,7 @@ def test_errors_of_whole_spectra_on_slopes_are_those_of_the_other_methods(table_
 def test_three_segments_of_a_shot_are_detected_together(table_4_1):
     """Up and down without Doppler are rare, as all see much the same speckle."""
     p = slope(table_4_1, 60, ratio=1.3, **{PROCESSING + "tnr": 10.0})
-    shots, draws = shots_of(p), 8000
+    shots, draws = prepare_single_category(p), 8000
     detected, _, _ = scatterers_reported(p, draws, seed=3)
     error = np.sqrt(detected.mean() * (1 - detected.mean()) / draws)
     assert shots.detection == "peak_bin"
@@ -304,7 +308,7 @@ def shot_at_random(table_4_1, number):
     return slope(table_4_1, rng.uniform(12, 90), ratio=float(rng.uniform(0.8, 3.0)), **changes)
 
 
-@pytest.mark.parametrize("number", every(5, range(24)))
+@pytest.mark.parametrize("number", parametrize_product(5, range(24)))
 def test_methods_agree_on_how_often_what_is_detected(number, table_4_1):
     p, draws = shot_at_random(table_4_1, number), 6000
     shares = {}

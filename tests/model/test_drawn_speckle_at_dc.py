@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from test_drawn_speckle import PROCESSING, flown, scatterers_reported
 from test_speckle_at_dc import BIN_WIDTH, HOVER, RANGE_BEAT, at_doppler
-from test_speckle_on_slopes import with_threshold
+from test_speckle_on_slopes import with_signal_over_threshold
 
 from sweep.model.effects.catalogue import DEFAULTS
 from sweep.model.pairing import UNCONFIRMED
@@ -17,7 +17,7 @@ def hover(table_4_1, bins, *, ratio=1.6, **changes):
     """Parameters of a lidar above level ground whose Doppler frequency is so many bins."""
     high = {PROCESSING + "tnr": 10.0}  # no false alarms, of which methods list different numbers
     p = at_doppler(DEFAULTS | table_4_1() | HOVER | high | changes, bins * BIN_WIDTH)
-    return with_threshold(p, ratio)
+    return with_signal_over_threshold(p, ratio)
 
 
 def shares(p, method, draws):

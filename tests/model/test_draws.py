@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from engine import keys
+from shot_helpers import make_point_keys
 
 from sweep.model.effects.catalogue import CORE
 from sweep.model.outputs import DRAW_OUTPUTS, ERROR_OUTPUTS, OUTPUTS
@@ -36,7 +36,7 @@ def test_detections_and_false_alarms_have_their_probabilities(table_4_1, method)
     parameters = _points(table_4_1, tnr=7.0)
     outputs = evaluate(parameters)
     assert ((outputs["pd_up"] > 0.02) & (outputs["pd_up"] < 0.98)).sum() >= 2
-    counts = simulate(parameters, CORE, keys=keys(6), batch_sizes=[DRAWS], method=method)
+    counts = simulate(parameters, CORE, keys=make_point_keys(6), batch_sizes=[DRAWS], method=method)
     for segment in ("up", "down", "doppler", "shot"):
         found = counts[f"n_detected_{segment}"][:, 0]
         assert _within_5_sigma(found, outputs[f"pd_{segment}"]).all(), segment
@@ -51,7 +51,9 @@ def test_direct_detection_draws_no_doppler_detection(table_4_1):
         "target.range": np.array([20.0]),
     }
     for method in ("probabilities", "noise"):
-        counts = simulate(parameters, CORE, keys=keys(1), batch_sizes=[50], method=method)
+        counts = simulate(
+            parameters, CORE, keys=make_point_keys(1), batch_sizes=[50], method=method
+        )
         assert counts["n_detected_doppler"].sum() == 0
         assert counts["n_detected_up"].sum() == 50
 
@@ -84,10 +86,12 @@ def test_counts_over_random_effects_have_the_means_over_their_draws(effects, met
         "footprint.beamlets": 7,
     }
     chosen, draws = (*CORE, *effects), 1500
-    found = simulate(parameters, chosen, keys=keys(6), batch_sizes=[1000, 500], method=method)
+    found = simulate(
+        parameters, chosen, keys=make_point_keys(6), batch_sizes=[1000, 500], method=method
+    )
     names = ("pd_up", "pd_doppler", "pd_down", "pd_shot", "alarm")
     table = {name: np.empty((6, draws)) for name in names}
-    for point, number, shots in realise(parameters, chosen, keys=keys(6), draws=draws):
+    for point, number, shots in realise(parameters, chosen, keys=make_point_keys(6), draws=draws):
         outputs = statistics(shots)
         quiet = (1 - outputs["pfa_segment"]) * (1 - outputs["p_leakage_up"])
         for name, values in (outputs | {"alarm": 1 - quiet}).items():
@@ -109,7 +113,7 @@ def test_batches_split_the_same_draws(method, random, table_4_1):
     parameters = _points(table_4_1, tnr=6.0) | UNSTEADY
     parameters |= {"instrument.processing.fft_size": 4096, "instrument.laser.power": 1.5}
     parameters |= {"footprint.beamlets": 7, "target.grazing_angle": np.linspace(0.3, 1.5, 6)}
-    arguments = {"keys": keys(6), "method": method}
+    arguments = {"keys": make_point_keys(6), "method": method}
     effects = (*CORE, *random)
     whole = simulate(parameters, effects, batch_sizes=[300], **arguments)
     parts = simulate(parameters, effects, batch_sizes=[100, 150, 50], **arguments)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import yaml
 from scipy.spatial.transform import Rotation
-from small_scenes import flight, observed
+from small_scenes import observe_shots, straight_flight
 
 import sweep
 from sweep.model import philox
@@ -14,7 +14,7 @@ from sweep.model.error_floor import ErrorFloor, stray
 from sweep.model.geometry.scanner import BeamCycle
 from sweep.model.navigation import solve
 from sweep.model.pairing import TRUE
-from sweep.scenes.eyepoint_arrays import to_arrays
+from sweep.scenes.eyepoint_arrays import eyepoints_to_arrays
 from sweep.spec import SceneSpec
 
 DRAWS = 20_000
@@ -68,8 +68,8 @@ def test_standard_errors_are_those_of_an_instrument_that_takes_its_errors_for_no
 def _flown(cycles=2):
     """Shots of four beams over level ground, one cycle after the other."""
     scanner = BeamCycle(BEAMS, [[0, 1, 2, 3]], 5.0, 0.0)
-    path = flight(position=(0.0, 0.0, 900.0), velocity=MOVING)
-    return observed(path, scanner=scanner, index=np.arange(4 * cycles), number=1)
+    path = straight_flight(position=(0.0, 0.0, 900.0), velocity=MOVING)
+    return observe_shots(path, scanner=scanner, index=np.arange(4 * cycles), number=1)
 
 
 def _points(seen, draws, noise=0.0):
@@ -142,7 +142,7 @@ def test_velocity_and_altitude_stray_by_their_covariances(floor):
     """And residuals show the pointing and the vibration alone."""
     seen = _flown(1)
     found = _strayed(seen, _points(seen, DRAWS, noise=1.0), floor)
-    got = solve(to_arrays(seen), found, shots_a_cycle=4, ground_slope=0.0, floor=floor)
+    got = solve(eyepoints_to_arrays(seen), found, shots_a_cycle=4, ground_slope=0.0, floor=floor)
     off, stated = got["velocity"][0] - MOVING, got["velocity_covariance"][0].mean(axis=0)
     variance = np.diag(stated)
     spread = np.sqrt((np.outer(variance, variance) + stated**2) / DRAWS)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from engine import every
+from shot_helpers import parametrize_product
 
 from sweep.model import estimators
 from sweep.model.detectors import Setting, taper
@@ -92,7 +92,7 @@ def errors(name, shape, length, decibel):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize(("window", "decibel"), every(3, WINDOWS, [20, 30, 40, 60]))
+@pytest.mark.parametrize(("window", "decibel"), parametrize_product(3, WINDOWS, [20, 30, 40, 60]))
 def test_the_most_likely_frequency_reaches_the_bound(window, decibel):
     """Within 10 %, whatever the window; and without bias, by 5 standard errors."""
     error, bound, _ = errors("maximum_likelihood", *window, decibel)

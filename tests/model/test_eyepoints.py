@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from small_scenes import flight, observed, plate
+from small_scenes import level_plate, observe_shots, straight_flight
 
 from sweep.model.eyepoints import observe, prepare_eyepoints
 from sweep.model.footprint import beamlets
@@ -17,7 +17,7 @@ GROUND = Surface("ground", 0.1, "lambert")
 
 
 def square(half):
-    return plate((-half, half), (-half, half))
+    return level_plate((-half, half), (-half, half))
 
 
 @pytest.mark.parametrize("tilt", [0.0, 30.0, 75.0])
@@ -27,7 +27,7 @@ def test_level_ground_gives_what_the_flat_plane_gives(table_4_1, tilt, phases):
     beams = cone(1, half_angle=np.radians(tilt), azimuth=np.pi / 2)
     pattern = "sunflower" if phases == "coherent" else "hexagonal"
     along = 45.0 * beams[0]  # no velocity across the beam: no Doppler spread, as on the plane
-    seen = observed(flight(velocity=along), beams=beams, number=109, pattern=pattern)
+    seen = observe_shots(straight_flight(velocity=along), beams=beams, number=109, pattern=pattern)
     parameters = table_4_1(phases=phases, reflectance_law="lambert")
     shots = prepare_eyepoints(seen, parameters, [GROUND])
     got = statistics(shots)
@@ -65,9 +65,9 @@ def test_velocity_across_the_footprint_of_a_spinning_target_is_that_of_its_point
     """Each beamlet meets the turned plate n.P = 0 at P and closes with u.(V - omega x P)."""
     omega, place, own = np.array([0.05, 0.3, 0.1]), np.array([8.0, -3.0, 300.0]), (2.0, 1.0, -9.0)
     path = ConstantAcceleration((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 10.0)
-    seen = observed(
-        flight(position=place, velocity=own), bodies=[square(400.0)],
-        motion=[Flight(path, Spin(omega))], index=[when], number=37, beam_divergence=0.02,
+    seen = observe_shots(
+        straight_flight(position=place, velocity=own), bodies=[square(400.0)],
+        body_motion=[Flight(path, Spin(omega))], index=[when], number=37, beam_divergence=0.02,
     )  # fmt: skip
     here = place + when * np.array(own)
     u = _beamlet_vectors(Rotation.identity(), np.array([0.0, 0.0, -1.0]), 0.02, 37)
@@ -94,8 +94,8 @@ def test_velocity_across_the_footprint_of_a_tumbling_instrument_is_that_of_its_a
     omega, arm = np.array([0.04, -0.08, 0.3]), np.array([3.0, 1.5, -0.5])
     own, place = np.array([20.0, -5.0, -30.0]), np.array([0.0, 0.0, 900.0])
     beam = np.array([np.sin(0.3), 0.0, -np.cos(0.3)])
-    seen = observed(
-        flight(position=place, velocity=own, attitude=Spin(omega), lever_arm=arm),
+    seen = observe_shots(
+        straight_flight(position=place, velocity=own, attitude=Spin(omega), lever_arm=arm),
         beams=beam[None], index=[when], number=37, beam_divergence=0.02,
     )  # fmt: skip
     turn = Rotation.from_rotvec(omega * when)
@@ -116,14 +116,14 @@ def test_velocity_across_the_footprint_of_a_tumbling_instrument_is_that_of_its_a
 
 def test_beamlets_that_miss_send_nothing_back(table_4_1):
     edge = [square(5.0)]
-    seen = observed(
-        flight(position=(5.0, 0.0, 100.0)), bodies=edge, beam_divergence=2e-3, number=109
+    seen = observe_shots(
+        straight_flight(position=(5.0, 0.0, 100.0)), bodies=edge, beam_divergence=2e-3, number=109
     )
     hit = seen.surface[0] >= 0
     assert 0 < hit.sum() < hit.size
     shots = prepare_eyepoints(seen, table_4_1(), [GROUND])
     assert (shots.amplitude[0][~hit] == 0).all() and (shots.amplitude[0][hit] > 0).all()
-    assert not observed(flight(position=(50.0, 0.0, 100.0)), bodies=edge).seen.any()
+    assert not observe_shots(straight_flight(position=(50.0, 0.0, 100.0)), bodies=edge).seen.any()
 
 
 def _turning(rate, arm=(0.0, 0.0, 0.0)):
@@ -154,7 +154,7 @@ def test_acceleration_and_approach_are_what_the_next_shots_see(name, body):
     """Central differences over 0.1 ms to either side, on level ground or on moving."""
     flight, scanner = MOTIONS[name]
     seen = observe(
-        np.array([99, 100, 101]), flight=flight, scanner=scanner, caster=Caster([plate()]),
+        np.array([99, 100, 101]), flight=flight, scanner=scanner, caster=Caster([level_plate()]),
         beam_divergence=50e-6, number=7, bodies=None if body is None else [_body(body)],
     )  # fmt: skip
     grows = (seen.radial_velocity[2] - seen.radial_velocity[0]) / 2e-4
@@ -166,5 +166,7 @@ def test_acceleration_and_approach_are_what_the_next_shots_see(name, body):
 
 
 def test_a_shot_that_sees_nothing_has_no_acceleration():
-    seen = observed(flight(), beams=np.array([[0, 0, 1.0], [0, 0, -1.0]]), index=(0, 1))
+    seen = observe_shots(
+        straight_flight(), beams=np.array([[0, 0, 1.0], [0, 0, -1.0]]), index=(0, 1)
+    )
     assert np.isnan(seen.acceleration).tolist() == np.isnan(seen.approach).tolist() == [True, False]

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from engine import every
 from scipy import stats
+from shot_helpers import parametrize_product
 
 from sweep.model.estimators import beat_deviation, carrier_to_noise_ratio
 from sweep.model.interpolation import (
@@ -77,7 +77,8 @@ def test_the_rectangular_and_hann_windows_have_their_closed_forms():
 
 
 @pytest.mark.parametrize(
-    ("name", "ratio"), every(4, ["hann", "hamming", "rectangular"], [30.0, 100.0, 1000.0])
+    ("name", "ratio"),
+    parametrize_product(4, ["hann", "hamming", "rectangular"], [30.0, 100.0, 1000.0]),
 )
 def test_errors_under_noise_are_those_reported_and_no_less_than_the_bound(name, ratio):
     """White noise in the time domain; the spread around known places over an SNR of 30 dB.

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 from scipy.spatial.transform import Rotation
-from small_scenes import DOWN, flight, observed
+from small_scenes import DOWNWARD_BEAM, observe_shots, straight_flight
 
 from sweep.model.geometry.platform import Nadir
 from sweep.model.geometry.scanner import BeamCycle, PointingJitter, cone, corners
@@ -25,9 +25,9 @@ def _scan(beams):
 
 def _seen(beams, jitter=JITTER, **keywords):
     """Shots at a plane 1000 m below, of a platform in level flight."""
-    path = flight(velocity=keywords.pop("velocity", (0.0, 0.0, 0.0)))
+    path = straight_flight(velocity=keywords.pop("velocity", (0.0, 0.0, 0.0)))
     keywords = {"index": np.arange(SHOTS), "number": 1} | keywords
-    return observed(path, scanner=_scan(beams), jitter=jitter, **keywords)
+    return observe_shots(path, scanner=_scan(beams), jitter=jitter, **keywords)
 
 
 def _alike(values, deviation):
@@ -66,8 +66,8 @@ def test_the_turn_has_three_independent_normal_angles_about_the_bodys_axes():
 def test_no_jitter_and_a_jitter_of_nothing_are_the_same_bit_for_bit():
     index = np.arange(50)
     for a, b in zip(
-        _seen(DOWN, None, index=index, number=7),
-        _seen(DOWN, PointingJitter(0.0, 1), index=index, number=7),
+        _seen(DOWNWARD_BEAM, None, index=index, number=7),
+        _seen(DOWNWARD_BEAM, PointingJitter(0.0, 1), index=index, number=7),
         strict=True,
     ):
         np.testing.assert_array_equal(a, b)
@@ -75,7 +75,8 @@ def test_no_jitter_and_a_jitter_of_nothing_are_the_same_bit_for_bit():
 
 def test_the_seed_decides_on_the_angles():
     one, same, other = (
-        _seen(DOWN, PointingJitter(SIGMA, seed), index=np.arange(2000)).range for seed in (1, 1, 2)
+        _seen(DOWNWARD_BEAM, PointingJitter(SIGMA, seed), index=np.arange(2000)).range
+        for seed in (1, 1, 2)
     )
     np.testing.assert_array_equal(one, same)
     assert abs(np.corrcoef(one, other)[0, 1]) < 5 / np.sqrt(2000)
@@ -83,10 +84,10 @@ def test_the_seed_decides_on_the_angles():
 
 @pytest.mark.parametrize("some", [[33, 7, 20], [5]])
 def test_any_stretch_of_a_flight_is_the_same_bit_for_bit(some):
-    path = flight(velocity=(1.0, 2.0, -50.0), attitude=Nadir(0.3))
+    path = straight_flight(velocity=(1.0, 2.0, -50.0), attitude=Nadir(0.3))
     scanner = BeamCycle(corners(np.radians(22.5)), [[0, 1, 2, 3]], 4.0)
     whole, part = (
-        observed(path, scanner=scanner, index=index, jitter=JITTER)
+        observe_shots(path, scanner=scanner, index=index, jitter=JITTER)
         for index in (np.arange(36), np.array(some))
     )
     for all_shots, alone in zip(whole[:-1], part[:-1], strict=True):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import mpmath
 import numpy as np
 import pytest
-from engine import difference, every, run_of_bins, shape_of
+from shot_helpers import detected_window, line_shape_of_window, magnitude_error, parametrize_product
 
 from sweep.model import truth
 from sweep.model.crossings import (
@@ -65,11 +65,13 @@ def strengths_without_moments(places, degree, generator):
     return strength - np.linalg.pinv(powers) @ (powers @ strength)
 
 
-@pytest.mark.parametrize(("name", "half"), every(3, EVERY_FORM, [0.05, 1.0, 2.5, 6.0, 40.0]))
+@pytest.mark.parametrize(
+    ("name", "half"), parametrize_product(3, EVERY_FORM, [0.05, 1.0, 2.5, 6.0, 40.0])
+)
 def test_no_sum_of_strengths_is_seen_from_afar_as_more_than_it_is_said_to_be(name, half):
     """Against the transforms of all of them, from the table's end to the record's other end."""
     generator, shape = np.random.default_rng(5), window(name, 4096)
-    _, form, sizes, _, _ = shape_of(shape, 4096)
+    _, form, sizes, _, _ = line_shape_of_window(shape, 4096)
     room, gained = np.zeros((ROOM, LEAST_WIDTH)), []
     for degree in (0, 1, 2, 4, 6):
         places = np.append(generator.uniform(-half, half, 10), [-half, half])
@@ -90,7 +92,7 @@ def test_no_sum_of_strengths_is_seen_from_afar_as_more_than_it_is_said_to_be(nam
 
 @pytest.mark.parametrize(
     ("allowed", "window", "phases"),
-    every(5, [1e-1, 1e-3, 1e-6], EVERY_FORM, ["coherent", "incoherent"]),
+    parametrize_product(5, [1e-1, 1e-3, 1e-6], EVERY_FORM, ["coherent", "incoherent"]),
 )
 def test_leakage_far_from_the_lines_is_left_out_up_to_what_is_allowed(
     table_4_1, window, phases, allowed
@@ -188,7 +190,8 @@ def drawn_bundles(table_4_1, seed, fft_size, apart):
 
 
 @pytest.mark.parametrize(
-    ("fft_size", "image"), every(3, [64, 100, 255, 512, 1023, 2048, 4099, 8192], [True, False])
+    ("fft_size", "image"),
+    parametrize_product(3, [64, 100, 255, 512, 1023, 2048, 4099, 8192], [True, False]),
 )
 def test_leakage_of_bundles_wide_and_narrow_in_ffts_of_any_size(table_4_1, fft_size, image):
     """As wide as the band, or all past DC or Nyquist, where only images make spectra even."""
@@ -236,10 +239,10 @@ def test_bins_of_the_run_are_those_of_the_record(table_4_1, window, phases):
             | {"target.range": r, "target.grazing_angle": grazing, "target.radial_velocity": v}
         )
         for segment in range(3):
-            low, found = run_of_bins(shots, segment)
+            low, found = detected_window(shots, segment)
             exact = truth.spectrum(shots, 0, segment, range_walk=False)
             assert 5 < found.size < 4097
-            error = difference(shots, found, exact[low : low + found.size], exact.max())
+            error = magnitude_error(shots, found, exact[low : low + found.size], exact.max())
             assert error < (1e-9 if shots.incoherent else 1e-10)
 
 

@@ -9,8 +9,8 @@ from functools import lru_cache, partial
 
 import numpy as np
 import pytest
-from engine import keys, prepared
-from small_scenes import flight, instrument, observed, plate
+from shot_helpers import make_point_keys, prepare_single_category
+from small_scenes import level_plate, observe_shots, scene_parameters, straight_flight
 
 from sweep.model import leaked_peaks as leaked
 from sweep.model import outputs
@@ -73,19 +73,23 @@ def _flown(table_4_1, method, scene, *, draws=0, first=0):
     changes, further = SCENES[scene]
     changes = dict(changes)
     height, effects = changes.pop("height", HEIGHT), changes.pop("effects", CORE)
-    roof = plate(x=(0.0, 30.0), surface=1, height=ROOF)
-    bodies = [plate(x=(-1e3, 30.0)), *[roof] * changes.pop("roof", True)]
-    path = flight(position=(0.0, 0.0, height), velocity=(0.0, 0.0, -20.0))
+    roof = level_plate(x=(0.0, 30.0), surface=1, height=ROOF)
+    bodies = [level_plate(x=(-1e3, 30.0)), *[roof] * changes.pop("roof", True)]
+    path = straight_flight(position=(0.0, 0.0, height), velocity=(0.0, 0.0, -20.0))
     law = {"fft_size": SIZE, "detection": "any_bin", "noise_bins": "correlated"}
-    table = instrument(table_4_1, **law, **changes)
+    table = scene_parameters(table_4_1, **law, **changes)
     speckle = "developed" if "fading" in effects else "none"
     starts = {"probabilities": 0, "noise": 10**6, "spectra": 2 * 10**6}
     got = cloud(
-        observed(path, bodies=bodies, number=7),
+        observe_shots(path, bodies=bodies, number=7),
         parameters=DEFAULTS | table | further | {"footprint.speckle": speckle},
-        surfaces=[Surface("ground", 0.5), Surface("roof", 0.005)], keys=keys(1), effects=effects,
-        method=method, draws=draws or NUMBER[method], first_draw=starts[method] + first,
-    )  # fmt: skip
+        surfaces=[Surface("ground", 0.5), Surface("roof", 0.005)],
+        keys=make_point_keys(1),
+        effects=effects,
+        method=method,
+        draws=draws or NUMBER[method],
+        first_draw=starts[method] + first,
+    )
     return got, height
 
 
@@ -202,7 +206,7 @@ def _raised(leaks, level, draws, *, fading=None, room=3):
     """Bins and sizes of the peaks raised in the up-chirp, a list for each draw."""
     found = []
     bins, ratios = np.empty(room, np.int64), np.empty(room)
-    (key,), tables = keys(1), interpolator(window("hamming", SIZE), SIZE)
+    (key,), tables = make_point_keys(1), interpolator(window("hamming", SIZE), SIZE)
     for d in range(draws):
         ratios[:] = 0.0
         factors = np.ones((1, 3)) if fading is None else np.full((1, 3), fading[d])
@@ -223,7 +227,7 @@ def _largest(bins, magnitudes, level):
 def _one_shot(table_4_1, effects=CORE, further=(), **changes):
     law = {"fft_size": SIZE, "beamlets": 1, "radial_velocity": 20.0, "window": "hamming"}
     parameters = DEFAULTS | table_4_1(**law | {"range": 400.0} | changes) | dict(further)
-    return prepared(parameters, effects)
+    return prepare_single_category(parameters, effects)
 
 
 @pytest.mark.parametrize("fades", [False, True])

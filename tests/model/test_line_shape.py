@@ -4,7 +4,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from engine import every, shape_of
+from shot_helpers import line_shape_of_window, parametrize_product
 
 from sweep.model.lines import IM, LEAST_WIDTH, PLACE, RE
 from sweep.model.segments import tangents
@@ -44,7 +44,9 @@ def seen(sizes, power, places, weights, first, count, shape):
     return room[F_RE, :count] + (0 if power else 1j * room[F_IM, :count])
 
 
-@pytest.mark.parametrize(("name", "sizes", "power"), every(7, WINDOWS, SIZES, [False, True]))
+@pytest.mark.parametrize(
+    ("name", "sizes", "power"), parametrize_product(7, WINDOWS, SIZES, [False, True])
+)
 def test_lines_show_what_direct_sums_over_the_record_show(name, sizes, power):
     """Near the lines and far from them, on either side; no line exceeds its envelope."""
     fft_size = sizes[0]
@@ -52,7 +54,7 @@ def test_lines_show_what_direct_sums_over_the_record_show(name, sizes, power):
     bins = np.unique([*range(-28, 29, 3), *rng.integers(-fft_size // 2, fft_size // 2, 9)])
     for drift in (0.0, 0.7, 4.0, 30.0):
         phase = partial(wandering, drift)
-        shape = shape_of(window(name, sizes[1]), fft_size, power=power, phase=phase)
+        shape = line_shape_of_window(window(name, sizes[1]), fft_size, power=power, phase=phase)
         places = rng.uniform(-3, 3, 2)
         weights = rng.normal(size=2) + 1j * rng.normal(size=2)
         weights = abs(weights) + 0j if power else weights
@@ -74,7 +76,7 @@ def test_lines_show_what_direct_sums_over_the_record_show(name, sizes, power):
 def test_no_bin_beyond_a_lines_reach_is_above_the_level(name, drift):
     size = 4096
     phase = partial(wandering, drift)
-    _, form, _, shift, _ = shape_of(window(name, size), size, phase=phase)
+    _, form, _, shift, _ = line_shape_of_window(window(name, size), size, phase=phase)
     y = np.linspace(-2048, 2048, 2 * 4096 + 1)
     exact = abs(
         np.fft.fft(

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import scipy.constants
-from engine import prepared
 from scipy import integrate
 from scipy.constants import c as speed_of_light
+from shot_helpers import prepare_single_category
 
 from sweep.model import constants, link, shot
 from sweep.model.footprint import beamlets
@@ -43,7 +43,7 @@ def test_each_beamlets_echo_falls_with_the_square_of_its_own_range(law, table_4_
     far = np.sin(0.03) / down
     lit = down > 0
     assert far[lit].max() / far[lit].min() > 2
-    shots = prepared(scene)
+    shots = prepare_single_category(scene)
     power = (shots.beat_scale * shots.amplitude[0] / (2 * 1.1 * GAIN)) ** 2 / 1e-3
     scattered = down / np.pi if law == "lambert" else 1 / (2 * np.pi)
     expected = 0.1 * np.pi * 0.0125**2 * share * scattered / (100.0 * far) ** 2
@@ -155,7 +155,7 @@ def test_direct_detection_ignores_the_local_oscillator_and_has_no_shot_noise_of_
 ):
     scene = thermally_limited | {"instrument.receiver.local_oscillator_power": 5.0}
     assert direct_snr(scene) == direct_snr(thermally_limited)
-    assert "local_oscillator_shot" not in prepared(scene).noise_sources
+    assert "local_oscillator_shot" not in prepare_single_category(scene).noise_sources
 
 
 # Noise
@@ -163,7 +163,7 @@ def test_direct_detection_ignores_the_local_oscillator_and_has_no_shot_noise_of_
 
 def test_the_noise_of_table_4_1_by_hand(table_4_1):
     """1.4099e-13 A^2 shot, 1.21e-14 detector, 6.25e-16 amplifier; times (7 kohm)^2."""
-    shots = prepared(table_4_1(fft_size=1024))
+    shots = prepare_single_category(table_4_1(fft_size=1024))
     by_hand = {"local_oscillator_shot": 1.40992e-13, "detector": 1.21e-14, "amplifier": 6.25e-16}
     for source, current in by_hand.items():
         assert shots.noise_sources[source] == pytest.approx(current * 4.9e7, rel=1e-5)
@@ -175,8 +175,8 @@ def test_the_noise_of_table_4_1_by_hand(table_4_1):
 
 
 def test_gain_raises_light_and_detector_noise_as_its_square_and_leaves_the_amplifiers(table_4_1):
-    plain = prepared(table_4_1(fft_size=1024, solar_irradiance=2.6e8)).noise_sources
-    gained = prepared(
+    plain = prepare_single_category(table_4_1(fft_size=1024, solar_irradiance=2.6e8)).noise_sources
+    gained = prepare_single_category(
         table_4_1(fft_size=1024, solar_irradiance=2.6e8, apd_gain=10.0, excess_noise_factor=4.0)
     ).noise_sources
     factors = {
@@ -192,7 +192,7 @@ def test_the_narrower_stage_sets_the_bandwidth_of_the_noise(table_4_1):
         stages = {"detector_bandwidth": detector, "amplifier_bandwidth": amplifier}
         assert electrical_bandwidth(stages) == 100e6
         scene = table_4_1(detector_bandwidth=detector, amplifier_bandwidth=amplifier, fft_size=1024)
-        shot_noise = prepared(scene).noise_sources["local_oscillator_shot"]
+        shot_noise = prepare_single_category(scene).noise_sources["local_oscillator_shot"]
         assert shot_noise == pytest.approx(1.40992e-13 / 4 * 4.9e7, rel=1e-5)
 
 

@@ -5,7 +5,12 @@ Records of scatterers share the mean echo power, the noise and the threshold wit
 
 import numpy as np
 import pytest
-from drawn_shots import LANDER, drawn_detections, shots_of, with_threshold
+from scatterer_shots import (
+    LANDER_PARAMETERS,
+    draw_segment_detections,
+    prepare_single_category,
+    with_signal_over_threshold,
+)
 
 from sweep.model.effects.catalogue import DEFAULTS
 from sweep.model.look_speckle import LookSpeckle
@@ -68,11 +73,13 @@ FAST = ("eight powers, fast and down", "three votes of eight", "any two of power
     "case", [pytest.param(case, marks=[pytest.mark.slow] * (case not in FAST)) for case in CASES]
 )
 def test_looks_detect_as_often_as_in_drawn_records(case, table_4_1):
-    p = DEFAULTS | table_4_1() | LANDER | SLOPE | CASES[case]
-    p = with_threshold(p | {NUMBER: 1}, 1.3 if COMBINE not in p else 1.0) | {NUMBER: p[NUMBER]}
-    shots = shots_of(p)
+    p = DEFAULTS | table_4_1() | LANDER_PARAMETERS | SLOPE | CASES[case]
+    p = with_signal_over_threshold(p | {NUMBER: 1}, 1.3 if COMBINE not in p else 1.0) | {
+        NUMBER: p[NUMBER]
+    }
+    shots = prepare_single_category(p)
     outputs = statistics(shots)
-    found = drawn_detections(p, shots, draws=DRAWS, seed=len(case))
+    found = draw_segment_detections(p, shots, draws=DRAWS, seed=len(case))
     shot = found["up"] & found["down"]
     if shots.any_two:
         shot = sum(found[segment].astype(int) for segment in found) >= 2
@@ -166,19 +173,19 @@ def test_tails_keep_their_digits():
 
 
 def test_a_target_at_rest_has_one_speckle_in_all_looks(table_4_1):
-    p = DEFAULTS | table_4_1() | LANDER | SLOPE | {NUMBER: 8}
+    p = DEFAULTS | table_4_1() | LANDER_PARAMETERS | SLOPE | {NUMBER: 8}
     p |= {"target.radial_velocity": 0.0, "target.transverse_velocity": 0.0}
-    shots = shots_of(p)
+    shots = prepare_single_category(p)
     assert shots.look_speckle is None
-    common = statistics(shots_of(p | {SPECKLE: "common"}))
+    common = statistics(prepare_single_category(p | {SPECKLE: "common"}))
     np.testing.assert_array_equal(statistics(shots)["pd_shot"], common["pd_shot"])
 
 
 def test_added_amplitudes_of_looks_lose_what_their_speckle_does_not_share(table_4_1):
     """The mean amplitude of N looks: sum of mu over all pairs of looks, over N^2, of the power."""
-    p = DEFAULTS | table_4_1() | LANDER | SLOPE | {NUMBER: 6, COMBINE: "coherent"}
-    moving, common = shots_of(p), shots_of(p | {SPECKLE: "common"})
-    powers = shots_of(p | {COMBINE: "power"}).look_speckle.by_lag[0, 0]
+    p = DEFAULTS | table_4_1() | LANDER_PARAMETERS | SLOPE | {NUMBER: 6, COMBINE: "coherent"}
+    moving, common = prepare_single_category(p), prepare_single_category(p | {SPECKLE: "common"})
+    powers = prepare_single_category(p | {COMBINE: "power"}).look_speckle.by_lag[0, 0]
     lag = np.arange(6) - np.arange(6)[:, None]
     shared = np.abs(powers)[np.abs(lag)].sum() / 36
     assert 0.05 < shared < 0.9

@@ -5,10 +5,10 @@ from functools import partial
 import numpy as np
 import pytest
 from drawn_leakage import drawn_leakage
-from engine import every, keys
 from scipy import special, stats
+from shot_helpers import make_point_keys, parametrize_product
 
-from sweep.analysis.shot_figure import simulated
+from sweep.analysis.shot_spectra import simulate_shot
 from sweep.model import alarms, truth, window
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.crossings import leave_out_joined
@@ -203,13 +203,13 @@ LOOKS = {
 }
 
 
-@pytest.mark.parametrize("name", every(3, LOOKS))
+@pytest.mark.parametrize("name", parametrize_product(3, LOOKS))
 def test_whole_spectra_are_detected_as_often_as_the_closed_form_says(scene, name):
     changes, effects = LOOKS[name]
     given = dimmed(scene(**changes), ("image", *effects), 0.6)
     told, number = evaluate(given, ("image", *effects)), 600
     found = simulate(
-        given, ("image", *effects), keys=keys(1), batch_sizes=[number], method="spectra"
+        given, ("image", *effects), keys=make_point_keys(1), batch_sizes=[number], method="spectra"
     )
     for which in ("pd_up", "pd_down", "pd_shot"):
         p = told[which][0]
@@ -225,7 +225,7 @@ def test_the_threshold_of_a_segment_holds_its_alarms(scene):
     for changes in ({NUMBER: 8}, {NUMBER: 8, COMBINE: "binary", VOTES: 4}):
         given = base | changes | {PFA_SEGMENT: 0.2, "instrument.processing.window": "hamming"}
         given |= {"target.reflectance": 1e-12}
-        found = simulate(given, (), keys=keys(1), batch_sizes=[600], method="spectra")
+        found = simulate(given, (), keys=make_point_keys(1), batch_sizes=[600], method="spectra")
         share = found["n_false_alarm_up"].sum() / 600
         assert share == pytest.approx(0.2, abs=5 * np.sqrt(0.16 / 600) + 0.03 * 0.2)
 
@@ -236,7 +236,7 @@ def test_estimates_err_by_the_root_of_the_number_of_looks_less(scene):
     for number in (1, 16):
         given = quiet | {NUMBER: number}
         found[number] = simulate(
-            given, ("image",), keys=keys(1), batch_sizes=[250], method="spectra"
+            given, ("image",), keys=make_point_keys(1), batch_sizes=[250], method="spectra"
         )
     one, many = (found[number] for number in (1, 16))
     assert one["range_bound"] == pytest.approx(4 * many["range_bound"], rel=1e-12)
@@ -283,7 +283,9 @@ def test_a_lasers_line_width_costs_coherent_looks_their_share(scene):
     assert left == pytest.approx(share, rel=1e-9)
     given = dimmed(given, effects, 0.6)
     told, number = evaluate(given, effects)["pd_up"][0], 800
-    found = simulate(given, effects, keys=keys(1), batch_sizes=[number], method="spectra")
+    found = simulate(
+        given, effects, keys=make_point_keys(1), batch_sizes=[number], method="spectra"
+    )
     error = 5 * np.sqrt(told * (1 - told) / number)
     assert found["pd_up"][0] == pytest.approx(told, abs=error + 0.02)
     without = evaluate(given, ("image",))["pd_up"][0]
@@ -377,7 +379,7 @@ def test_drawn_rough_surfaces_fade_in_looks_as_the_closed_form_says(scene):
     light = dimmed(smooth, ("image", "fading"), 0.6)["instrument.laser.power"]
     told = evaluate(smooth | {"instrument.laser.power": light}, ("image", "fading"))
     found = simulate(
-        rough | {"instrument.laser.power": light}, ("image", "speckle"), keys=keys(1),
+        rough | {"instrument.laser.power": light}, ("image", "speckle"), keys=make_point_keys(1),
         batch_sizes=[6000], method="probabilities",
     )  # fmt: skip
     for which in ("pd_up", "pd_shot"):
@@ -390,9 +392,9 @@ def test_drawn_rough_surfaces_fade_in_looks_as_the_closed_form_says(scene):
 def test_pictures_show_what_is_held_against_the_threshold(scene, combine):
     """Noise: mean power within 5 sigma, a spread less by the root of 16; or any bin's votes."""
     given = scene(**{NUMBER: 16, COMBINE: combine, VOTES: 4, "target.reflectance": 1e-12})
-    shot = simulated(given, ("image",), seed=3)
-    power = (shot.segments[0].magnitude[8:-8] / shot.deviation) ** 2 / 2
-    looks = shot.prepared.looks
+    shot = simulate_shot(given, ("image",), seed=3)
+    power = (shot.segments[0].magnitude[8:-8] / shot.bin_deviation) ** 2 / 2
+    looks = shot.prepared_shot.looks
     if combine == "binary":  # the fourth largest of 16
         levels = np.array([0.8, 1.4, 2.0])
         told = looks.steady(np.zeros(3), np.sqrt(2 * levels))[0]

@@ -4,9 +4,9 @@ from math import radians
 
 import numpy as np
 import pytest
-from engine import DRAWS, within_5_sigma
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, ncx2
+from shot_helpers import DRAWS, is_within_5_sigma
 
 from sweep.model import navigation
 from sweep.model.geometry.scanner import cone, corners, squares
@@ -137,7 +137,7 @@ def _drawn_with_alarm(beams, *, alarm, beam, seed):
 def test_true_beams_are_suspect_at_the_stated_level(beams):
     found = _drawn_with_alarm(beams, alarm=0.0, beam=0, seed=6)
     suspect = (found.status != SOLVED).sum()
-    assert suspect == 0 if len(beams) == 3 else within_5_sigma(suspect, LEVEL)
+    assert suspect == 0 if len(beams) == 3 else is_within_5_sigma(suspect, LEVEL)
 
 
 @pytest.mark.parametrize("beam", [0, 13])
@@ -145,7 +145,7 @@ def test_a_false_alarm_among_sixteen_beams_is_found_and_left_out(beam):
     """Far out, it is found whenever the fit without it passes: in 1 - level of the draws."""
     found = _drawn_with_alarm(SIXTEEN, alarm=50.0, beam=beam, seed=7)
     right = (found.status == EXCLUDED) & ~found.used[:, beam]
-    assert within_5_sigma(right.sum(), 1 - LEVEL)
+    assert is_within_5_sigma(right.sum(), 1 - LEVEL)
     assert (found.status[~right] == WITHHELD).all() and np.isnan(found.value[~right]).all()
     assert (found.used[right].sum(axis=1) == 15).all() and (found.degrees[right] == 12).all()
     left = np.delete(SIXTEEN, beam, axis=0)
@@ -161,7 +161,7 @@ def test_the_power_of_the_test_is_that_of_the_noncentral_chi_square():
     power = ncx2.sf(chi2.isf(LEVEL, 13), 13, (alarm / 0.01) ** 2 * (1 - leverage))
     assert 0.3 < power < 0.95
     found = _drawn_with_alarm(SIXTEEN, alarm=alarm, beam=beam, seed=8)
-    assert within_5_sigma((found.status != SOLVED).sum(), power)
+    assert is_within_5_sigma((found.status != SOLVED).sum(), power)
     excluded = found.status == EXCLUDED
     assert (~found.used[excluded, beam]).mean() > 0.8  # a beam told from 15 others: 1/16 by chance
 
@@ -180,7 +180,7 @@ def test_level_ground_tells_which_of_four_ranges_is_false():
     known = {"direction": FOUR, "range": ranges, "standard_error": 0.1, "level": LEVEL}
     found = altitude(**known, slope=0.0)
     right = (found.status == EXCLUDED) & (found.used.argmin(axis=1) == np.arange(DRAWS) % 4)
-    assert within_5_sigma(right.sum(), 1 - LEVEL)
+    assert is_within_5_sigma(right.sum(), 1 - LEVEL)
     assert (altitude(**known).status == WITHHELD).all()  # a free plane has one degree of freedom
 
 

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 import pytest
-from small_scenes import flight, instrument, observed
+from small_scenes import observe_shots, scene_parameters, straight_flight
 
 from sweep.model import philox
 from sweep.model.clouds import cloud
@@ -18,8 +18,8 @@ from sweep.model.geometry.mesh import Surface
 from sweep.model.geometry.platform import Spin
 from sweep.model.geometry.scanner import cone, corners, fixed
 from sweep.model.navigation import solve
-from sweep.scenes.eyepoint_arrays import to_arrays
-from sweep.scenes.meshes import clean
+from sweep.scenes.eyepoint_arrays import eyepoints_to_arrays
+from sweep.scenes.meshes import clean_mesh
 
 MOVING = {*CORE, "range_walk", "acceleration", "segment_motion"}
 CYCLES, DRAWS = 8, 150
@@ -40,13 +40,13 @@ def slanting(slope):
     """A plane that rises along x, and half as much along y."""
     x, y = np.array([-1e5, 1e5, 1e5, -1e5]), np.array([-1e5, -1e5, 1e5, 1e5])
     corner = np.column_stack([x, y, slope * x + slope / 2 * y])
-    return clean(corner, np.array([[0, 1, 2], [0, 2, 3]]), 0)[0]
+    return clean_mesh(corner, np.array([[0, 1, 2], [0, 2, 3]]), 0)[0]
 
 
 def solved(parameters, descent, slope, beams, *, interval=0.0, floor=None, stated=None, **ground):
     """Mean NEES / 3 of velocity, rms of altitude's z, and mean errors of each cycle's altitude."""
-    seen = observed(
-        flight(**({"position": (0.0, 0.0, 800.0)} | descent)), bodies=[slanting(slope)],
+    seen = observe_shots(
+        straight_flight(**({"position": (0.0, 0.0, 800.0)} | descent)), bodies=[slanting(slope)],
         scanner=fixed(beams, rate=2.0, interval=interval), index=range(CYCLES * len(beams)),
         beam_divergence=1e-7,
     )  # fmt: skip
@@ -58,7 +58,7 @@ def solved(parameters, descent, slope, beams, *, interval=0.0, floor=None, state
     if floor is not None:
         points = stray(points, seen, floor, keys=keys, seed=1)
     stated = {} if floor is None and stated is None else {"floor": stated or floor}
-    shots = to_arrays(seen)
+    shots = eyepoints_to_arrays(seen)
     found = solve(
         shots, points, shots_a_cycle=len(beams), **({"ground_slope": 10.0} | ground), **stated
     )
@@ -79,7 +79,7 @@ def solved(parameters, descent, slope, beams, *, interval=0.0, floor=None, state
 @pytest.mark.parametrize(("beams", "interval"), [(FOUR, 0.0), (FOUR, 0.05), (THREE, 0.0)])
 def test_errors_are_as_large_as_stated(table_4_1, descent, slope, beams, interval):
     """And a slope moves the altitude by no more than noise does: 14 mm if it is not known."""
-    parameters = instrument(table_4_1)
+    parameters = scene_parameters(table_4_1)
     nees, score, height = solved(parameters, DESCENTS[descent], slope, beams, interval=interval)
     assert nees == pytest.approx(1, abs=0.2)
     assert score == pytest.approx(1, abs=0.2)
@@ -92,7 +92,7 @@ def test_segments_of_other_slopes_are_paired_and_solved_alike(table_4_1, down_sl
 
     Lines that drift within a record add an error that is steady over draws, of the stated size.
     """
-    parameters = instrument(table_4_1) | {"instrument.chirp.down_slope": down_slope}
+    parameters = scene_parameters(table_4_1) | {"instrument.chirp.down_slope": down_slope}
     for name in ("oblique", "braking hard", "turning"):
         nees, score, height = solved(parameters, DESCENTS[name], 0.3, FOUR)
         assert nees == pytest.approx(1, abs=0.25)
@@ -101,14 +101,16 @@ def test_segments_of_other_slopes_are_paired_and_solved_alike(table_4_1, down_sl
 
 
 def test_ground_that_is_known_to_be_level_needs_no_slope(table_4_1):
-    nees, score, _ = solved(instrument(table_4_1), DESCENTS["oblique"], 0.0, FOUR, ground_slope=0.0)
+    nees, score, _ = solved(
+        scene_parameters(table_4_1), DESCENTS["oblique"], 0.0, FOUR, ground_slope=0.0
+    )
     assert nees == pytest.approx(1, abs=0.2)
     assert score == pytest.approx(1, abs=0.2)
 
 
 def test_where_relief_is_stated_velocities_have_the_error_of_unknown_slopes(table_4_1):
     """A turn of 60 deg/s slides the beams by hundreds of m/s: more than noise."""
-    parameters, turning = instrument(table_4_1), DESCENTS["turning"]
+    parameters, turning = scene_parameters(table_4_1), DESCENTS["turning"]
     plane, *_ = solved(parameters, turning, 0.2, FOUR)
     rough, *_ = solved(parameters, turning, 0.2, FOUR, relief=1e-6)
     assert plane == pytest.approx(1, abs=0.2) and rough < 0.5
@@ -119,7 +121,11 @@ def test_a_stated_floor_is_in_the_covariances(table_4_1, name):
     """Errors that one draw has in common are 150 numbers: their mean square is known to 12 %."""
     size = {"pointing": 2e-4, "clock": 1e-5, "wavelength": 1e-5}.get(name, 0.05)
     nees, score, _ = solved(
-        instrument(table_4_1), DESCENTS["oblique"], 0.2, FOUR, floor=ErrorFloor(**{name: size})
+        scene_parameters(table_4_1),
+        DESCENTS["oblique"],
+        0.2,
+        FOUR,
+        floor=ErrorFloor(**{name: size}),
     )
     assert nees == pytest.approx(1, abs=0.3)
     assert score == pytest.approx(1, abs=0.2)

@@ -4,7 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_scenes import DOWN, flight, instrument, observed, plate
+from small_scenes import (
+    DOWNWARD_BEAM,
+    level_plate,
+    observe_shots,
+    scene_parameters,
+    straight_flight,
+)
 
 from sweep.model.eyepoints import LEAST_RANGE, prepare_eyepoints
 from sweep.model.geometry.mesh import Surface
@@ -14,7 +20,7 @@ from sweep.model.looks import Looks
 from sweep.model.preparation import require_finite
 from sweep.model.search import _keep_echoes
 from sweep.model.unsupported import UnsupportedShot
-from sweep.scenes.meshes import clean
+from sweep.scenes.meshes import clean_mesh
 
 NOT_FINITE = [np.nan, np.inf, -np.inf]
 
@@ -40,8 +46,8 @@ def test_probabilities_of_several_records_end_for_levels_that_are_not_finite():
 
 
 def shots(table_4_1):
-    eyes = observed(flight(), index=range(3))
-    return prepare_eyepoints(eyes, instrument(table_4_1), [Surface("plate", 0.1)])
+    eyes = observe_shots(straight_flight(), index=range(3))
+    return prepare_eyepoints(eyes, scene_parameters(table_4_1), [Surface("plate", 0.1)])
 
 
 @pytest.mark.parametrize("value", NOT_FINITE)
@@ -64,15 +70,15 @@ def test_a_shot_with_a_number_that_is_not_finite_is_named(table_4_1, name, words
 
 
 def test_a_path_that_leaves_the_numbers_is_refused_with_the_shot_and_its_time():
-    away = flight(velocity=(1e308, 0.0, 0.0), duration=1e3)
+    away = straight_flight(velocity=(1e308, 0.0, 0.0), duration=1e3)
     with (
         np.errstate(all="ignore"),
         pytest.raises(UnsupportedShot, match=r"shot 4, at time 4 s, has a position that is not"),
     ):
-        observed(away, index=(0, 1, 4))
+        observe_shots(away, index=(0, 1, 4))
 
 
-WALL = clean(
+WALL = clean_mesh(
     np.array([[0.0, -50, -50], [0, 50, -50], [0, 50, 50], [0, -50, 50]]),
     np.array([[0, 1, 2], [0, 2, 3]]),
     0,
@@ -83,21 +89,23 @@ FORWARD = np.array([[1.0, 0.0, 0.0]])
 @pytest.mark.parametrize("x", [0.0, -1e-12, -0.5 * LEAST_RANGE])
 def test_an_instrument_in_the_plane_of_a_wall_sees_what_is_beyond_it(table_4_1, x):
     far = replace(WALL, origin=WALL.origin + np.array([200.0, 0.0, 0.0]))
-    eyes = observed(flight((x, 0.0, 0.0)), bodies=[WALL, far], beams=FORWARD)
+    eyes = observe_shots(straight_flight((x, 0.0, 0.0)), bodies=[WALL, far], beams=FORWARD)
     np.testing.assert_allclose(eyes.range, 200.0, rtol=1e-4)
-    prepare_eyepoints(eyes, instrument(table_4_1), [Surface("wall", 0.1)])
-    alone = observed(flight((x, 0.0, 0.0)), bodies=[WALL], beams=FORWARD)
+    prepare_eyepoints(eyes, scene_parameters(table_4_1), [Surface("wall", 0.1)])
+    alone = observe_shots(straight_flight((x, 0.0, 0.0)), bodies=[WALL], beams=FORWARD)
     assert not alone.seen.any()
 
 
 def test_a_surface_farther_than_the_least_range_is_hit():
-    eyes = observed(flight((-2 * LEAST_RANGE, 0.0, 0.0)), bodies=[WALL], beams=FORWARD)
+    eyes = observe_shots(
+        straight_flight((-2 * LEAST_RANGE, 0.0, 0.0)), bodies=[WALL], beams=FORWARD
+    )
     np.testing.assert_allclose(eyes.range, 2 * LEAST_RANGE)
-    low = observed(flight((0.0, 0.0, 0.1)), beams=DOWN)
+    low = observe_shots(straight_flight((0.0, 0.0, 0.1)), beams=DOWNWARD_BEAM)
     np.testing.assert_allclose(low.range, 0.1)
 
 
 def test_the_least_range_is_the_callers():
-    caster, origin = Caster(plate()), np.array([[0.0, 0.0, 0.5]])
+    caster, origin = Caster(level_plate()), np.array([[0.0, 0.0, 0.5]])
     for least, range_ in ((0.0, 0.5), (0.4, 0.5), (0.6, np.inf)):
-        assert caster.bundle(origin, DOWN[:, None], least_range=least).range == range_
+        assert caster.bundle(origin, DOWNWARD_BEAM[:, None], least_range=least).range == range_

@@ -5,7 +5,7 @@ from itertools import product
 
 import numpy as np
 import pytest
-from engine import difference, every, lines_of
+from shot_helpers import magnitude_error, parametrize_product, segment_lines
 from test_leakage import EVERY_FORM, EXEMPTED, FREQUENCY, LEAKAGE, MAGNITUDE, MISS, PD
 from test_leakage import drawn_bundles as bundles
 
@@ -54,7 +54,7 @@ def scene(table_4_1, **changes):
 
 def plain_sum(shots, i, segment, bins):
     """|X| of some bins with the folded lines' own kernels only: plain sums over the window."""
-    origin, delta, weight = lines_of(shots, i, segment)
+    origin, delta, weight = segment_lines(shots, i, segment)
     way = -1 if origin < 0 else 1
     total = np.zeros(len(bins), complex)
     for place, c in zip(delta, weight, strict=True):
@@ -65,7 +65,9 @@ def plain_sum(shots, i, segment, bins):
     return np.sqrt(total.real) if shots.incoherent else abs(total)
 
 
-@pytest.mark.parametrize(("fft_size", "window", "phases"), every(5, [512, 801], WINDOWS, PHASES))
+@pytest.mark.parametrize(
+    ("fft_size", "window", "phases"), parametrize_product(5, [512, 801], WINDOWS, PHASES)
+)
 def test_without_images_only_the_folded_lines_themselves_are_summed(
     window, phases, fft_size, table_4_1
 ):
@@ -78,7 +80,7 @@ def test_without_images_only_the_folded_lines_themselves_are_summed(
         for segment in range(3):
             bins, fast = segments.spectrum(shots, 0, segment)
             slow = plain_sum(shots, 0, segment, bins)
-            assert difference(shots, fast, slow) < (AGREEMENT if shots.incoherent else 1e-11)
+            assert magnitude_error(shots, fast, slow) < (AGREEMENT if shots.incoherent else 1e-11)
         if distance < 1:  # beats next to DC: images are there, and were left out
             both = find(replace(shots, image=True))[1, MAGNITUDE]
             assert abs(both / find(shots)[1, MAGNITUDE] - 1) > 1e-3
@@ -115,7 +117,7 @@ def test_without_leakage_detections_stay_what_they_are(table_4_1, fft_size, imag
 
 @pytest.mark.parametrize(
     ("sizes", "window", "phases"),
-    every(3, [(2**13, 600e6), (5000, 6e6)],
+    parametrize_product(3, [(2**13, 600e6), (5000, 6e6)],
           [*EVERY_FORM, "kaiser(8.6)", "dpss(3)", "bartlett"], PHASES),
 )  # fmt: skip
 def test_without_leakage_every_window_detects_the_same(window, phases, sizes, table_4_1):
@@ -217,12 +219,14 @@ def test_phase_errors_and_widths_are_those_of_the_record(effects, case, window, 
         slow = exact(shots, 0, segment, width_by_hermite(shots, 0))
         peak = segments.spectrum(plain, 0, segment)[1].max()
         assert np.array_equal(bins, np.arange(shots.fft_size // 2 + 1))
-        assert difference(shots, fast, slow, peak) < AGREEMENT
+        assert magnitude_error(shots, fast, slow, peak) < AGREEMENT
 
 
 @pytest.mark.parametrize(
     ("effects", "leakage", "phases"),
-    every(5, [DRIFTING, ("line_width",), (*DRIFTING, "line_width")], [True, False], PHASES),
+    parametrize_product(
+        5, [DRIFTING, ("line_width",), (*DRIFTING, "line_width")], [True, False], PHASES
+    ),
 )
 def test_what_is_found_is_found_in_the_whole_spectrum(effects, leakage, phases, table_4_1):
     """Peak, exempt bins and groups of 40 points against all bins of their spectra."""
@@ -286,7 +290,9 @@ def test_draws_and_returns_see_what_the_spectrum_shows(effects, table_4_1):
 # What is not there, and company
 
 
-@pytest.mark.parametrize(("left_out", "phases"), every(3, [("image", "leakage"), ()], PHASES))
+@pytest.mark.parametrize(
+    ("left_out", "phases"), parametrize_product(3, [("image", "leakage"), ()], PHASES)
+)
 def test_the_company_of_points_changes_no_bit(phases, left_out, table_4_1):
     """Of points in several stretches; of their order; of one alone. All kinds of drift at once."""
     number = 2 * POINTS + 40

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from small_scenes import flight, instrument, observed, plate
+from small_scenes import level_plate, observe_shots, scene_parameters, straight_flight
 
 from sweep.model import philox
 from sweep.model.clouds import cloud
@@ -14,7 +14,7 @@ from sweep.model.geometry.platform import Spin
 from sweep.model.geometry.scanner import cone, fixed
 from sweep.model.own_motion import MotionPriors, own_motion
 from sweep.model.pairing import TRUE
-from sweep.scenes.meshes import clean
+from sweep.scenes.meshes import clean_mesh
 
 MOVING = {*CORE, "range_walk", "acceleration", "segment_motion"}
 BEAMS = cone(4, half_angle=math.radians(15))
@@ -39,7 +39,7 @@ def tilted(slope, across=None):
     """A plane that rises along x, and half as much along y unless said otherwise."""
     x, y = np.array([-1e5, 1e5, 1e5, -1e5]), np.array([-1e5, -1e5, 1e5, 1e5])
     corners = np.column_stack([x, y, slope * x + (slope / 2 if across is None else across) * y])
-    return clean(corners, np.array([[0, 1, 2], [0, 2, 3]]), 0)[0]
+    return clean_mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]), 0)[0]
 
 
 def errors_of_points(seen, parameters, effects=MOVING, **how):
@@ -61,9 +61,11 @@ def errors_of_points(seen, parameters, effects=MOVING, **how):
 def shots(motion, slope=0.0, across=None, **keywords):
     """Shots of four beams at three times of a flight, 109 beamlets each."""
     scanner = fixed(BEAMS, rate=2.0)
-    path = flight(**(FALL | motion))
+    path = straight_flight(**(FALL | motion))
     bodies = [tilted(slope, across)]
-    return observed(path, bodies=bodies, scanner=scanner, index=range(12), number=109, **keywords)
+    return observe_shots(
+        path, bodies=bodies, scanner=scanner, index=range(12), number=109, **keywords
+    )
 
 
 def is_near_one(scores, most=1.5):
@@ -77,7 +79,7 @@ def is_near_one(scores, most=1.5):
 @pytest.mark.parametrize("name", MOTIONS)
 @pytest.mark.parametrize("method", ["probabilities", "noise"])
 def test_points_of_a_moving_instrument_are_as_good_as_they_say(table_4_1, name, slope, method):
-    parameters = instrument(table_4_1, beamlets=109)
+    parameters = scene_parameters(table_4_1, beamlets=109)
     priors = MotionPriors() if slope else LEVEL_GROUND
     found = errors_of_points(shots(MOTIONS[name], slope), parameters, method=method, priors=priors)
     for _, scores in found.values():
@@ -89,13 +91,17 @@ def test_standard_errors_are_right_over_ground_of_the_stated_slopes_and_do_not_k
 
     Two slopes of each plane make its errors: 80 numbers, whose mean square is known to 16 %.
     """
-    parameters, slopes = instrument(table_4_1, beamlets=19), MotionPriors().terrain_slope
+    parameters, slopes = scene_parameters(table_4_1, beamlets=19), MotionPriors().terrain_slope
     random, squares, stated = np.random.default_rng(5), [], []
     for along, across in slopes * random.standard_normal((40, 2)):
-        seen = observed(
-            flight(**(FALL | MOTIONS["turning"])), bodies=[tilted(along, across)], number=19,
-            scanner=fixed(BEAMS, rate=2.0), index=range(4), beam_divergence=1e-7,
-        )  # fmt: skip
+        seen = observe_shots(
+            straight_flight(**(FALL | MOTIONS["turning"])),
+            bodies=[tilted(along, across)],
+            number=19,
+            scanner=fixed(BEAMS, rate=2.0),
+            index=range(4),
+            beam_divergence=1e-7,
+        )
         error, scores = errors_of_points(seen, parameters)["range"]
         squares.append((scores**2).mean())
         stated.append(np.median(error / scores / seen.range.mean()))
@@ -108,7 +114,7 @@ def test_a_wobble_of_20_deg_a_second_moves_level_ground_by_no_more_than_millimet
     """Uncorrected it is metres: 2.2 m of 3,127.5 m, stated as 6.4 mm."""
     seen = shots(MOTIONS["wobbling"])
     assert np.abs(seen.acceleration).max() > 25
-    parameters = instrument(table_4_1, beamlets=109)
+    parameters = scene_parameters(table_4_1, beamlets=109)
     (error, _), (speed, _) = errors_of_points(seen, parameters, priors=LEVEL_GROUND).values()
     assert np.abs(error).max() < 0.08 and np.median(np.abs(error)) < 0.02
     assert np.abs(speed).max() < 2e-3
@@ -117,7 +123,7 @@ def test_a_wobble_of_20_deg_a_second_moves_level_ground_by_no_more_than_millimet
 @pytest.mark.parametrize("down_slope", [-1.0, 0.5])
 @pytest.mark.parametrize("record", ["real", "complex"])
 def test_segments_of_any_slopes_are_corrected_alike(table_4_1, down_slope, record):
-    parameters = instrument(table_4_1, beamlets=109) | {
+    parameters = scene_parameters(table_4_1, beamlets=109) | {
         "instrument.chirp.down_slope": down_slope, "instrument.receiver.record": record,
     }  # fmt: skip
     for motion in ({}, {"acceleration": (0.0, 0.0, 6.0)}):
@@ -127,7 +133,7 @@ def test_segments_of_any_slopes_are_corrected_alike(table_4_1, down_slope, recor
 
 @pytest.mark.parametrize("left_out", [{"acceleration"}, {"range_walk"}, {"segment_motion"}])
 def test_only_what_is_simulated_is_corrected(table_4_1, left_out):
-    parameters = instrument(table_4_1, beamlets=109)
+    parameters = scene_parameters(table_4_1, beamlets=109)
     seen = shots(MOTIONS["turning"], 0.1)
     for _, scores in errors_of_points(seen, parameters, MOVING - left_out).values():
         is_near_one(scores)
@@ -139,13 +145,17 @@ def test_a_body_that_moves_is_not_known_and_its_errors_are_those_stated_beforeha
     Unless the spec states accelerations of targets, standard errors are too small, and must not
     come from what the scene does.
     """
-    lift = flight(position=(0.0, 0.0, 0.0), acceleration=(0.0, 0.0, 30.0))
-    seen = observed(
-        flight(**FALL), bodies=[plate()], motion=[lift], scanner=fixed(BEAMS, rate=2.0),
-        index=range(4), number=109,
-    )  # fmt: skip
+    lift = straight_flight(position=(0.0, 0.0, 0.0), acceleration=(0.0, 0.0, 30.0))
+    seen = observe_shots(
+        straight_flight(**FALL),
+        bodies=[level_plate()],
+        body_motion=[lift],
+        scanner=fixed(BEAMS, rate=2.0),
+        index=range(4),
+        number=109,
+    )
     np.testing.assert_allclose(own_motion(seen).acceleration, 0, atol=1e-9)
-    parameters = instrument(table_4_1, beamlets=109)
+    parameters = scene_parameters(table_4_1, beamlets=109)
     for acceleration, low, high in ((0.0, 50, 1000), (30.0, 0.9, 1.1), (300.0, 0.09, 0.11)):
         priors = MotionPriors(terrain_slope=0.0, target_acceleration=acceleration)
         (error, scores), _ = errors_of_points(seen, parameters, priors=priors).values()
@@ -155,12 +165,17 @@ def test_a_body_that_moves_is_not_known_and_its_errors_are_those_stated_beforeha
 
 def test_a_targets_speed_stated_beforehand_is_in_the_standard_errors(table_4_1):
     """A plate that slides by 100 m/s along a beam's azimuth, seen at 15 deg from its normal."""
-    slide = flight(position=(0.0, 0.0, 0.0), velocity=(100.0, 0.0, 0.0))
-    seen = observed(
-        flight(**FALL), bodies=[plate()], motion=[slide], scanner=fixed(BEAMS[:1], rate=2.0),
-        index=range(3), number=19, beam_divergence=1e-7,
-    )  # fmt: skip
-    parameters = instrument(table_4_1, beamlets=19)
+    slide = straight_flight(position=(0.0, 0.0, 0.0), velocity=(100.0, 0.0, 0.0))
+    seen = observe_shots(
+        straight_flight(**FALL),
+        bodies=[level_plate()],
+        body_motion=[slide],
+        scanner=fixed(BEAMS[:1], rate=2.0),
+        index=range(3),
+        number=19,
+        beam_divergence=1e-7,
+    )
+    parameters = scene_parameters(table_4_1, beamlets=19)
     scores = {}
     for speed in (0.0, 100.0):
         priors = MotionPriors(terrain_slope=0.0, target_speed=speed)
@@ -179,6 +194,6 @@ def test_known_motion_is_the_true_one_over_level_ground():
 
 
 def test_a_beam_that_looks_ahead_is_taken_to_meet_a_wall_that_faces_it():
-    seen = observed(flight(attitude=WOBBLE), beams=np.array([[1.0, 0.0, -0.01]]))
+    seen = observe_shots(straight_flight(attitude=WOBBLE), beams=np.array([[1.0, 0.0, -0.01]]))
     known = own_motion(seen)
     assert known.slip_at(np.array([1e3])).tolist() == [0.0]

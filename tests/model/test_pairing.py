@@ -4,9 +4,9 @@ import itertools
 
 import numpy as np
 import pytest
-from engine import prepared
 from hypothesis import given
 from hypothesis import strategies as st
+from shot_helpers import prepare_single_category
 
 from sweep.model import waveform
 from sweep.model.pairing import TOLERANCE, confirm, pair_peaks
@@ -75,7 +75,7 @@ def test_signed_beats_of_any_slope_confirm_each_other_at_any_range(table_4_1, do
     scene = table_4_1(fft_size=4096) | {
         "instrument.receiver.record": "complex", "instrument.chirp.down_slope": down_slope,
     }  # fmt: skip
-    shots = prepared(scene)
+    shots = prepare_single_category(scene)
     signed, third = How.of(shots, 0, False).signed, np.array(_third(shots), float)
     f_r, f_d, size = far * 4096.0, 700.0, 4096.0
     # carriers differ by 5e-6, and Doppler shifts with them by less than a hundredth of a bin

@@ -4,8 +4,8 @@ import itertools
 
 import numpy as np
 import pytest
-from engine import every
-from small_scenes import flight, instrument, observed, plate
+from shot_helpers import parametrize_product
+from small_scenes import level_plate, observe_shots, scene_parameters, straight_flight
 
 from sweep.model import philox
 from sweep.model.accuracy import Accuracy
@@ -14,7 +14,7 @@ from sweep.model.footprint import beamlets
 from sweep.model.geometry.mesh import Surface
 from sweep.model.ray_error import _roughness, folded
 from sweep.model.resolution import more_rays, rays_needed
-from sweep.scenes.meshes import clean
+from sweep.scenes.meshes import clean_mesh
 
 RAYS = Accuracy.rays
 
@@ -39,26 +39,29 @@ def _rough(spacing=0.03, size=161, relief=0.02, seed=1):
         np.stack([first, first + size, first + size + 1], axis=1),
         np.stack([first, first + size + 1, first + 1], axis=1),
     ])  # fmt: skip
-    return clean(corners, faces, 0)[0]
+    return clean_mesh(corners, faces, 0)[0]
 
 
 SCENES = {
     "rough ground": ([_rough()], 0.004),
-    "the edge of a table": ([plate(), plate(x=(0.0, 1e3), surface=1, height=7.0)], 0.00025),
+    "the edge of a table": (
+        [level_plate(), level_plate(x=(0.0, 1e3), surface=1, height=7.0)],
+        0.00025,
+    ),
 }
 """Meshes, and the way from shot to shot [m]."""
 
 
 def _seen(scene, number):
     bodies, step = SCENES[scene]
-    path = flight(
+    path = straight_flight(
         position=(-step * SHOTS / 2, 0.0, HEIGHT), velocity=(step, 0.0, 0.0), duration=1e4
     )
-    return observed(path, bodies=bodies, number=number, index=np.arange(SHOTS))
+    return observe_shots(path, bodies=bodies, number=number, index=np.arange(SHOTS))
 
 
 def _parameters(table_4_1, power=0.006):
-    return instrument(table_4_1, power=power, fft_size=2**16)
+    return scene_parameters(table_4_1, power=power, fft_size=2**16)
 
 
 def _cloud(seen, parameters, **keywords):
@@ -121,7 +124,7 @@ def test_numbers_are_whole_shells(number):
 # What they leave
 
 
-@pytest.mark.parametrize(("scene", "number"), every(4, SCENES, [19, 109, 439]))
+@pytest.mark.parametrize(("scene", "number"), parametrize_product(4, SCENES, [19, 109, 439]))
 def test_it_tells_what_far_more_rays_would_change(table_4_1, scene, number):
     """Of 99 in 100 shots at least half of it, of four in ten no more than ten times as much.
 

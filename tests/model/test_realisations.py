@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from engine import by_vectors, every, keys
-from mean_over_draws import evaluate
+from mean_over_draws import mean_statistics
 from scipy import special
+from shot_helpers import intersect_level_plane, make_point_keys, parametrize_product
 
 from sweep.model import realisations
 from sweep.model.effects import pointing_jitter, scintillation
@@ -47,7 +47,7 @@ def scene(table_4_1, **changes):
 def per_draw(parameters, effects, n, draws, first_draw=0, seeded=None):
     """Outputs of every draw by name, (n, draws)."""
     names = {name: np.full((n, draws), np.nan) for name in OUTPUTS}
-    chosen = keys(n) if seeded is None else seeded
+    chosen = make_point_keys(n) if seeded is None else seeded
     for point, draw, shots in realise(
         parameters, effects, keys=chosen, first_draw=first_draw, draws=draws
     ):
@@ -58,14 +58,14 @@ def per_draw(parameters, effects, n, draws, first_draw=0, seeded=None):
 
 def test_any_stretch_of_points_or_draws_has_the_same_bits(table_4_1, monkeypatch):
     whole = per_draw(scene(table_4_1), ALL, 4, 60)
-    means = evaluate(scene(table_4_1), ALL, keys=keys(4), draws=60)
+    means = mean_statistics(scene(table_4_1), ALL, keys=make_point_keys(4), draws=60)
     assert np.unique(whole["snr_up"]).size == 240
     late = per_draw(scene(table_4_1), ALL, 4, 20, first_draw=30)
     alone = scene(table_4_1, range=np.array([5000.0]), fft_size=4096)
-    single = per_draw(alone, ALL, 1, 60, seeded=keys(4)[3:])
+    single = per_draw(alone, ALL, 1, 60, seeded=make_point_keys(4)[3:])
     monkeypatch.setattr(realisations, "ROWS", 7)
     pieces = per_draw(scene(table_4_1), ALL, 4, 60)
-    summed = evaluate(scene(table_4_1), ALL, keys=keys(4), draws=60)
+    summed = mean_statistics(scene(table_4_1), ALL, keys=make_point_keys(4), draws=60)
     for name in OUTPUTS:
         np.testing.assert_array_equal(whole[name][:, 30:50], late[name], err_msg=name)
         np.testing.assert_array_equal(whole[name][3:], single[name], err_msg=name)
@@ -76,7 +76,9 @@ def test_any_stretch_of_points_or_draws_has_the_same_bits(table_4_1, monkeypatch
 
 def test_wide_footprints_are_cut_into_shorter_stretches(table_4_1, monkeypatch):
     monkeypatch.setattr(realisations, "BEAMLETS", 70)
-    sizes = [s.point.size for s in realise(scene(table_4_1), ALL, keys=keys(4), draws=25)]
+    sizes = [
+        s.point.size for s in realise(scene(table_4_1), ALL, keys=make_point_keys(4), draws=25)
+    ]
     assert max(sizes) == 10 and sum(sizes) == 100
 
 
@@ -85,7 +87,7 @@ STILL = [effect for effect in CORE if effect != "doppler_spread"]
 
 
 def drawn_shots(parameters, effects):
-    (stretch,) = realise(parameters, [*STILL, *effects], keys=keys(2), draws=50)
+    (stretch,) = realise(parameters, [*STILL, *effects], keys=make_point_keys(2), draws=50)
     return stretch.shots
 
 
@@ -113,7 +115,7 @@ def test_a_random_effect_that_does_nothing_leaves_every_count_as_it_is(method, t
     """Air without turbulence multiplies by exactly 1: not a number of the noise's has moved."""
     parameters = scene(table_4_1) | {"atmosphere.structure_constant": 0.0}
     parameters["instrument.processing.tnr"] = 5.0
-    chosen = {"keys": keys(4), "batch_sizes": [40, 70], "method": method}
+    chosen = {"keys": make_point_keys(4), "batch_sizes": [40, 70], "method": method}
     still = simulate(parameters, CORE, **chosen)
     drawn = simulate(parameters, [*CORE, "scintillation"], **chosen)
     for name in DRAW_OUTPUTS:
@@ -128,7 +130,7 @@ def test_a_random_effect_that_does_nothing_leaves_every_count_as_it_is(method, t
 def test_means_are_means_of_the_draws_with_their_standard_errors(table_4_1):
     parameters = scene(table_4_1)
     drawn = per_draw(parameters, ALL, 4, 300)
-    means = evaluate(parameters, ALL, keys=keys(4), draws=300)
+    means = mean_statistics(parameters, ALL, keys=make_point_keys(4), draws=300)
     assert list(means) == [*OUTPUTS, *ERROR_OUTPUTS]
     for name, values in drawn.items():
         if not name.startswith("log10"):
@@ -136,7 +138,7 @@ def test_means_are_means_of_the_draws_with_their_standard_errors(table_4_1):
     for name in ("pd_up", "pd_down", "pd_doppler", "pd_shot"):
         error = drawn[name].std(axis=1, ddof=1) / np.sqrt(300)
         np.testing.assert_allclose(means[name + "_error"], error, rtol=1e-9)
-        alone = evaluate(parameters, ALL, keys=keys(4), draws=1)
+        alone = mean_statistics(parameters, ALL, keys=make_point_keys(4), draws=1)
         assert np.isnan(alone[name + "_error"]).all()
     np.testing.assert_allclose(drawn["pd_up"] * drawn["pd_down"], drawn["pd_shot"], rtol=1e-15)
 
@@ -148,7 +150,7 @@ def test_logarithms_are_those_of_the_mean_even_where_it_underflows(tnr, table_4_
     parameters |= {"atmosphere.structure_constant": 1e-8, "target.radial_velocity": 20.0}
     effects = (*CORE, "scintillation")
     drawn = per_draw(parameters, effects, 2, 200)
-    means = evaluate(parameters, effects, keys=keys(2), draws=200)
+    means = mean_statistics(parameters, effects, keys=make_point_keys(2), draws=200)
     assert (np.ptp(drawn["log10_pfa_bin"], axis=1) > 1e-3).all()
     for name in ("pfa_bin", "pfa_segment", "pfa_shot"):
         logs = np.log(10) * drawn["log10_" + name]
@@ -159,7 +161,8 @@ def test_logarithms_are_those_of_the_mean_even_where_it_underflows(tnr, table_4_
 
 
 @pytest.mark.parametrize(
-    ("architecture", "law"), every(3, ["homodyne", "direct"], ["log_normal", "gamma_gamma"])
+    ("architecture", "law"),
+    parametrize_product(3, ["homodyne", "direct"], ["log_normal", "gamma_gamma"]),
 )
 def test_twinkling_keeps_the_mean_echo_and_has_its_index(law, architecture, table_4_1):
     """Power of mean 1 on the echo and its shot noise, and on the SNR its square if direct."""
@@ -169,8 +172,8 @@ def test_twinkling_keeps_the_mean_echo_and_has_its_index(law, architecture, tabl
         "instrument.receiver.architecture": architecture,
     }
     effects = (*CORE, "scintillation")
-    stretches = list(realise(parameters, effects, keys=keys(4), draws=DRAWS))
-    (plain,) = realise(parameters, CORE, keys=keys(4), draws=1)
+    stretches = list(realise(parameters, effects, keys=make_point_keys(4), draws=DRAWS))
+    (plain,) = realise(parameters, CORE, keys=make_point_keys(4), draws=1)
     power = np.concatenate([s.shots.echo_power for s in stretches]) / plain.shots.echo_power[0]
     even = scintillation.Turbulence(uniform=1e-14)
     legs = scintillation.both_ways(even, DEFAULTS | parameters, np.array(3000.0))
@@ -193,7 +196,9 @@ def test_twinkling_keeps_the_mean_echo_and_has_its_index(law, architecture, tabl
 
 def test_the_mean_over_a_log_normal_echo_is_gauss_and_hermites(table_4_1):
     parameters = table_4_1(range=4000.0, beamlets=1, tnr=8.0, power=0.1) | AIR
-    means = evaluate(parameters, (*CORE, "scintillation"), keys=keys(1), draws=50_000)
+    means = mean_statistics(
+        parameters, (*CORE, "scintillation"), keys=make_point_keys(1), draws=50_000
+    )
     even = scintillation.Turbulence(uniform=1e-14)
     legs = scintillation.both_ways(even, DEFAULTS | parameters, np.array(4000.0))
     variance = np.log1p(index(legs))
@@ -230,16 +235,16 @@ def test_the_mean_over_jitter_is_a_quadrature_over_both_angles(changes, sigma, t
     share = np.exp(-(a**2 + b**2) / 2) * 0.1**2 / (2 * np.pi)
     off = sigma * np.stack([a, b], axis=1)
     steepness = parameters["target.grazing_angle"]
-    far, grazing, direction = by_vectors(5000.0, steepness, off)
+    far, grazing, direction = intersect_level_plane(5000.0, steepness, off)
     along = direction @ [np.cos(steepness), 0.0, -np.sin(steepness)]
     outputs = evaluate_without(
         parameters
         | {"target.range": far, "target.grazing_angle": grazing}
         | {"target.radial_velocity": 150.0 * along}
     )
-    means = evaluate(
+    means = mean_statistics(
         parameters | {"target.pointing_jitter": sigma}, (*CORE, "pointing_jitter"),
-        keys=keys(1), draws=DRAWS,
+        keys=make_point_keys(1), draws=DRAWS,
     )  # fmt: skip
     for name in ("pd_up", "pd_down", "pd_shot"):
         exact = (share * outputs[name]).sum()
@@ -253,7 +258,9 @@ def test_a_moving_instrument_sees_what_its_jitter_turns_into_the_beam(table_4_1)
     """Towards the near side, tilting up by a takes a of the speed away: v_r' = v_r - a v."""
     parameters = table_4_1(beamlets=1, radial_velocity=50.0, grazing_angle=0.5)
     parameters |= {"target.pointing_jitter": 1e-4, "target.transverse_velocity": 80.0}
-    (stretch,) = realise(parameters, (*CORE, "pointing_jitter"), keys=keys(1), draws=2000)
+    (stretch,) = realise(
+        parameters, (*CORE, "pointing_jitter"), keys=make_point_keys(1), draws=2000
+    )
     upwards = np.arcsin(2000.0 * np.sin(0.5) / stretch.shots.range) - 0.5  # -a
     found = stretch.shots.radial_velocity - 50.0
     np.testing.assert_allclose(found, 80.0 * upwards, atol=3 * 130.0 * 1e-4**2 * 10)
@@ -271,7 +278,7 @@ def test_a_beam_over_the_horizon_is_a_draw_without_an_echo(table_4_1):
     noise = np.exp(-(4 - np.pi) / 4 * 9)
     np.testing.assert_allclose(drawn["pd_up"][0, missed], noise, rtol=1e-9)
     np.testing.assert_array_equal(np.isnan(drawn["range_error"][0]), missed)
-    means = evaluate(parameters, effects, keys=keys(1), draws=2000)
+    means = mean_statistics(parameters, effects, keys=make_point_keys(1), draws=2000)
     assert means["range_error"] == pytest.approx(drawn["range_error"][0, ~missed].mean(), rel=1e-9)
     assert means["pd_up"] == pytest.approx(drawn["pd_up"].mean(), rel=1e-12)
 
@@ -279,10 +286,12 @@ def test_a_beam_over_the_horizon_is_a_draw_without_an_echo(table_4_1):
 def test_a_steady_beam_is_the_shot_as_it_is(table_4_1):
     parameters = table_4_1(range=np.array([2000.0, 4000.0]), grazing_angle=0.5, beamlets=7)
     angles = pointing_jitter.angles(
-        pointing_jitter.Realisation(keys(2), np.zeros(2, np.int64)), np.array([0.0, 1.0])
+        pointing_jitter.Realisation(make_point_keys(2), np.zeros(2, np.int64)), np.array([0.0, 1.0])
     )
     assert (angles[0] == 0).all() and (angles[1] != 0).all()
-    still = evaluate(parameters, (*CORE, "pointing_jitter"), keys=keys(2), draws=3)
+    still = mean_statistics(
+        parameters, (*CORE, "pointing_jitter"), keys=make_point_keys(2), draws=3
+    )
     plain = evaluate_without(parameters)
     for name in ("pd_up", "pd_doppler", "pd_shot", "snr_down"):
         np.testing.assert_allclose(still[name], plain[name], rtol=1e-6)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from engine import every
+from shot_helpers import parametrize_product
 
 from sweep.model import shot
 
@@ -107,7 +107,7 @@ def dips(pd):
     return int(np.sum((pd[1:] < 0.5) & (pd[:-1] >= 0.5)))
 
 
-@pytest.mark.parametrize("degrees", every(2, [15, 85]))
+@pytest.mark.parametrize("degrees", parametrize_product(2, [15, 85]))
 def test_a_longer_fft_has_fewer_and_rarer_dips(degrees, table_4_1):
     """Fig. 4.8: frequent dips at 2^16, less severe the longer the FFT."""
     pd = [slice_at(table_4_1, degrees, fft_size=2**e) for e in (16, 17, 18)]

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from engine import every
+from shot_helpers import parametrize_product
 
 from sweep.model import shot
 from sweep.model.accuracy import Accuracy
@@ -36,9 +36,17 @@ def scenes(table_4_1, seed, **fixed):
 
 @pytest.mark.parametrize(
     "case",
-    every(3, [("rectangular", "thesis"), ("hamming", "lambert"), ("flattop", "lambert"),
-              ("kaiser(8.6)", "lambert"), ("blackman", "thesis")]),
-)  # fmt: skip
+    parametrize_product(
+        3,
+        [
+            ("rectangular", "thesis"),
+            ("hamming", "lambert"),
+            ("flattop", "lambert"),
+            ("kaiser(8.6)", "lambert"),
+            ("blackman", "thesis"),
+        ],
+    ),
+)
 def test_pd_and_magnitudes_are_within_the_tolerance_of_a_continuum(table_4_1, case):
     window, law = case
     parameters = scenes(table_4_1, 1, window=window, reflectance_law=law)

@@ -4,8 +4,8 @@ import dataclasses
 
 import numpy as np
 import pytest
-from engine import DRAWS, keys, prepared, within_5_sigma
 from scipy import ndimage, stats
+from shot_helpers import DRAWS, is_within_5_sigma, make_point_keys, prepare_single_category
 
 from sweep.model import truth, waveform
 from sweep.model.draws import Seen
@@ -45,7 +45,7 @@ def _surfaces(table_4_1, ranges, velocities, *, shares=None, spread=0.02, beamle
     """
     ranges, velocities = np.array(ranges), np.array(velocities)
     changes = {"phases": "incoherent"} | changes
-    shots = prepared(
+    shots = prepare_single_category(
         table_4_1(range=ranges[0], radial_velocity=velocities[0], beamlets=beamlets, **changes)
     )
     which = np.arange(beamlets) % len(ranges)
@@ -66,7 +66,7 @@ def _certain(found, sure=1.0):
 
 def _drawn(shots, found=None, **keywords):
     found = groups(shots) if found is None else found
-    return draw_returns(shots, found, keys=keys(shots.range.size), **keywords)
+    return draw_returns(shots, found, keys=make_point_keys(shots.range.size), **keywords)
 
 
 # Groups
@@ -99,7 +99,7 @@ def test_groups_are_runs_of_bins_above_the_threshold_in_the_true_spectrum(table_
 
 
 def test_the_strongest_group_is_what_a_single_detection_finds(table_4_1):
-    shots = prepared(table_4_1(range=np.linspace(500.0, 9000.0, 7), beamlets=19))
+    shots = prepare_single_category(table_4_1(range=np.linspace(500.0, 9000.0, 7), beamlets=19))
     found, expected = groups(shots), np.moveaxis(find(shots), 1, 0)
     np.testing.assert_array_equal(found.pd[:, :, 0].T, expected[0])
     np.testing.assert_array_equal(found.magnitude[:, :, 0].T, expected[2])
@@ -118,7 +118,7 @@ def test_fewer_groups_listed_are_the_strongest_of_all(table_4_1):
 
 
 def test_below_the_threshold_the_strongest_bin_is_listed(table_4_1):
-    found = groups(prepared(table_4_1(range=9900.0, power=0.001, grazing_angle=0.3)))
+    found = groups(prepare_single_category(table_4_1(range=9900.0, power=0.001, grazing_angle=0.3)))
     assert (found.bin[0, :, 0] >= 0).all()
     assert (found.bin[0, :, 1:] == -1).all()
     assert (found.pd[0, :, 0] < 0.1).all()
@@ -129,7 +129,7 @@ def test_below_the_threshold_the_strongest_bin_is_listed(table_4_1):
 
 
 def test_a_flat_plane_reports_what_its_peaks_report(table_4_1):
-    shots = prepared(table_4_1(range=np.linspace(300.0, 3000.0, 50), beamlets=19))
+    shots = prepare_single_category(table_4_1(range=np.linspace(300.0, 3000.0, 50), beamlets=19))
     found = _certain(groups(shots))
     got, expected = _drawn(shots, found), report(shots, find(shots))
     np.testing.assert_array_equal(got.range[:, 0, 0], expected.range)
@@ -138,7 +138,7 @@ def test_a_flat_plane_reports_what_its_peaks_report(table_4_1):
 
 
 def test_direct_detection_gives_ranges_without_a_doppler_segment(table_4_1):
-    shots = prepared(
+    shots = prepare_single_category(
         table_4_1(architecture="direct", range=200.0, power=200.0, radial_velocity=3.0)
     )
     got = _drawn(shots)
@@ -176,9 +176,9 @@ def test_true_returns_are_the_very_draws_that_are_counted_as_detected(table_4_1,
     A true pair, both peaks found, is lost only where a false peak takes one of them: rarely.
     """
     parameters = _weak(table_4_1) | {"instrument.processing.tnr": 9.0}
-    shots = prepared(parameters)
+    shots = prepare_single_category(parameters)
     counts = simulate(
-        parameters, CORE, keys=keys(4), first_draw=3, batch_sizes=[2000], method=method
+        parameters, CORE, keys=make_point_keys(4), first_draw=3, batch_sizes=[2000], method=method
     )
     got = _drawn(shots, first_draw=3, draws=2000, method=method)
     both = (got.group[..., 0] == 0) & (got.group[..., 2] == 0)
@@ -200,7 +200,7 @@ def test_dropouts_and_false_alarms_have_their_probabilities(table_4_1, method, l
     returns 2 in p a p a, and so on; confirmed by the true Doppler peak where that is there.
     """
     parameters = _weak(table_4_1, **law)
-    shots = prepared(parameters)
+    shots = prepare_single_category(parameters)
     out = evaluate(parameters)
     got = _drawn(shots, draws=DRAWS, method=method)
     alarm = [
@@ -214,8 +214,8 @@ def test_dropouts_and_false_alarms_have_their_probabilities(table_4_1, method, l
         none.append((1 - pd) * (1 - a))
         two.append(pd * a)
     number = (got.flags > 0).sum(2)
-    assert within_5_sigma((number >= 1).sum(1), (1 - none[0]) * (1 - none[1])).all()
-    assert within_5_sigma((number == 2).sum(1), two[0] * two[1]).all()
+    assert is_within_5_sigma((number >= 1).sum(1), (1 - none[0]) * (1 - none[1])).all()
+    assert is_within_5_sigma((number == 2).sum(1), two[0] * two[1]).all()
     # readings by chance (1e-3 of the false peaks) take a true peak from its partner
     both = ((got.group[..., 0] == 0) & (got.group[..., 2] == 0)).any(2)
     slack = 3e-3 * DRAWS * alarm[0]
@@ -299,7 +299,7 @@ def _up_in_noise(centre, magnitude, levels, tables, half, *, low=0, others=0.0, 
     )  # fmt: skip
     seen = Seen.nothing(1)._replace(low=np.full((1, 3), low), others=np.full((1, 3), others))
     peaks, which = np.zeros((2, 4)), np.zeros(2, np.int64)
-    (key,) = keys(1)
+    (key,) = make_point_keys(1)
 
     def drawn(number):
         address = key[0], key[1], number
@@ -360,7 +360,7 @@ def test_interpolated_errors_are_those_reported(table_4_1, method, name):
 
     Ranges run through the bin, so that the errors are of all places between bins.
     """
-    shots = prepared(
+    shots = prepare_single_category(
         table_4_1(
             range=1000 + RANGE_BIN * np.linspace(0, 1, 20, endpoint=False), window=name,
             radial_velocity=9.0, beamlets=1, power=0.5, phases="incoherent",
@@ -412,7 +412,7 @@ def test_reported_errors_hold_for_a_footprint_that_spreads(table_4_1, phases):
     its size, so the mean square of errors over stated ones is near 1 over all places. Lines that
     add as amplitudes may cancel, and then lie anywhere: about 1 again, with larger outliers.
     """
-    shots = prepared(
+    shots = prepare_single_category(
         table_4_1(
             range=1000 + RANGE_BIN * np.linspace(0, 1, 200, endpoint=False), window="hann",
             radial_velocity=9.0, beamlets=61, power=50.0, grazing_angle=np.radians(20.0),
@@ -431,7 +431,9 @@ def test_reported_errors_hold_for_a_footprint_that_spreads(table_4_1, phases):
 
 
 def test_beamlets_appear_where_their_beats_fold_to(table_4_1):
-    shots = prepared(table_4_1(range=8000.0, radial_velocity=-170.0, beamlets=7, grazing_angle=0.3))
+    shots = prepare_single_category(
+        table_4_1(range=8000.0, radial_velocity=-170.0, beamlets=7, grazing_angle=0.3)
+    )
     shots = dataclasses.replace(shots, doppler=np.linspace(-1e-9, 1e-9, 7)[None])
     velocity = -170.0 + shots.doppler[0] * LIGHT / 2
     lines = beamlet_lines(shots)[0]

@@ -2,9 +2,15 @@
 
 import numpy as np
 import pytest
-from engine import DRAWS, every, keys, prepared, within_5_sigma
 from hypothesis import given
 from hypothesis import strategies as st
+from shot_helpers import (
+    DRAWS,
+    is_within_5_sigma,
+    make_point_keys,
+    parametrize_product,
+    prepare_single_category,
+)
 
 from sweep.model import truth
 from sweep.model.band import band_of
@@ -76,15 +82,17 @@ def noisy_spectra(shots, segment, rng):
     return np.abs(np.fft.rfft(taper * (signal.real + sigma * rng.normal(size=shape)), SIZE))
 
 
-@pytest.mark.parametrize(("record", "offset"), every(4, ["real", "complex"], [-40, -1, 0, 1, 40]))
+@pytest.mark.parametrize(
+    ("record", "offset"), parametrize_product(4, ["real", "complex"], [-40, -1, 0, 1, 40])
+)
 def test_drawn_records_that_are_searched_in_the_band_alone(record, offset, table_4_1):
     """The strongest bin of the up beat lies some bins within the band's far end, or beyond it."""
-    whole = prepared(scene_of(table_4_1, record=record))
+    whole = prepare_single_category(scene_of(table_4_1, record=record))
     place = truth.find(whole)[0, 3, 0] / (600e6 / SIZE)  # of the echo [bins]
     metre = 299792458 * 600e6 / SIZE / (2 * 50e12)
     end = 220.0 + offset * metre
     scene = scene_of(table_4_1, (end - 60 * metre, end, 3.0, 3.0), record)
-    shots, found = prepared(scene), evaluate(scene)
+    shots, found = prepare_single_category(scene), evaluate(scene)
     first, number = shots.band[0, :, 0]
     inside = np.isin(place % SIZE, (first + np.arange(number)) % SIZE)
     assert inside == (offset >= 0) and abs(number - 61) <= 1
@@ -95,19 +103,19 @@ def test_drawn_records_that_are_searched_in_the_band_alone(record, offset, table
     near &= bool(inside)
     hits, alarms = crosses[:, near].any(axis=1).sum(), crosses[:, ~near].any(axis=1).sum()
     assert 0.2 < evaluate(scene_of(table_4_1, record=record))["pd_up"][0] < 0.98
-    assert within_5_sigma(hits, found["pd_up"][0], 0.005 * DRAWS)
+    assert is_within_5_sigma(hits, found["pd_up"][0], 0.005 * DRAWS)
     assert found["pd_up"][0] + found["miss_up"][0] == pytest.approx(1)
     if not inside:
         assert found["pd_up"][0] == found["pd_shot"][0] == 0 and np.isnan(found["range_error"][0])
     chance = found["pfa_segment"][0]
     if inside:
-        assert within_5_sigma(alarms, chance, 0.03 * chance * DRAWS)
+        assert is_within_5_sigma(alarms, chance, 0.03 * chance * DRAWS)
         assert chance < evaluate(scene_of(table_4_1, record=record))["pfa_segment"][0] / 3
     else:
         leaking = found["p_leakage_up"][0]  # of the main lobe's half that is in the band
         assert (leaking > 0.02) == (offset == -1)
         either = 1 - (1 - chance) * (1 - leaking)
-        assert within_5_sigma(alarms, either, 0.03 * either * DRAWS)
+        assert is_within_5_sigma(alarms, either, 0.03 * either * DRAWS)
 
 
 def test_a_band_of_all_bins_is_the_whole_record(table_4_1):
@@ -142,17 +150,19 @@ def test_draws_and_points_keep_to_the_band(method, record, table_4_1):
     band = (np.array([150.0, 60.0]), np.array([260.0, 140.0]), 0.0, 5.0)
     scene = scene_of(table_4_1, band, record, range=np.full(2, 220.0), tnr=4.5)
     found, draws = evaluate(scene), 1000
-    counts = simulate(scene, CORE, keys=keys(2), method=method, batch_sizes=[draws], first_draw=0)
+    counts = simulate(
+        scene, CORE, keys=make_point_keys(2), method=method, batch_sizes=[draws], first_draw=0
+    )
     spread = 5 * np.sqrt(draws * 0.25)
     assert counts["n_detected_up"][:, 0] == pytest.approx(draws * found["pd_up"], abs=spread)
     assert counts["n_detected_up"][1, 0] == 0
     assert counts["n_false_alarm_up"][:, 0] == pytest.approx(
         draws * (1 - (1 - found["pfa_segment"]) * (1 - found["p_leakage_up"])), abs=spread
     )
-    shots = prepared(scene)
+    shots = prepare_single_category(scene)
     listed = groups(shots)
     assert (listed.bin[:, 0, 0] >= 0).tolist() == [True, False] and listed.pd[1, 0, 0] == 0
-    points = draw_returns(shots, listed, keys=keys(2), draws=draws, method=method)
+    points = draw_returns(shots, listed, keys=make_point_keys(2), draws=draws, method=method)
     assert (points.group[1][..., [0, 2]] < 0).all()
     own = np.isfinite(points.range) & (points.flags & UNCONFIRMED == 0)
     # In one band the echo, in the other noise: of signed beats Doppler's seldom confirms that.

@@ -5,9 +5,9 @@ from dataclasses import replace
 import mpmath
 import numpy as np
 import pytest
-from engine import difference
 from scipy.constants import speed_of_light
-from small_scenes import flight, instrument, observed
+from shot_helpers import magnitude_error
+from small_scenes import observe_shots, scene_parameters, straight_flight
 
 from sweep.model import segments, truth
 from sweep.model.effects.catalogue import CORE, DEFAULTS, names_of
@@ -19,7 +19,7 @@ from sweep.model.realisations import realise
 from sweep.model.returns import beamlet_lines, draw_returns
 from sweep.model.shot import prepare
 from sweep.model.waveform import GAP, ORDER, ORDERS, SEGMENTS, SIGNS
-from sweep.tasks.flight_study import plan_shots
+from sweep.tasks.studies.flight_study import plan_shot_effects
 
 MOVING = (*CORE, "segment_motion")
 
@@ -119,7 +119,7 @@ def drawn(number):
 
 def disagreement(shots, **kept):
     return max(
-        difference(
+        magnitude_error(
             shots,
             segments.spectrum(shots, 0, int(segment))[1],
             truth.spectrum(shots, 0, int(segment), **kept),
@@ -195,12 +195,18 @@ SLOWS = (100.0**2 - 30.0**2) / (2 * 400.0)
 
 def of_flight(table_4_1, effects):
     """The first shots of three beams, falling straight at level ground from 500 m."""
-    seen = observed(
-        flight((0.0, 0.0, 500.0), (0.0, 0.0, -100.0), acceleration=(0.0, 0.0, SLOWS), duration=6.0),
-        scanner=fixed(cone(3, half_angle=TILT), rate=1.0), index=np.arange(3), number=1,
-    )  # fmt: skip
+    seen = observe_shots(
+        straight_flight(
+            (0.0, 0.0, 500.0), (0.0, 0.0, -100.0), acceleration=(0.0, 0.0, SLOWS), duration=6.0
+        ),
+        scanner=fixed(cone(3, half_angle=TILT), rate=1.0),
+        index=np.arange(3),
+        number=1,
+    )
     ground = [Surface("ground", 0.1, "lambert")]
-    return prepare_eyepoints(seen, DEFAULTS | instrument(table_4_1, beamlets=1), ground, effects)
+    return prepare_eyepoints(
+        seen, DEFAULTS | scene_parameters(table_4_1, beamlets=1), ground, effects
+    )
 
 
 def of_grid(table_4_1, effects):
@@ -231,14 +237,14 @@ def test_a_flight_s_plan_lists_what_its_path_calls_for(table_4_1):
     ground = [Surface("ground", 0.1, "lambert")]
     called = []
     for slows in (SLOWS, 0.0):
-        seen = observed(
-            flight(velocity=(0.0, 0.0, -slows), acceleration=(0.0, 0.0, slows)), number=7
+        seen = observe_shots(
+            straight_flight(velocity=(0.0, 0.0, -slows), acceleration=(0.0, 0.0, slows)), number=7
         )
-        planned = plan_shots(
-            seen, np.zeros(1, np.int64), instrument(table_4_1, beamlets=7), ground, modes={},
+        planned = plan_shot_effects(
+            seen, np.zeros(1, np.int64), scene_parameters(table_4_1, beamlets=7), ground, modes={},
             rotating=False,
         )  # fmt: skip
-        flags = planned.selected(1).flags
+        flags = planned.selected_effects(1).effect_flags
         called.append({"acceleration", "segment_motion"} & set(names_of(int(flags[0]))))
     assert called == [{"acceleration", "segment_motion"}, set()]
 

@@ -11,11 +11,17 @@ import math
 import numpy as np
 import pytest
 import validate_speckle
-from drawn_shots import EFFECTS, detections, draw_shots, facet_of, shot_detections
-from engine import every, keys
+from scatterer_shots import (
+    COMPARED_EFFECTS,
+    draw_shots,
+    point_facet,
+    segment_detections,
+    shot_detections,
+)
 from scatterers import SPEED_OF_LIGHT
+from shot_helpers import make_point_keys, parametrize_product
 from test_drawn_speckle import flown
-from validate_speckle import mapping_at_random, spec_of_ratio, stated_error
+from validate_speckle import random_mapping, spec_of_ratio, stated_error
 
 from sweep.model.pairing import FLAGS, UNCONFIRMED
 from sweep.model.sampling import simulate
@@ -53,7 +59,7 @@ def spec_at_random(number):
     kind = ("looks", "any_bin", "peak_bin", "wide")[number % 4]
     steepest = 12 if kind == "wide" else 90
     while True:
-        mapping = mapping_at_random(rng)
+        mapping = random_mapping(rng)
         ratio = float(np.exp(rng.uniform(np.log(0.8), np.log(4.0))))
         degrees = float(np.exp(rng.uniform(np.log(5), np.log(steepest))))
         instrument = mapping["instrument"]
@@ -78,7 +84,7 @@ def spec_at_random(number):
             found = spec_of_ratio(mapping, ratio)
         except (SpecError, UnsupportedShot):
             continue
-        chirps = [found.stored["pd_up"], found.stored["pd_down"]]
+        chirps = [found.stored_pd["pd_up"], found.stored_pd["pd_down"]]
         if min(chirps) > 0.1 and max(chirps) < 0.97:
             return found
 
@@ -86,7 +92,9 @@ def spec_at_random(number):
 def shares_of_grid(p, method, draws, seed):
     """Shares of a grid's draws by segment, and of the shot."""
     given = dict(p) | {"target.range": np.ravel(p["target.range"])[:1]}
-    counts = simulate(given, EFFECTS, keys=keys(1, seed), batch_sizes=[draws], method=method)
+    counts = simulate(
+        given, COMPARED_EFFECTS, keys=make_point_keys(1, seed), batch_sizes=[draws], method=method
+    )
     names = ("up", "doppler", "down", "shot")
     return {name: counts[f"n_detected_{name}"][0, 0] / draws for name in names}
 
@@ -104,13 +112,13 @@ def compared(number):
     """Shares that differ from those of scatterers, or among flights, by more than is allowed."""
     found = spec_at_random(number)
     shots, p, differing = found.shots, found.parameters, []
-    detected = detections(draw_shots(p, shots, draws=SCATTERER_DRAWS, seed=number), shots)
+    detected = segment_detections(draw_shots(p, shots, draws=SCATTERER_DRAWS, seed=number), shots)
     chirps = detected["up"] & detected["down"]
     events = detected | {"shot": shot_detections(detected, shots), "chirps": chirps}
     if "doppler" in detected:
         events["all segments"] = chirps & detected["doppler"]
     truth = {name: float(event.mean()) for name, event in events.items()}
-    facet = facet_of(p, shots)
+    facet = point_facet(p, shots)
 
     def compare(source, shares, draws, slack, above=0.0):
         for name, share in shares.items():
@@ -123,7 +131,7 @@ def compared(number):
                 differing.append(f"{source} {name}: {share:.4f} for {truth[name]:.4f}")
 
     law = [stated_error(name, shots, facet) + validate_speckle.TOLERANCE for name in ("up", "shot")]
-    stored = {name[3:]: share for name, share in found.stored.items()}
+    stored = {name[3:]: share for name, share in found.stored_pd.items()}
     compare("closed form", {k: v for k, v in stored.items() if k != "shot"}, 1e9, law[:1] * 2)
     compare("closed form", {"shot": stored["shot"]}, 1e9, law)
     several, flights = shots.looks.several, {}
@@ -149,6 +157,6 @@ def compared(number):
     return differing
 
 
-@pytest.mark.parametrize("number", every(3, range(60)))
+@pytest.mark.parametrize("number", parametrize_product(3, range(60)))
 def test_all_methods_find_the_same_shares(number):
     assert compared(number) == []

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from engine import keys, prepared
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
+from shot_helpers import make_point_keys, prepare_single_category
 
 from sweep.model import looks
 from sweep.model.effects.catalogue import CORE, DEFAULTS
@@ -78,10 +78,10 @@ def test_the_power_of_a_lorentzian_line_is_that_of_records_whose_phase_walks(wid
     """Mean |X|^2 of the strongest bin over 600 drawn phases, to 5 standard errors and 3 %."""
     parameters = _parameters(table_4_1, {SHAPE: "lorentzian", WIDTH: width}, "none", 0.1)
     parameters |= {"instrument.processing.fft_size": 2**12}
-    shots = prepared(parameters, EFFECTS)
+    shots = prepare_single_category(parameters, EFFECTS)
     out = statistics(shots)
     signal = signal_of(shots, 0, 0)
-    spectra = drawn_of(shots, 0, 0, signal, key=keys(1)[0], draws=np.arange(600))
+    spectra = drawn_of(shots, 0, 0, signal, key=make_point_keys(1)[0], draws=np.arange(600))
     power = np.abs(spectra[:, signal.strongest]) ** 2 / (2 * shots.bin_deviation[0] ** 2)
     error = 5 * power.std() / np.sqrt(600) + 0.03 * power.mean()
     assert out["snr_up"][0] == pytest.approx(power.mean(), abs=error)

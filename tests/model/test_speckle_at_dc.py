@@ -5,7 +5,13 @@ Compared with drawn records of scatterers, which share the mean echo power, nois
 
 import numpy as np
 import pytest
-from drawn_shots import EFFECTS, LANDER, drawn_detections, shots_of, with_threshold
+from scatterer_shots import (
+    COMPARED_EFFECTS,
+    LANDER_PARAMETERS,
+    draw_segment_detections,
+    prepare_single_category,
+    with_signal_over_threshold,
+)
 
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.catalogue import DEFAULTS
@@ -14,9 +20,12 @@ from sweep.model.sampling import simulate
 from sweep.model.shot import find, statistics
 
 DRAWS = 20_000
-BIN_WIDTH = LANDER["instrument.processing.sample_rate"] / LANDER["instrument.processing.fft_size"]
+BIN_WIDTH = (
+    LANDER_PARAMETERS["instrument.processing.sample_rate"]
+    / LANDER_PARAMETERS["instrument.processing.fft_size"]
+)
 RANGE_BEAT = 1e9 / 50e-6 * 2 * 300.0 / SPEED_OF_LIGHT
-HOVER = LANDER | {
+HOVER = LANDER_PARAMETERS | {
     "target.range": 300.0, "target.grazing_angle": np.pi / 2, "instrument.processing.tnr": 6.0,
     "target.transverse_velocity": 0.0, "instrument.processing.detection": "peak_bin",
 }  # fmt: skip
@@ -30,7 +39,7 @@ def at_doppler(parameters, frequency):
 
 def with_circular_pd(parameters, pd):
     """Parameters with the laser power for which a circular number in the Doppler segment has pd."""
-    shots = shots_of(parameters)
+    shots = prepare_single_category(parameters)
     snr = 0.5 * float(shots.threshold[0] / shots.bin_deviation[0]) ** 2 / -np.log(pd) - 1
     now = 0.5 * float(find(shots)[1, 2, 0] / shots.bin_deviation[0]) ** 2
     factor = parameters["instrument.laser.power"] * snr / now
@@ -50,7 +59,7 @@ def test_a_hovering_lidar_detects_a_real_number(bins, circular, drawn, error, ta
     """Shares drawn by another simulation, with the probabilities of circular numbers there."""
     p = at_doppler(DEFAULTS | table_4_1() | HOVER, bins * BIN_WIDTH)
     p = with_circular_pd(p, circular)
-    outputs = statistics(shots_of(p))
+    outputs = statistics(prepare_single_category(p))
     assert abs(outputs["pd_doppler"][0] - drawn) < 3 * error
     assert outputs["pd_doppler"][0] + outputs["miss_doppler"][0] == pytest.approx(1, abs=1e-12)
 
@@ -72,9 +81,9 @@ def test_slow_echoes_are_detected_as_often_as_drawn_ones(
         "instrument.processing.window": window, "instrument.processing.detection": rule,
         "target.grazing_angle": grazing,
     }  # fmt: skip
-    p = with_threshold(at_doppler(p, doppler * BIN_WIDTH), 1.6)
-    shots = shots_of(p)
-    drawn = drawn_detections(p, shots, draws=DRAWS, seed=7)["doppler"].mean()
+    p = with_signal_over_threshold(at_doppler(p, doppler * BIN_WIDTH), 1.6)
+    shots = prepare_single_category(p)
+    drawn = draw_segment_detections(p, shots, draws=DRAWS, seed=7)["doppler"].mean()
     expected = float(statistics(shots)["pd_doppler"][0])
     assert abs(drawn - expected) < 4 * np.sqrt(expected * (1 - expected) / DRAWS) + tolerance
 
@@ -83,9 +92,9 @@ def test_slow_echoes_are_detected_as_often_as_drawn_ones(
 def test_an_up_beat_at_dc_is_a_real_number(rule, tolerance, table_4_1):
     """The Doppler frequency takes the range beat away; the down beat is at twice that."""
     p = DEFAULTS | table_4_1() | HOVER | {"instrument.processing.detection": rule}
-    p = with_threshold(at_doppler(p, RANGE_BEAT + 0.3 * BIN_WIDTH), 1.6)
-    shots = shots_of(p)
-    detections, outputs = drawn_detections(p, shots, draws=DRAWS, seed=3), statistics(shots)
+    p = with_signal_over_threshold(at_doppler(p, RANGE_BEAT + 0.3 * BIN_WIDTH), 1.6)
+    shots = prepare_single_category(p)
+    detections, outputs = draw_segment_detections(p, shots, draws=DRAWS, seed=3), statistics(shots)
     both = (detections["up"] & detections["down"]).mean()
     error = np.sqrt(0.25 / DRAWS)
     assert abs(detections["up"].mean() - outputs["pd_up"][0]) < 4 * error
@@ -95,9 +104,9 @@ def test_an_up_beat_at_dc_is_a_real_number(rule, tolerance, table_4_1):
 
 def test_any_two_segments_detect_a_hovering_lidar_as_drawn(table_4_1):
     p = DEFAULTS | table_4_1() | HOVER | {"instrument.processing.shot_detection": "any_two"}
-    p = with_threshold(at_doppler(p, 0.2 * BIN_WIDTH), 1.6)
-    shots = shots_of(p)
-    detections = drawn_detections(p, shots, draws=DRAWS, seed=3)
+    p = with_signal_over_threshold(at_doppler(p, 0.2 * BIN_WIDTH), 1.6)
+    shots = prepare_single_category(p)
+    detections = draw_segment_detections(p, shots, draws=DRAWS, seed=3)
     two = (np.sum([detections[name] for name in detections], axis=0) >= 2).mean()
     outputs = statistics(shots)
     assert abs(two - outputs["pd_shot"][0]) < 0.003 + 4 * np.sqrt(two * (1 - two) / DRAWS)
@@ -114,7 +123,9 @@ def test_looks_near_dc_detect_as_often_as_drawn_ones(combine, speckle, place, ta
         "instrument.looks.combine": combine, "instrument.looks.votes": 2,
         "instrument.looks.speckle": speckle,
     }  # fmt: skip
-    shots = shots_of(with_threshold(at_doppler(p, place * BIN_WIDTH), 1.3))
+    shots = prepare_single_category(
+        with_signal_over_threshold(at_doppler(p, place * BIN_WIDTH), 1.3)
+    )
     w = shots.window.samples()
     time, k = (np.arange(w.size) - w.size / 2) / w.size, round(place)
     line, image = ((w * np.cos(2 * np.pi * y * time)).sum() for y in (k - place, k + place))
@@ -150,10 +161,10 @@ def test_the_hoyt_law_is_the_mean_of_exponentials(share, level):
 @pytest.mark.parametrize("place", [0.0, 0.42])
 def test_draws_in_noise_detect_slow_echoes_as_often(rule, place, table_4_1):
     p = DEFAULTS | table_4_1() | HOVER | {"instrument.processing.detection": rule}
-    p = with_threshold(at_doppler(p, place * BIN_WIDTH), 1.6)
+    p = with_signal_over_threshold(at_doppler(p, place * BIN_WIDTH), 1.6)
     p["target.range"] = np.array([300.0])
     keys, draws = np.array([[1, 2]], np.uint64), 20_000
-    counts = simulate(p, EFFECTS, keys=keys, batch_sizes=[draws], method="noise")
+    counts = simulate(p, COMPARED_EFFECTS, keys=keys, batch_sizes=[draws], method="noise")
     drawn = counts["n_detected_doppler"][0, 0] / draws
-    expected = float(statistics(shots_of(p))["pd_doppler"][0])
+    expected = float(statistics(prepare_single_category(p))["pd_doppler"][0])
     assert abs(drawn - expected) < 0.004 + 4 * np.sqrt(expected * (1 - expected) / draws)

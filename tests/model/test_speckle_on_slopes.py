@@ -6,7 +6,12 @@ of lines, spectra or detection.
 
 import numpy as np
 import pytest
-from drawn_shots import LANDER, drawn_detections, shots_of, with_threshold
+from scatterer_shots import (
+    LANDER_PARAMETERS,
+    draw_segment_detections,
+    prepare_single_category,
+    with_signal_over_threshold,
+)
 
 from sweep.model import beam
 from sweep.model.effects.catalogue import DEFAULTS
@@ -67,11 +72,17 @@ RATIOS = {"four bins": 0.6}
 )
 @pytest.mark.parametrize("case", CASES)
 def test_both_chirps_are_detected_as_often_as_in_drawn_records(case, rule, tolerance, table_4_1):
-    p = DEFAULTS | table_4_1() | LANDER | CASES[case] | {"instrument.processing.detection": rule}
-    p = with_threshold(p, RATIOS.get(case, 1.3))
-    shots = shots_of(p)
+    p = (
+        DEFAULTS
+        | table_4_1()
+        | LANDER_PARAMETERS
+        | CASES[case]
+        | {"instrument.processing.detection": rule}
+    )
+    p = with_signal_over_threshold(p, RATIOS.get(case, 1.3))
+    shots = prepare_single_category(p)
     outputs = statistics(shots)
-    detections = drawn_detections(p, shots, draws=DRAWS, seed=len(case))
+    detections = draw_segment_detections(p, shots, draws=DRAWS, seed=len(case))
     both = (detections["up"] & detections["down"]).mean()
     expected = float(outputs["pd_shot"][0])
     error = np.sqrt(expected * (1 - expected) / DRAWS)
@@ -80,8 +91,8 @@ def test_both_chirps_are_detected_as_often_as_in_drawn_records(case, rule, toler
 
 def test_carriers_that_differ_share_less_speckle_than_equal_ones(table_4_1):
     """The correlation is exp(-t^2 / 2), t = 4 pi df sigma_R / c, where the footprint is narrow."""
-    p = DEFAULTS | table_4_1() | LANDER | CASES["steep chirp, short record"]
-    shots = shots_of(p)
+    p = DEFAULTS | table_4_1() | LANDER_PARAMETERS | CASES["steep chirp, short record"]
+    shots = prepare_single_category(p)
     delay, length = 2 * 150.0 / 299792458.0, 8192 / 200e6
     frequencies_apart = 2 * (4e9 / 100e-6) * (5e-6 + length / 2 - delay - 50e-6)
     deviation = float(beam.beams(p)[0].radius(150.0)) / np.sqrt(8) / np.tan(np.radians(30))

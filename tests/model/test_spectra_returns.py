@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from engine import every, keys
-from small_scenes import flight, instrument, observed, plate
+from shot_helpers import make_point_keys, parametrize_product
+from small_scenes import level_plate, observe_shots, scene_parameters, straight_flight
 
 from sweep.model.clouds import cloud
 from sweep.model.estimators import DETECTOR, ESTIMATOR
@@ -27,7 +27,7 @@ TARGET = {
 
 
 def _given(table_4_1, tnr=10.0, power=1.6e-3, **methods):
-    parameters = instrument(
+    parameters = scene_parameters(
         table_4_1, fft_size=2**11, power=power, tnr=tnr, beamlets=7, detection="any_bin",
         noise_bins="correlated",
     )  # fmt: skip
@@ -36,25 +36,29 @@ def _given(table_4_1, tnr=10.0, power=1.6e-3, **methods):
 
 def _flown(parameters, *, first=1000, draws=NUMBER, bodies=None, x=0.0, **given):
     given = {"effects": EFFECTS} | given
-    path = flight(position=(x, 0.0, HEIGHT), velocity=(0.0, 0.0, -CLOSING))
-    seen = observed(path, bodies=bodies, number=7)
+    path = straight_flight(position=(x, 0.0, HEIGHT), velocity=(0.0, 0.0, -CLOSING))
+    seen = observe_shots(path, bodies=bodies, number=7)
     return cloud(
         seen, parameters=parameters, surfaces=[Surface("ground", 0.1), Surface("table", 0.1)],
-        keys=keys(1), first_draw=first, draws=draws, method="spectra", **given,
+        keys=make_point_keys(1), first_draw=first, draws=draws, method="spectra", **given,
     )  # fmt: skip
 
 
 def _grid(parameters, methods=None):
     """A flat target of the same range, velocity and reflectance, with other draws."""
     return simulate(
-        parameters | TARGET, EFFECTS, keys=keys(1), batch_sizes=[NUMBER], method="spectra",
+        parameters | TARGET,
+        EFFECTS,
+        keys=make_point_keys(1),
+        batch_sizes=[NUMBER],
+        method="spectra",
         **({} if methods is None else {"methods": methods}),
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize(
     "way",
-    every(2, [
+    parametrize_product(2, [
         ("jacobsen", "complex"), ("peak_bin", "real"), ("maximum_likelihood", "real"),
         ("jacobsen", "real"), ("centroid", "real"),
     ]),
@@ -78,7 +82,7 @@ def test_an_estimators_bias_and_scatter_are_those_of_a_grid(table_4_1, way):
 
 @pytest.mark.parametrize(
     "way",
-    every(2, [
+    parametrize_product(2, [
         ("fixed", "real"), ("ca_cfar", "real"), ("ca_cfar", "complex"), ("os_cfar", "real"),
         ("goca_cfar", "real"), ("fixed", "complex"),
     ]),
@@ -138,7 +142,7 @@ def test_functions_of_ones_own_see_every_draw_alone(table_4_1):
 
 def test_both_surfaces_of_a_footprint_are_seen_and_fade_each_for_itself(table_4_1):
     """Both are seen as often as by chance, and their strengths are not correlated; 5 sigma."""
-    bodies = [plate(x=(-1e3, 30.0)), plate(x=(0.0, 30.0), surface=1, height=120.0)]
+    bodies = [level_plate(x=(-1e3, 30.0)), level_plate(x=(0.0, 30.0), surface=1, height=120.0)]
     changes = {ESTIMATOR + "kind": "candan", "footprint.speckle": "developed"}
     parameters = _given(table_4_1, power=0.3, **changes)
     effects = (*EFFECTS, "several_returns", "fading")

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from engine import keys
+from shot_helpers import make_point_keys
 
 from sweep.model import philox, sampling
 from sweep.model.accuracy import Accuracy
@@ -43,7 +43,9 @@ def _points(table_4_1, **changes):
 
 def _drawn(parameters, number=400, effects=EFFECTS, **place):
     size = np.size(parameters["target.range"])
-    return simulate(parameters, effects, keys=keys(size), batch_sizes=[number], **place, **WHOLE)
+    return simulate(
+        parameters, effects, keys=make_point_keys(size), batch_sizes=[number], **place, **WHOLE
+    )
 
 
 @BOTH
@@ -55,7 +57,7 @@ def test_noise_has_the_power_and_the_correlation_of_window_and_padding(
     changes = {"instrument.processing.window": window, "instrument.chirp.duration": duration}
     changes[RECORD] = record
     ((_, shots),) = prepare(_points(table_4_1, **changes) | {"target.range": 100.0}, EFFECTS)
-    noise = noise_of(shots, 0, 0, key=keys(1)[0], draws=np.arange(300))[:, 8:-8]
+    noise = noise_of(shots, 0, 0, key=make_point_keys(1)[0], draws=np.arange(300))[:, 8:-8]
     power = 2 * float(shots.bin_deviation[0]) ** 2
     independent = 300 * noise.shape[1] / 2  # tapers and padding leave half of them, or more
     assert np.mean(np.abs(noise) ** 2) == pytest.approx(power, rel=5 / np.sqrt(independent))
@@ -147,7 +149,7 @@ def test_batches_points_and_their_order_change_no_bit(table_4_1, effects, record
     parameters = _points(table_4_1, **{"target.roughness": 1e-6, "footprint.beamlets": 4})
     parameters |= {RECORD: record}
     parameters |= {DETECTOR + "kind": "os_cfar", ESTIMATOR + "kind": "candan"}
-    given = keys(3)
+    given = make_point_keys(3)
     whole = simulate(parameters, effects, keys=given, batch_sizes=[40, 30], **WHOLE)
     other = parameters | {"target.range": parameters["target.range"][::-1].copy()}
     parts = simulate(other, effects, keys=given[::-1], batch_sizes=[13, 7, 50], **WHOLE)
@@ -164,7 +166,7 @@ def test_batches_points_and_their_order_change_no_bit(table_4_1, effects, record
 
 def test_drawing_until_the_tolerance_is_met_stops_where_it_is(table_4_1):
     parameters, accuracy = _points(table_4_1), Accuracy(0.1, 0.95, interval="wilson")
-    given = {"keys": keys(3), "accuracy": accuracy} | WHOLE
+    given = {"keys": make_point_keys(3), "accuracy": accuracy} | WHOLE
     found = simulate(parameters, EFFECTS, batch=20, limit=500, **given)
     assert (found["accuracy_missed"] == 0).all() and found["n_draws"].min() < 100
     again = simulate(
@@ -196,8 +198,8 @@ def test_cells_of_an_iq_spectrum_have_neighbours_all_round(table_4_1, kind):
     parameters = _points(table_4_1, **changes) | COMPLEX | {"target.range": 1000.0}
     parameters |= DEFAULTS | {DETECTOR + "kind": kind, DETECTOR + "pfa": 0.02}
     ((_, shots),) = prepare(parameters, EFFECTS)
-    view = view_of(shots, 0, parameters, keys(1)[0], Methods())
-    noise = noise_of(shots, 0, 0, key=keys(1)[0], draws=np.arange(10_000))
+    view = view_of(shots, 0, parameters, make_point_keys(1)[0], Methods())
+    noise = noise_of(shots, 0, 0, key=make_point_keys(1)[0], draws=np.arange(10_000))
     _, flags = flagged([noise], view, 0)
     assert flags.shape == (10_000, 64)
     np.testing.assert_allclose(flags.mean(axis=0), 0.02, atol=5 * np.sqrt(0.02 * 0.98 / 10_000))
@@ -238,7 +240,13 @@ def test_a_detector_sees_the_same_draws_together_where_they_are_stopped(
 
     sizes = {"instrument.processing.fft_size": np.array([2048, 1024, 2048])}
     parameters = _points(table_4_1, **sizes) | {DETECTOR + "kind": "m:f"}
-    given = {"parameters": parameters, "effects": EFFECTS, "keys": keys(3), **much, **WHOLE}
+    given = {
+        "parameters": parameters,
+        "effects": EFFECTS,
+        "keys": make_point_keys(3),
+        **much,
+        **WHOLE,
+    }
     given |= {"accuracy": Accuracy(0.1), "methods": Methods({"m:f": over_the_median})}
     whole, (found, pieces) = simulate(**given), _in_pieces(**given)
     assert pieces > 3
@@ -253,7 +261,7 @@ def test_speckle_is_detected_as_often_as_in_closed_form(table_4_1):
 
     Twice a sharp threshold's spread, as single draws are counted here and averaged there.
     """
-    from mean_over_draws import evaluate as averaged
+    from mean_over_draws import mean_statistics as averaged
 
     parameters = _points(
         table_4_1,
@@ -265,7 +273,7 @@ def test_speckle_is_detected_as_often_as_in_closed_form(table_4_1):
         },
     )
     effects = (*EFFECTS, "speckle")
-    pd = averaged(parameters, effects, keys=keys(1), draws=600)["pd_down"]
+    pd = averaged(parameters, effects, keys=make_point_keys(1), draws=600)["pd_down"]
     found = _drawn(parameters, 600, effects)["pd_down"]
     assert 0.1 < pd[0] < 0.95
     assert found == pytest.approx(pd, abs=5 * 0.5 / np.sqrt(600))
@@ -312,7 +320,7 @@ def test_the_laser_turns_the_record_sample_by_sample(table_4_1):
     parameters |= {"footprint.beamlets": 1}
     ((_, pure),) = prepare(parameters, ("doppler", "image"))
     ((_, shots),) = prepare(parameters, ("doppler", "image", "line_width"))
-    key, draws, rate = keys(1)[0], np.arange(3), 500e6
+    key, draws, rate = make_point_keys(1)[0], np.arange(3), 500e6
     delay = 100.0 / SPEED_OF_LIGHT * rate
     found = drawn_of(shots, 0, 2, signal_of(shots, 0, 2), key=key, draws=draws)
     for draw, drawn in zip(draws, found, strict=True):

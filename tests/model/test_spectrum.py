@@ -5,7 +5,7 @@ Places, phases and far sidelobes in many digits are cases of `tests/stability`.
 
 import numpy as np
 import pytest
-from engine import every, shape_of
+from shot_helpers import line_shape_of_window, parametrize_product
 
 from sweep.model.lines import (
     AMPLITUDE_TOLERANCES,
@@ -37,7 +37,7 @@ def magnitudes(name, sizes, origin, delta, weights, *, power=False, low=0, high=
     fft_size, length = sizes
     high = fft_size // 2 if high is None else high
     n, count, delta = len(delta), high - low + 1, np.asarray(delta, float)
-    table, form, numbers, _, _ = shape_of(window(name, length), fft_size, power=power)
+    table, form, numbers, _, _ = line_shape_of_window(window(name, length), fft_size, power=power)
     room = np.empty((ROOM, max(count, n, LEAST_WIDTH, MOST_CELLS) + 16))
     room[PLACE, :n], room[IM, :n] = delta, 0.0 if power else np.imag(weights)
     room[RE, :n] = np.abs(weights) ** 2 if power else np.real(weights)
@@ -70,7 +70,9 @@ def bundle(rng, number, spread):
 SIZES = [(256, 256), (255, 255), (256, 200), (255, 201), (2000, 77), (4096, 4096), (5000, 4097)]
 
 
-@pytest.mark.parametrize(("name", "sizes"), every(5, [*COSINE_SUMS, *TABULATED], SIZES))
+@pytest.mark.parametrize(
+    ("name", "sizes"), parametrize_product(5, [*COSINE_SUMS, *TABULATED], SIZES)
+)
 def test_bins_are_those_of_the_discrete_fourier_transform(name, sizes):
     """Lines anywhere, near DC and Nyquist and beyond them, and their images."""
     fft_size, length = sizes
@@ -163,7 +165,9 @@ def test_few_lines_are_as_good_in_every_bin_as_the_window_lets_them(name, tolera
 
 @pytest.mark.parametrize(
     ("name", "fft_size"),
-    every(7, ["rectangular", "hann", "hamming", "chebwin(60)", "kaiser(4)"], [2047, 2048, 4096]),
+    parametrize_product(
+        7, ["rectangular", "hann", "hamming", "chebwin(60)", "kaiser(4)"], [2047, 2048, 4096]
+    ),
 )
 def test_bins_that_a_level_leaves_out_hold_less_and_the_others_are_unchanged(
     name, fft_size, table_4_1

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from engine import DRAWS, every, prepared, within_5_sigma
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import integrate, stats
+from shot_helpers import DRAWS, is_within_5_sigma, parametrize_product, prepare_single_category
 
 from sweep.model import alarms, truth
 from sweep.model.detection import Fading
@@ -85,13 +85,15 @@ def shares(shots, alike):
 
 @pytest.mark.parametrize(
     ("tnr", "detection", "alike", "record"),
-    every(5, [2.5, 4.5], ["any_bin", "peak_bin"], [None, 1.0, 0.7], ["real", "complex"]),
+    parametrize_product(
+        5, [2.5, 4.5], ["any_bin", "peak_bin"], [None, 1.0, 0.7], ["real", "complex"]
+    ),
 )
 def test_drawn_records_whose_largest_bin_is_reported(tnr, detection, alike, record, table_4_1):
     """At TNR 2.5 noise nearly always alarms, at 4.5 hardly ever. Segments share their speckle."""
     speckle = "none" if alike is None else "developed"
     changes = {"tnr": tnr, "detection": detection}
-    shots = prepared(scene_of(table_4_1, speckle, record, **changes), FADING)
+    shots = prepare_single_category(scene_of(table_4_1, speckle, record, **changes), FADING)
     shots = shots if alike is None else shares(shots, alike)
     found, rng, each = statistics(shots), np.random.default_rng(71), []
     first, second = (speckle_of(speckle, rng) for _ in range(2))
@@ -101,12 +103,12 @@ def test_drawn_records_whose_largest_bin_is_reported(tnr, detection, alike, reco
         right, wrong = reported(shots, segment, echo, rng)
         each.append((right, wrong))
         assert 0.1 < found[f"pd_{name}"][0] < 0.97
-        assert within_5_sigma(right.sum(), found[f"pd_{name}"][0], 0.005 * DRAWS)
-        assert within_5_sigma(wrong.sum(), found[f"p_wrong_range_{name}"][0], 0.003 * DRAWS)
+        assert is_within_5_sigma(right.sum(), found[f"pd_{name}"][0], 0.005 * DRAWS)
+        assert is_within_5_sigma(wrong.sum(), found[f"p_wrong_range_{name}"][0], 0.003 * DRAWS)
     (up, up_wrong), (down, down_wrong) = each
-    assert within_5_sigma((up & down).sum(), found["pd_shot"][0], 0.007 * DRAWS)
+    assert is_within_5_sigma((up & down).sum(), found["pd_shot"][0], 0.007 * DRAWS)
     spoilt = (up | up_wrong) & (down | down_wrong) & ~(up & down)
-    assert within_5_sigma(spoilt.sum(), found["p_wrong_range_shot"][0], 0.006 * DRAWS)
+    assert is_within_5_sigma(spoilt.sum(), found["p_wrong_range_shot"][0], 0.006 * DRAWS)
     if tnr == 2.5:
         assert found["p_wrong_range_up"][0] > 0.02
 
@@ -115,11 +117,11 @@ def test_drawn_records_whose_largest_bin_is_reported(tnr, detection, alike, reco
 def test_drawn_records_that_are_searched_in_a_band(speckle, table_4_1):
     band = dict(zip(ENDS, (160.0, 240.0, 2.0, 4.0), strict=True))
     scene = scene_of(table_4_1, speckle, tnr=2.5) | band
-    shots, found = prepared(scene, FADING), evaluate(scene, FADING)
+    shots, found = prepare_single_category(scene, FADING), evaluate(scene, FADING)
     rng = np.random.default_rng(72)
     right, wrong = reported(shots, 0, speckle_of(speckle, rng), rng)
-    assert within_5_sigma(right.sum(), found["pd_up"][0], 0.005 * DRAWS)
-    assert within_5_sigma(wrong.sum(), found["p_wrong_range_up"][0], 0.005 * DRAWS)
+    assert is_within_5_sigma(right.sum(), found["pd_up"][0], 0.005 * DRAWS)
+    assert is_within_5_sigma(wrong.sum(), found["p_wrong_range_up"][0], 0.005 * DRAWS)
     whole = evaluate(scene_of(table_4_1, speckle, tnr=2.5), FADING)
     assert found["p_wrong_range_up"][0] < 0.7 * whole["p_wrong_range_up"][0]
 
@@ -137,7 +139,7 @@ def test_chances_are_the_integrals_that_they_stand_for(table_4_1, tnr, decades, 
         table_4_1, speckle, tnr=tnr, power=10**decades, detection="peak_bin",
         noise_bins="independent",
     )  # fmt: skip
-    shots, found = prepared(scene, ALONE), evaluate(scene, ALONE)
+    shots, found = prepare_single_category(scene, ALONE), evaluate(scene, ALONE)
     crosses = evaluate(scene | {PEAKS: "all"}, ALONE)
     sigma = shots.bin_deviation[0]
     level, signal = shots.threshold[0] / sigma, np.sqrt(2 * crosses["snr_up"][0])
@@ -186,9 +188,11 @@ def test_of_strong_echoes_no_peak_is_wrong(table_4_1):
 @pytest.mark.parametrize("record", ["real", "complex"])
 def test_segments_of_their_own_speckle_are_independent(record, table_4_1):
     scene = scene_of(table_4_1, "developed", record, tnr=np.array([2.5, 4.0, 6.0]))
-    found = statistics(shares(prepared(scene, FADING), 0.0))
+    found = statistics(shares(prepare_single_category(scene, FADING), 0.0))
     assert found["pd_shot"] == pytest.approx(found["pd_up"] * found["pd_down"], rel=1e-9)
-    near, far = (statistics(shares(prepared(scene, FADING), 1e-4 * k)) for k in (0, 1))
+    near, far = (
+        statistics(shares(prepare_single_category(scene, FADING), 1e-4 * k)) for k in (0, 1)
+    )
     for name in ("pd_shot", "p_wrong_range_shot"):
         assert near[name] == pytest.approx(far[name], rel=1e-4)
 

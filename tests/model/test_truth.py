@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from engine import difference, every, prepared
 from scipy.constants import c as speed_of_light
+from shot_helpers import magnitude_error, parametrize_product, prepare_single_category
 
 from sweep.model import segments, truth
 from sweep.model.window import samples
@@ -57,7 +57,7 @@ def disagreement(shots):
         bins, fast = segments.spectrum(shots, 0, int(segment))
         exact = truth.spectrum(shots, 0, int(segment), range_walk=False)
         assert np.array_equal(bins, np.arange(shots.fft_size // 2 + 1))
-        worst = max(worst, difference(shots, fast, exact))
+        worst = max(worst, magnitude_error(shots, fast, exact))
     return worst
 
 
@@ -66,7 +66,7 @@ def disagreement(shots):
 )
 def test_the_fast_path_is_the_truth_over_the_whole_range_of_every_parameter(batch, table_4_1):
     for scene in map(drawn_scene, range(batch * BATCH, (batch + 1) * BATCH)):
-        assert disagreement(prepared(table_4_1(**scene))) < AGREEMENT, scene
+        assert disagreement(prepare_single_category(table_4_1(**scene))) < AGREEMENT, scene
 
 
 def velocity_for(frequency, *, sign, parameters):
@@ -80,7 +80,9 @@ def velocity_for(frequency, *, sign, parameters):
 
 @pytest.mark.parametrize(
     ("window", "phases", "fft_size"),
-    every(5, ["rectangular", "hamming", "chebwin(80)"], ["coherent", "incoherent"], [1024, 625]),
+    parametrize_product(
+        5, ["rectangular", "hamming", "chebwin(80)"], ["coherent", "incoherent"], [1024, 625]
+    ),
 )
 def test_the_fast_path_is_the_truth_with_beats_at_dc_and_at_nyquist(
     window, phases, fft_size, table_4_1
@@ -93,7 +95,7 @@ def test_the_fast_path_is_the_truth_with_beats_at_dc_and_at_nyquist(
         for sign in (1, 0, -1):
             for frequency in (0.0, 300e6, -300e6, 600e6):
                 v = velocity_for(frequency, sign=sign, parameters=scene)
-                shots = prepared(scene | {"target.radial_velocity": v})
+                shots = prepare_single_category(scene | {"target.radial_velocity": v})
                 assert disagreement(shots) < AGREEMENT
 
 
@@ -109,7 +111,7 @@ def test_the_fast_path_is_the_truth_with_beats_at_dc_and_at_nyquist(
     ],
 )
 def test_the_fast_path_is_the_truth_at_the_published_fft_sizes(changes, table_4_1):
-    assert disagreement(prepared(table_4_1(**changes))) < AGREEMENT
+    assert disagreement(prepare_single_category(table_4_1(**changes))) < AGREEMENT
 
 
 def test_the_fast_path_is_the_truth_where_each_beamlet_has_a_doppler_shift_of_its_own(table_4_1):
@@ -117,7 +119,7 @@ def test_the_fast_path_is_the_truth_where_each_beamlet_has_a_doppler_shift_of_it
     rng = np.random.default_rng(21)
     for phases, v in (("coherent", 150.0), ("incoherent", 150.0), ("coherent", 0.0)):
         scene = table_4_1(fft_size=8192, phases=phases, radial_velocity=v, grazing_angle=0.4)
-        shots = prepared(scene | {"footprint.beamlets": 19, "target.range": 9000.0})
+        shots = prepare_single_category(scene | {"footprint.beamlets": 19, "target.range": 9000.0})
         own = replace(shots, doppler=rng.uniform(-1e-8, 1e-8, shots.offset.shape))
         assert disagreement(own) < AGREEMENT
         _, with_shifts = segments.spectrum(own, 0, 1)
@@ -145,7 +147,7 @@ def test_the_frequency_of_the_record_is_that_of_the_delayed_chirp_less_the_chirp
     segment, sign, v, architecture, start, table_4_1
 ):
     """Derivative of the unwrapped phase against (f + s S (t - tau)) (1 - tau') - (f + s S t)."""
-    shots = prepared(
+    shots = prepare_single_category(
         table_4_1(**ONE_WAY, radial_velocity=v, acquisition_delay=5e-6, architecture=architecture)
     )
     rate, f = 1e9 / 500e-6, start + 1e9 * (sign < 0)
@@ -187,7 +189,7 @@ def test_the_record_is_what_a_balanced_detector_makes_of_two_optical_fields(
     oscillator, received = field(1e-3, t), np.sqrt(0.5) * field(echo, t - delay)
     one, other = (oscillator + received) / np.sqrt(2), (oscillator - received) / np.sqrt(2)
     voltage = 7e3 * 1.1 * 3.0 * (np.abs(one) ** 2 - np.abs(other) ** 2)
-    record = truth.analytic_record(prepared(scene), 0, segment, 0).real
+    record = truth.analytic_record(prepare_single_category(scene), 0, segment, 0).real
     # Phases of 2e9 t + 1e12 t^2 < 1e5 cycles round to 1e-11; powers of 1e-3 W to 1e-19 W, against
     # a beat of sqrt(1e-3 echo) = 2e-7 W.
     assert np.abs(record - voltage).max() < 1e-8 * np.abs(voltage).max()
@@ -205,7 +207,7 @@ def test_a_tone_stands_at_half_its_amplitude_times_the_windows_sum(window, loss_
     heights = []
     for bins in (1000.0, 1000.5):
         v = velocity_for(bins * 600e6 / 4096, sign=0, parameters=scene)
-        shots = prepared(scene | {"target.radial_velocity": v})
+        shots = prepare_single_category(scene | {"target.radial_velocity": v})
         magnitude = truth.spectrum(shots, 0, 1, range_walk=False)
         heights.append(magnitude[1000])
         if bins == 1000.0:
@@ -225,7 +227,7 @@ def test_incoherent_truth_is_the_root_mean_square_over_independent_phases(table_
         beamlets=3, fft_size=512, range=40.0, radial_velocity=0.6, grazing_angle=0.05,
         beam_divergence=4e-3, window="hamming",
     )  # fmt: skip
-    shots = prepared(scene | {"footprint.phases": "incoherent"})
+    shots = prepare_single_category(scene | {"footprint.phases": "incoherent"})
     weights = 0.54 - 0.46 * np.cos(2 * np.pi * np.arange(512) / 512)
     for segment in range(3):
         records = [truth.analytic_record(shots, 0, segment, b) for b in range(3)]
@@ -248,7 +250,7 @@ def test_a_complex_record_has_signed_bins_and_no_images(table_4_1, phases, windo
         window=window, phases=phases, fft_size=4096, beamlets=7, range=30.0,
         radial_velocity=velocity,
     )  # fmt: skip
-    shots = replace(prepared(scene), complex_record=True, phase_errors=())
+    shots = replace(prepare_single_category(scene), complex_record=True, phase_errors=())
     w, half = samples(window, 4096), 2048
     found = segments.find(shots)
     for segment in range(3):
@@ -258,6 +260,6 @@ def test_a_complex_record_has_signed_bins_and_no_images(table_4_1, phases, windo
         exact = coherent if phases == "coherent" else np.sqrt((abs(spectra) ** 2).sum(axis=0))
         bins, magnitude = segments.spectrum(shots, 0, segment)
         assert bins.size == 4096
-        assert difference(shots, magnitude, exact[bins % 4096]) <= AGREEMENT
+        assert magnitude_error(shots, magnitude, exact[bins % 4096]) <= AGREEMENT
         peak = (exact.argmax() + half) % 4096 - half
         assert found[segment, 3, 0] == peak * shots.sample_rate / 4096

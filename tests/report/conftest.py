@@ -4,14 +4,14 @@ import shutil
 
 import pytest
 from click.testing import CliRunner
-from reported import EXPERIMENTS, GRID, SCENE
+from report_specs import EXPERIMENTS, GRID_SPEC, SCENE_SPEC
 
 from sweep.cli import main
-from sweep.report.writing import write
-from sweep.spec import SceneSpec, Spec
+from sweep.report.study_report import write_report
+from sweep.spec import GridSpec, SceneSpec
 from sweep.tasks import driver
 
-ARGUMENTS = [
+CHROMIUM_ARGUMENTS = [
     "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
     "--disable-background-networking", "--disable-component-update",
 ]  # fmt: skip
@@ -21,7 +21,7 @@ ARGUMENTS = [
 def grid_store(tmp_path_factory):
     """Two powers, 1201 ranges and three angles; not to be changed."""
     store = tmp_path_factory.mktemp("grid") / "grid.zarr"
-    spec = Spec.from_mapping(GRID, base=EXPERIMENTS)
+    spec = GridSpec.from_mapping(GRID_SPEC, base=EXPERIMENTS)
     assert driver.run(spec, store=store, scheduler="none", progress=False).complete
     return store
 
@@ -30,7 +30,7 @@ def grid_store(tmp_path_factory):
 def scene_store(tmp_path_factory):
     """Four beams over hills, in full light and in dim; not to be changed."""
     store = tmp_path_factory.mktemp("scene") / "scene.zarr"
-    spec = SceneSpec.from_mapping(SCENE, base=EXPERIMENTS)
+    spec = SceneSpec.from_mapping(SCENE_SPEC, base=EXPERIMENTS)
     assert driver.run(spec, store=store, scheduler="none", progress=False).complete
     return store
 
@@ -38,15 +38,15 @@ def scene_store(tmp_path_factory):
 @pytest.fixture(scope="session")
 def grid_page(grid_store):
     """The grid's page, which the command writes beside the store."""
-    ran = CliRunner().invoke(main, ["report", str(grid_store)], catch_exceptions=False)
+    result = CliRunner().invoke(main, ["report", str(grid_store)], catch_exceptions=False)
     page = grid_store.with_name("grid-report.html")
-    assert ran.exit_code == 0 and ran.stdout.startswith(f"{page}: ")
+    assert result.exit_code == 0 and result.stdout.startswith(f"{page}: ")
     return page
 
 
 @pytest.fixture(scope="session")
 def scene_page(scene_store):
-    return write(scene_store, scene_store.with_name("scene.html"))
+    return write_report(scene_store, scene_store.with_name("scene.html"))
 
 
 @pytest.fixture(scope="session")
@@ -56,8 +56,8 @@ def chromium():
     if path is None:
         pytest.skip("no chromium on the path")
     playwright = pytest.importorskip("playwright.sync_api")
-    with playwright.sync_playwright() as run:
-        browser = run.chromium.launch(executable_path=path, args=ARGUMENTS)
+    with playwright.sync_playwright() as playwright_session:
+        browser = playwright_session.chromium.launch(executable_path=path, args=CHROMIUM_ARGUMENTS)
         yield browser
         browser.close()
 
@@ -68,7 +68,7 @@ def opened(chromium):
 
     At the end it must have said nothing wrong, and asked nothing of any network.
     """
-    wrong, asked, contexts = [], [], []
+    page_errors, requested_urls, contexts = [], [], []
 
     def opened(file, *, width=1200, scheme="light"):
         context = chromium.new_context(
@@ -76,9 +76,9 @@ def opened(chromium):
         )
         contexts.append(context)
         page = context.new_page()
-        page.on("console", lambda m: wrong.append(m.text) if m.type == "error" else None)
-        page.on("pageerror", lambda error: wrong.append(str(error)))
-        page.on("request", lambda request: asked.append(request.url))
+        page.on("console", lambda m: page_errors.append(m.text) if m.type == "error" else None)
+        page.on("pageerror", lambda error: page_errors.append(str(error)))
+        page.on("request", lambda request: requested_urls.append(request.url))
         page.goto(file.as_uri())
         page.wait_for_selector("html[data-drawn=all]", timeout=60_000)
         return page
@@ -86,5 +86,5 @@ def opened(chromium):
     yield opened
     for context in contexts:
         context.close()
-    assert not wrong
-    assert not [url for url in asked if not url.startswith(("file:", "data:", "blob:"))]
+    assert not page_errors
+    assert not [url for url in requested_urls if not url.startswith(("file:", "data:", "blob:"))]

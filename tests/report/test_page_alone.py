@@ -28,7 +28,7 @@ def test_a_page_needs_no_home_and_no_settings(tmp_path, where):
         (tmp_path / "itables.toml").write_text('classes = "theirs"\n')
     code = UNKNOWN if where == "nobody's home" else ""
     code += (
-        "import os, sweep.report.page, itables.options as options\n"
+        "import os, sweep.report.html_page, itables.options as options\n"
         "assert 'ITABLES_CONFIG' not in os.environ\n"
         "assert options.classes != 'theirs'\n"
     )

@@ -13,19 +13,19 @@ import pandas
 import pytest
 import yaml
 from click.testing import CliRunner
-from reported import EXPERIMENTS, GRID
+from report_specs import EXPERIMENTS, GRID_SPEC
 
 import sweep
-from sweep.analysis.figures import SceneStudy, Study
-from sweep.analysis.opening import NotAStoreError
+from sweep.analysis.datasets import NotAStoreError
+from sweep.analysis.study_figures import GridResults, SceneResults
 from sweep.cli import main
 from sweep.model.pairing import TRUE
 from sweep.model.shot import evaluate
 from sweep.model.threshold import TNR
-from sweep.report import detector, flights
-from sweep.report.page import Control
-from sweep.report.writing import write
-from sweep.spec import Spec
+from sweep.report import detector_charts, flight_charts
+from sweep.report.html_page import Control
+from sweep.report.study_report import write_report
+from sweep.spec import GridSpec
 from sweep.tasks import driver
 
 
@@ -37,7 +37,7 @@ def _spec_in(page):
 
 
 def test_the_spec_on_the_page_is_the_study_s_own(grid_page, grid_store):
-    spec = Spec.from_mapping(_spec_in(grid_page))
+    spec = GridSpec.from_mapping(_spec_in(grid_page))
     assert spec.id == json.loads((grid_store / "zarr.json").read_text())["attributes"]["study_id"]
     assert spec.id in grid_page.read_text()
 
@@ -65,10 +65,10 @@ def test_figures_without_points_are_told_and_whole_spectra_have_no_threshold_to_
     figures = [{"kind": "slices", "variable": "pd_shot", "x": "range", "title": "Elsewhere",
                 "where": {"range": "7 km"}}]  # fmt: skip
     kinds = {"instrument.processing.detector.kind": ["fixed", "ca_cfar"]}
-    spec = Spec.from_mapping(
-        GRID
+    spec = GridSpec.from_mapping(
+        GRID_SPEC
         | {
-            "instrument": {"file": GRID["instrument"], "processing": {"fft_size": "2^12"}},
+            "instrument": {"file": GRID_SPEC["instrument"], "processing": {"fft_size": "2^12"}},
             "axes": {"target.range": ["1 km", "2 km"], "target.grazing_angle": ["45 deg"]} | kinds,
             "draws": {"method": "spectra", "number": 3},
             "figures": figures,
@@ -77,47 +77,49 @@ def test_figures_without_points_are_told_and_whole_spectra_have_no_threshold_to_
     )
     store = tmp_path / "spectra.zarr"
     driver.run(spec, store=store, scheduler="none", progress=False)
-    text = write(store, tmp_path / "spectra.html").read_text()
+    text = write_report(store, tmp_path / "spectra.html").read_text()
     assert "No point of the study is within its limits." in text
     assert "Receiver operating characteristic" not in text and "Noise by source" in text
 
 
 def test_an_incomplete_store_says_so(tmp_path):
     axes = {"target.range": ["1 km", "2 km"], "target.grazing_angle": ["45 deg"]}
-    spec = Spec.from_mapping(
-        GRID | {"axes": axes, "figures": [], "storage": {"block_points": 1}}, base=EXPERIMENTS
+    spec = GridSpec.from_mapping(
+        GRID_SPEC | {"axes": axes, "figures": [], "storage": {"block_points": 1}}, base=EXPERIMENTS
     )
     store = tmp_path / "half.zarr"
     driver.run(spec, store=store, scheduler="none", progress=False)
     receipts = store / ".sweep" / "receipts.jsonl"
     receipts.write_text(receipts.read_text().splitlines(keepends=True)[0])
-    page = write(store, tmp_path / "half.html")
+    page = write_report(store, tmp_path / "half.html")
     assert "The study is not complete: 1 of 2 points are computed." in page.read_text()
 
 
 @pytest.mark.parametrize("axes", [{}, {"instrument.processing.window": ["hann", "hamming"]}])
 def test_studies_without_a_numeric_axis_have_a_page(tmp_path, axes):
-    target = GRID["target"] | {"range": "2 km", "grazing_angle": "60 deg"}
-    spec = Spec.from_mapping(GRID | {"axes": axes, "target": target, "figures": []},
+    target = GRID_SPEC["target"] | {"range": "2 km", "grazing_angle": "60 deg"}
+    spec = GridSpec.from_mapping(GRID_SPEC | {"axes": axes, "target": target, "figures": []},
                              base=EXPERIMENTS)  # fmt: skip
     store = tmp_path / "point.zarr"
     driver.run(spec, store=store, scheduler="none", progress=False)
-    text = write(store, tmp_path / "point.html").read_text()
+    text = write_report(store, tmp_path / "point.html").read_text()
     assert "Receiver operating characteristic" in text and "Noise by source" in text
 
 
 def test_characteristics_are_those_of_the_answers_and_alarms_those_of_the_model(grid_store):
-    study = Study.of(grid_store)
-    (track, *_), _ = detector.tracks(study)
-    chart = detector.roc(study, [track], 0)
-    (place, *_) = detector._places_of_interest(track)
-    point = study.dataset.isel(track.position(place))
-    curve = point.sweep.roc(detector.IN_A_BIN)
-    by_alarm = {panel.when["alarm"]: panel.lines[0] for panel in chart.panels}
+    study = GridResults.from_store(grid_store)
+    (track, *_), _ = detector_charts.grid_profiles(study)
+    chart = detector_charts.roc_chart(study, [track], 0)
+    (place, *_) = detector_charts._roc_indices(track)
+    point = study.dataset.isel(track.axis_indices(place))
+    curve = point.sweep.roc(detector_charts.ROC_PFA_BIN_VALUES)
+    by_alarm = {panel.facet_choices["alarm"]: panel.lines[0] for panel in chart.panels}
     for line in by_alarm.values():
         np.testing.assert_allclose(line.y, curve["pd"], rtol=1e-6)
-    position = track.position(place)
-    at = {m.path: m.values[position[axis.name]] for axis in study.spec.axes for m in axis.members}
+    position = track.axis_indices(place)
+    at = {
+        m.path: m.values[position[axis.name]] for axis in study.spec.axes for m in axis.parameters
+    }
     of_model = evaluate(study.spec.parameters() | at | {TNR: curve["curve_tnr"].values}, [])
     for alarm, name in (("in a bin", "pfa_bin"), ("in a segment", "pfa_segment"),
                         ("in both chirps", "pfa_both_chirps")):  # fmt: skip
@@ -183,27 +185,32 @@ def test_a_flight_s_page_opens_with_its_points_and_velocities(scene_page, scene_
 
 def test_an_answer_from_the_parts_that_a_page_shows_says_so():
     counts = pandas.DataFrame([{"what": "four", "shots": 20, "true": 18, "false alarm": 1}] * 2)
-    assert flights.came_back(counts, [], 3) == [
+    assert flight_charts.returns_sentences(counts, [], 3) == [
         "In the 2 of 5 parts of the study shown here, 40 shots brought back 36 true points and 2 "
         "false ones; a shot counts once a draw."
     ]
 
 
 def test_errors_of_a_flight_are_measured_less_true(scene_store):
-    study = SceneStudy.of(scene_store)
-    seen, _ = flights.recordings(study)
-    chart = flights.errors(seen)
+    study = SceneResults.from_store(scene_store)
+    seen, _ = flight_charts.select_recordings(study)
+    chart = flight_charts.error_chart(seen)
     group = study.tree["four"].to_dataset().isel(draw=0, optical_efficiency=0)
     true = (group["flags"].values & TRUE) > 0
     expected = (group["range_interpolated"] - group["true_range"]).values[true]
     drawn = np.concatenate([line.y for line in chart.panels[0].lines])
     np.testing.assert_array_equal(np.sort(drawn), np.sort(expected))
-    assert f"rms {np.sqrt(np.mean(expected**2)):.3g}" in chart.panels[0].when["quantity"]
+    assert f"rms {np.sqrt(np.mean(expected**2)):.3g}" in chart.panels[0].facet_choices["quantity"]
 
 
 def test_parts_of_a_study_open_in_their_middle():
-    assert [Control("part", "", list("abcdef")[:n]).start for n in (1, 2, 3, 6)] == [0, 0, 1, 2]
-    assert Control("answer", "", list("abc")).start == 0
+    assert [Control("part", "", list("abcdef")[:n]).initial_option for n in (1, 2, 3, 6)] == [
+        0,
+        0,
+        1,
+        2,
+    ]
+    assert Control("answer", "", list("abc")).initial_option == 0
 
 
 def test_what_is_no_study_is_refused_in_words(tmp_path, scene_store):
@@ -211,20 +218,20 @@ def test_what_is_no_study_is_refused_in_words(tmp_path, scene_store):
     assert missing.exit_code == 2 and "there is no store at" in missing.stderr
     (eyepoints,) = (scene_store.parent / "eyepoints").glob("*.zarr")
     with pytest.raises(NotAStoreError, match="holds the eyepoints of a flight"):
-        write(eyepoints, tmp_path / "page.html")
+        write_report(eyepoints, tmp_path / "page.html")
     assert not list(tmp_path.glob("*.html"))
 
 
 MEMORY = """
 import resource, sys
-from sweep.report.writing import write
-from sweep.spec import Spec
-from sweep.tasks.grid_study import GridStudy
-from sweep.tasks.store import create
+from sweep.report.study_report import write_report
+from sweep.spec import GridSpec
+from sweep.tasks.studies.grid_study import GridStudy
+from sweep.tasks.engine.study_store import create_store
 
-spec = Spec.from_mapping({mapping!r}, base={base!r})
-create(sys.argv[1], GridStudy(spec))
-write(sys.argv[1], sys.argv[1] + ".html")
+spec = GridSpec.from_mapping({mapping!r}, base={base!r})
+create_store(sys.argv[1], GridStudy(spec))
+write_report(sys.argv[1], sys.argv[1] + ".html")
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 """
 
@@ -237,7 +244,7 @@ def test_a_hundred_million_points_take_little_more_memory_than_a_million(tmp_pat
             "target.range": {"linear": ["1 m", "12 km"], "number": number},
             "target.grazing_angle": {"linear": ["1 deg", "90 deg"], "number": 100},
         }
-        mapping = GRID | {"axes": axes, "figures": GRID["figures"][:1]}
+        mapping = GRID_SPEC | {"axes": axes, "figures": GRID_SPEC["figures"][:1]}
         code = MEMORY.format(mapping=mapping, base=str(EXPERIMENTS))
         store = tmp_path / f"{number}.zarr"
         ran = subprocess.run(
@@ -252,7 +259,7 @@ def test_a_place_of_a_flight_without_computed_shots_has_no_panel_over_time(scene
     shutil.copytree(scene_store, store)
     shutil.rmtree(store / "four" / "flags" / "c" / "0")  # of the first of two places
     (store / ".sweep" / "receipts.jsonl").unlink()  # what is committed has to be there
-    found, _ = flights.recordings(SceneStudy.of(store))
-    for chart in (flights.along(found), flights.errors(found)):
-        assert {panel.when["cloud"] for panel in chart.panels} == {found[1].words}
+    found, _ = flight_charts.select_recordings(SceneResults.from_store(store))
+    for chart in (flight_charts.shots_over_time_chart(found), flight_charts.error_chart(found)):
+        assert {panel.facet_choices["cloud"] for panel in chart.panels} == {found[1].label}
         assert all(panel.lines for panel in chart.panels)

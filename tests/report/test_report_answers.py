@@ -2,17 +2,17 @@
 
 import numpy as np
 import pytest
-from reported import EXPERIMENTS, GRID
+from report_specs import EXPERIMENTS, GRID_SPEC
 
 from sweep.analysis import labels
-from sweep.analysis.charts import SHEET
-from sweep.analysis.figures import Study
-from sweep.report import detector
-from sweep.report.page import Table
-from sweep.spec import Slices, Spec
+from sweep.analysis.charts import SHEET_LIMITS
+from sweep.analysis.study_figures import GridResults
+from sweep.report import detector_charts
+from sweep.report.html_page import HtmlTable
+from sweep.spec import GridSpec, SlicesFigure
 from sweep.tasks import driver
 
-SPECKLED = GRID | {
+SPECKLED = GRID_SPEC | {
     "target": {"radial_velocity": "150 m/s", "reflectance": 0.1, "roughness": "1 um"},
     "footprint": {"beamlets": 1, "speckle": "none"},
     "draws": {"number": 60},
@@ -24,9 +24,9 @@ SPECKLED = GRID | {
 
 def made(directory, mapping):
     """The study of a mapping, computed."""
-    spec = Spec.from_mapping(mapping, base=EXPERIMENTS)
+    spec = GridSpec.from_mapping(mapping, base=EXPERIMENTS)
     driver.run(spec, store=directory / "made.zarr", scheduler="none", progress=False)
-    return Study.of(directory / "made.zarr")
+    return GridResults.from_store(directory / "made.zarr")
 
 
 @pytest.fixture(scope="module")
@@ -41,29 +41,29 @@ def drawn_lines(chart, **choices):
     return {line.name: line for line in panel.lines}
 
 
-@pytest.mark.parametrize("choice,answer", detector.ANSWERS.items())
+@pytest.mark.parametrize("choice,answer", detector_charts.ANSWER_BY_LABEL.items())
 def test_the_maximum_range_is_the_answer_s_in_the_units_of_the_page(grid_store, choice, answer):
-    study = Study.of(grid_store)
-    chart = detector.maximum_range(study)
-    expected = study.dataset.sweep.maximum_range(detector.PD)[answer].compute() / 1000
+    study = GridResults.from_store(grid_store)
+    chart = detector_charts.maximum_range_item(study)
+    expected = study.dataset.sweep.maximum_range(detector_charts.PD_LEVEL)[answer].compute() / 1000
     assert expected.notnull().any()
     for power in (1, 3):
         line = drawn_lines(chart, answer=choice)[f"power {power} W"]
         assert list(line.x) == [20, 50, 80]
         np.testing.assert_allclose(line.y, expected.sel(power=power), rtol=1e-6)
-    assert {panel.y.words for panel in chart.panels} == {"maximum range (km)"}
-    assert f"pd of {detector.PD:g}" in chart.heading
+    assert {panel.y.label for panel in chart.panels} == {"maximum range (km)"}
+    assert f"pd of {detector_charts.PD_LEVEL:g}" in chart.heading
 
 
 def test_a_study_of_range_alone_has_its_maximum_range_in_a_table(tmp_path):
     axes = {"target.range": {"step": ["500 m", "12 km", "500 m"]}}
-    target = GRID["target"] | {"grazing_angle": "50 deg"}
-    study = made(tmp_path, GRID | {"axes": axes, "target": target, "figures": []})
-    table = detector.maximum_range(study)
-    assert isinstance(table, Table)
-    answer = study.dataset.sweep.maximum_range(detector.PD).compute()
+    target = GRID_SPEC["target"] | {"grazing_angle": "50 deg"}
+    study = made(tmp_path, GRID_SPEC | {"axes": axes, "target": target, "figures": []})
+    table = detector_charts.maximum_range_item(study)
+    assert isinstance(table, HtmlTable)
+    answer = study.dataset.sweep.maximum_range(detector_charts.PD_LEVEL).compute()
     assert list(table.frame["maximum range (km)"] * 1000) == [
-        pytest.approx(float(answer[name])) for name in detector.ANSWERS.values()
+        pytest.approx(float(answer[name])) for name in detector_charts.ANSWER_BY_LABEL.values()
     ]
     assert set(table.frame["which is"]) == {"found"}
 
@@ -76,33 +76,37 @@ def test_cuts_along_a_zipped_axis_have_a_maximum_range_each_and_no_range_none(tm
         {"target.range": {"step": ["500 m", "9 km", "500 m"]}, "target.grazing_angle": "85 deg"},
     ]}  # fmt: skip
     axes = {"instrument.laser.power": ["1 W", "3 W"], "cut": cut}
-    study = made(tmp_path, GRID | {"axes": axes, "figures": []})
-    chart = detector.maximum_range(study)
-    parts = list(dict.fromkeys(panel.when["part"] for panel in chart.panels))
+    study = made(tmp_path, GRID_SPEC | {"axes": axes, "figures": []})
+    chart = detector_charts.maximum_range_item(study)
+    parts = list(dict.fromkeys(panel.facet_choices["part"] for panel in chart.panels))
     assert parts == ["grazing angle 30°", "grazing angle 85°"]
     steep = study.dataset.isel(cut=study.dataset.grazing_angle.values == 85)
-    expected = steep.sweep.maximum_range(detector.PD).unbroken / 1000
-    (line,) = drawn_lines(chart, part="grazing angle 85°", answer=detector.KEPT).values()
+    expected = steep.sweep.maximum_range(detector_charts.PD_LEVEL).unbroken / 1000
+    (line,) = drawn_lines(
+        chart, part="grazing angle 85°", answer=detector_charts.UNBROKEN_LABEL
+    ).values()
     np.testing.assert_allclose(line.y, expected, rtol=1e-6)
-    target = GRID["target"] | {"range": "1 km", "grazing_angle": "50 deg"}
+    target = GRID_SPEC["target"] | {"range": "1 km", "grazing_angle": "50 deg"}
     power = {"instrument.laser.power": ["1 W", "3 W"]}
     (tmp_path / "powers").mkdir()
-    powers = made(tmp_path / "powers", GRID | {"axes": power, "target": target, "figures": []})
-    assert detector.maximum_range(powers) is None
+    powers = made(tmp_path / "powers", GRID_SPEC | {"axes": power, "target": target, "figures": []})
+    assert detector_charts.maximum_range_item(powers) is None
     near = {"target.range": ["50 m", "60 m"], "target.grazing_angle": ["50 deg", "60 deg"]}
     (tmp_path / "near").mkdir()
-    sure = detector.maximum_range(made(tmp_path / "near", GRID | {"axes": near, "figures": []}))
-    assert detector.is_empty(sure) and not detector.is_empty(chart)
-    (told,) = detector.reached(sure)
+    sure = detector_charts.maximum_range_item(
+        made(tmp_path / "near", GRID_SPEC | {"axes": near, "figures": []})
+    )
+    assert detector_charts.is_empty(sure) and not detector_charts.is_empty(chart)
+    (told,) = detector_charts.maximum_range_sentences(sure)
     assert told.startswith("No maximum range at 2 of 2 places") and "up to the last" in told
 
 
 def test_where_a_study_draws_lines_have_the_intervals_of_their_points(drawn):
-    figure = Slices(kind="slices", variable="pd_shot", x="range", by="grazing_angle")
-    chart = drawn.chart(figure, SHEET)
+    figure = SlicesFigure(kind="slices", variable="pd_shot", x="range", by="grazing_angle")
+    chart = drawn.make_chart(figure, SHEET_LIMITS)
     told = drawn.dataset.sweep.detection_probability("shot").compute()
     for angle in (30, 90):
-        line = drawn_lines(chart)[f"grazing angle {labels.quantity(angle, 'deg')}"]
+        line = drawn_lines(chart)[f"grazing angle {labels.format_quantity(angle, 'deg')}"]
         own = told.sel(grazing_angle=angle)
         assert (own.high - own.low).max() > 0.05
         np.testing.assert_allclose(line.y, own.pd, atol=1e-6)
@@ -112,9 +116,9 @@ def test_where_a_study_draws_lines_have_the_intervals_of_their_points(drawn):
 
 
 def test_the_maximum_range_has_an_interval_where_pd_has(drawn):
-    chart = detector.maximum_range(drawn)
-    expected = drawn.dataset.sweep.maximum_range(detector.PD).compute() / 1000
-    (line,) = drawn_lines(chart, answer=detector.KEPT).values()
+    chart = detector_charts.maximum_range_item(drawn)
+    expected = drawn.dataset.sweep.maximum_range(detector_charts.PD_LEVEL).compute() / 1000
+    (line,) = drawn_lines(chart, answer=detector_charts.UNBROKEN_LABEL).values()
     known = np.isfinite(expected.unbroken_low + expected.unbroken_high)
     assert known.any()
     np.testing.assert_allclose(line.low[known], expected.unbroken_low[known], rtol=1e-6)
@@ -123,11 +127,11 @@ def test_the_maximum_range_has_an_interval_where_pd_has(drawn):
 
 
 def test_false_alarms_of_a_shot_are_those_that_are_told_a_second(grid_store):
-    study = Study.of(grid_store)
-    found, fewer = detector.tracks(study)
-    chart = detector.false_alarms(study, found, fewer)
-    at = found[0].part.first(found[0].side)
-    shown = drawn_lines(chart, part=found[0].words)
+    study = GridResults.from_store(grid_store)
+    found, fewer = detector_charts.grid_profiles(study)
+    chart = detector_charts.false_alarm_chart(study, found, fewer)
+    at = found[0].points.first_indices(found[0].coordinate)
+    shown = drawn_lines(chart, part=found[0].label)
     for name, leakage in (("noise, both", False), ("either, both", True)):
         a_second = study.dataset.isel(at).sweep.false_alarms_per_second("1 Hz", leakage=leakage)
         together = -(-a_second.size // len(shown[name].y))

@@ -8,15 +8,15 @@ from sweep.model.geometry.platform import ConstantAcceleration, Flight, Nadir
 from sweep.model.geometry.rays import Caster
 from sweep.model.geometry.scanner import cone, fixed
 from sweep.model.outputs import BEAMLETS, SHOTS
-from sweep.scenes.eyepoint_arrays import from_arrays, to_arrays
-from sweep.scenes.meshes import clean
+from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays, eyepoints_to_arrays
+from sweep.scenes.meshes import clean_mesh
 
 
 @pytest.fixture(scope="module")
 def eyepoints():
     """Shots near the edge of a plate: some see it, some in part, some not at all."""
     corners = 30.0 * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
-    ground = clean(corners, np.array([[0, 1, 2], [0, 2, 3]]), 0)[0]
+    ground = clean_mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]), 0)[0]
     path = ConstantAcceleration((0.0, 0.0, 100.0), (10.0, 0.0, 0.0), (0.0, 0.0, 0.0), 10.0)
     return observe(
         np.arange(24),
@@ -29,7 +29,7 @@ def eyepoints():
 
 
 def test_arrays_have_names_types_and_dimensions_of_the_store(eyepoints):
-    arrays = to_arrays(eyepoints)
+    arrays = eyepoints_to_arrays(eyepoints)
     outputs = {**SHOTS, **BEAMLETS}
     sizes = {"shot": 24, "beamlet": 7, "xyz": 3}
     assert arrays.keys() == outputs.keys()
@@ -39,14 +39,14 @@ def test_arrays_have_names_types_and_dimensions_of_the_store(eyepoints):
 
 
 def test_what_is_read_back_is_what_was_cast_bit_for_bit(eyepoints):
-    back = from_arrays(to_arrays(eyepoints), eyepoints.weight)
+    back = eyepoints_from_arrays(eyepoints_to_arrays(eyepoints), eyepoints.weight)
     for name, array in eyepoints._asdict().items():
         assert np.array_equal(getattr(back, name), array, equal_nan=array.dtype.kind == "f"), name
         assert getattr(back, name).dtype == array.dtype, name
 
 
 def test_the_surface_of_the_beam_is_that_of_its_first_beamlet_that_hits(eyepoints):
-    surface = to_arrays(eyepoints)["beam_surface"]
+    surface = eyepoints_to_arrays(eyepoints)["beam_surface"]
     partial = (eyepoints.surface[:, 0] < 0) & eyepoints.seen
     assert partial.any() and not eyepoints.seen.all()
     assert np.array_equal(surface >= 0, eyepoints.seen)
@@ -56,10 +56,10 @@ def test_the_surface_of_the_beam_is_that_of_its_first_beamlet_that_hits(eyepoint
 
 
 def test_arrays_that_are_missing_or_of_another_size_are_named(eyepoints):
-    arrays = to_arrays(eyepoints)
+    arrays = eyepoints_to_arrays(eyepoints)
     with pytest.raises(ValueError, match="lack offset"):
-        from_arrays({k: v for k, v in arrays.items() if k != "offset"}, eyepoints.weight)
+        eyepoints_from_arrays({k: v for k, v in arrays.items() if k != "offset"}, eyepoints.weight)
     with pytest.raises(ValueError, match=r"beam_range has shape \(23,\), not \(24,\)"):
-        from_arrays(arrays | {"beam_range": arrays["beam_range"][:-1]}, eyepoints.weight)
+        eyepoints_from_arrays(arrays | {"beam_range": arrays["beam_range"][:-1]}, eyepoints.weight)
     with pytest.raises(ValueError, match=r"offset has shape \(24, 7\), not \(24, 6\)"):
-        from_arrays(arrays, eyepoints.weight[:-1])
+        eyepoints_from_arrays(arrays, eyepoints.weight[:-1])

@@ -9,9 +9,9 @@ import pytest
 import rasterio
 from rasterio import Affine
 
-from sweep.scenes.files import SceneError
-from sweep.scenes.maps import Factors, MapFrame, degree_at, require_one_map
+from sweep.scenes.map_frames import MapFrame, MetresPerUnit, degree_lengths, require_one_map
 from sweep.scenes.rasters import raster_digest, read_raster
+from sweep.scenes.scene_files import SceneError
 from sweep.scenes.terrain import Terrain
 from sweep.scenes.tiles import join_tiles
 
@@ -100,7 +100,7 @@ def test_other_maps_are_refused(survey, crs, middle, said):
 
 
 def test_a_large_raster_in_degrees_is_told_how_far_its_edges_are_off(survey):
-    metres = degree_at(45.0)
+    metres = degree_lengths(45.0)
     near = survey("EPSG:4326", (10.0, 45.0), 1e-3, metres[0], name="near.tif")
     assert read_raster(near, metres_per_degree=metres).warnings == ()
     far = survey("EPSG:4326", (10.0, 45.0), 0.2, metres[0], name="far.tif")
@@ -126,7 +126,9 @@ def test_a_map_in_feet_asks_for_the_unit_of_its_heights(survey):
     assert slope(read_raster(path, height_unit="m")) == pytest.approx(0.656, rel=1e-3)
     told = survey(FEET, COLORADO, 100.0, 1.0, name="told.tif", unit="US survey foot")
     assert slope(read_raster(told)) == pytest.approx(0.2, rel=1e-9)
-    assert read_raster(path, scaled=True).heights[0, 0] == 100  # the spec's factor tells the unit
+    assert (
+        read_raster(path, has_height_scale=True).heights[0, 0] == 100
+    )  # the spec's factor tells the unit
 
 
 def test_a_vertical_reference_system_tells_the_unit_of_heights(survey):
@@ -188,7 +190,7 @@ def test_depths_are_no_heights(survey):
 def test_a_unit_and_a_factor_of_heights_are_too_much(survey):
     path = survey("EPSG:32633", (500_000.0, 5e6), 10.0, 1.0, unit="ft")
     with pytest.raises(SceneError, match=r"heights in ft.*leave the scale out"):
-        read_raster(path, scaled=True)
+        read_raster(path, has_height_scale=True)
 
 
 @pytest.mark.parametrize(("unit", "metres"), [("metre", 1.0), ("foot", 0.3048)])
@@ -215,9 +217,9 @@ def test_coordinates_that_could_be_degrees_are_asked_about(tmp_path, west, south
     path = write_asc(tmp_path / "dem.asc", west=west, south=south, cell=cell)
     with pytest.raises(SceneError, match=r"could be degrees.*state metres_per_degree.*.prj"):
         read_raster(path)
-    ground = read_raster(path, metres_per_degree=degree_at(south))
+    ground = read_raster(path, metres_per_degree=degree_lengths(south))
     assert ground.spacing == pytest.approx(
-        (cell * degree_at(south)[0], -cell * degree_at(south)[1])
+        (cell * degree_lengths(south)[0], -cell * degree_lengths(south)[1])
     )
     ground = read_raster(path, metres_per_unit=(1.0, 1.0))
     assert ground.spacing == pytest.approx((cell, -cell))
@@ -244,7 +246,7 @@ def test_rasters_of_two_maps_are_refused(survey):
         require_one_map([one, same, other])
     with pytest.raises(SceneError, match="state one size for both"):
         require_one_map([one, map_frame(32632, "d.tif", metres_per_unit=(1.0005, 1.0))])
-    require_one_map([one, ("none", MapFrame(Factors(1.0, 1.0)))])
+    require_one_map([one, ("none", MapFrame(MetresPerUnit(1.0, 1.0)))])
 
 
 WHOLE = np.random.default_rng(3).normal(size=(9, 12))

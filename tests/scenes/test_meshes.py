@@ -3,11 +3,11 @@ from fractions import Fraction
 import numpy as np
 import pytest
 import trimesh
-from facet_areas import areas
+from facet_areas import triangle_areas
 
 from sweep.model.geometry.mesh import Mesh, merge
-from sweep.scenes.files import SceneError
-from sweep.scenes.meshes import clean, read_mesh
+from sweep.scenes.meshes import clean_mesh, read_mesh
+from sweep.scenes.scene_files import SceneError
 
 BOX = trimesh.creation.box(extents=(1.0, 2.0, 3.0))
 
@@ -38,7 +38,7 @@ def test_a_box_is_the_same_box_in_every_format(file, name):
     box = read_mesh(file(BOX, name))
     assert len(box.faces) == 12
     np.testing.assert_allclose(extents(box), (1, 2, 3), rtol=1e-6)
-    assert areas(box.vertices, box.faces).sum() == pytest.approx(22, rel=1e-6)
+    assert triangle_areas(box.vertices, box.faces).sum() == pytest.approx(22, rel=1e-6)
     assert volume(box) == pytest.approx(6, rel=1e-6)  # positive: facing outwards
 
 
@@ -78,7 +78,7 @@ def test_the_parts_of_a_scene_stand_where_its_graph_puts_them(file):
 def test_faces_without_area_and_double_ones_are_reported_when_the_mesh_is_made(tmp_path):
     path = tmp_path / "dirty.obj"
     path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 3\nf 3 2 1\nf 2 2 3\nf 2 4 3\n")
-    mesh, report = read_mesh(path).mesh()
+    mesh, report = read_mesh(path).to_mesh()
     assert len(mesh.faces) == 2
     assert (report.duplicate, report.degenerate) == (1, 1)
 
@@ -180,8 +180,8 @@ def exact(vertices, faces):
 
 
 def test_a_clean_closed_mesh_needs_nothing():
-    mesh, report = clean(CORNERS, CUBE, 3)
-    assert report.text() == "12 faces on 8 vertices; nothing to mend"
+    mesh, report = clean_mesh(CORNERS, CUBE, 3)
+    assert report.summary() == "12 faces on 8 vertices; nothing to mend"
     assert (mesh.surface == 3).all()
     assert world(mesh) == exact(CORNERS, CUBE)
 
@@ -190,7 +190,7 @@ def test_faces_without_data_are_dropped_and_the_rest_kept_in_order():
     vertices = np.vstack([CORNERS, [[np.nan, 0, 0], [0, np.inf, 0]]])
     faces = np.vstack([CUBE[:5], [[0, 1, 8]], CUBE[5:], [[9, 1, 2]]])
     surface = np.arange(14)
-    mesh, report = clean(vertices, faces, surface)
+    mesh, report = clean_mesh(vertices, faces, surface)
     assert (report.non_finite, report.unreferenced) == (2, 2)
     assert mesh.surface.tolist() == [0, 1, 2, 3, 4, 6, 7, 8, 9, 10, 11, 12]
     assert world(mesh) == exact(CORNERS, CUBE)
@@ -199,7 +199,7 @@ def test_faces_without_data_are_dropped_and_the_rest_kept_in_order():
 def test_faces_without_area_are_dropped_but_the_thinnest_with_area_is_kept():
     vertices = [[0, 0, 0], [1, 0, 0], [2, 0, 0], [1, 1e-12, 0], [0, 0, 5], [1, 1, 5]]
     faces = [[0, 1, 2], [0, 2, 3], [4, 4, 5], [0, 1, 4]]
-    mesh, report = clean(vertices, faces, [0, 1, 2, 3])
+    mesh, report = clean_mesh(vertices, faces, [0, 1, 2, 3])
     assert report.degenerate == 2
     assert mesh.surface.tolist() == [1, 3]
 
@@ -208,7 +208,7 @@ def test_a_face_given_twice_is_kept_once_in_whatever_winding_and_on_whatever_cop
     vertices = np.vstack([CORNERS, CORNERS, -0.0 * CORNERS[:1]])
     faces = np.vstack([CUBE, CUBE[:4, ::-1], CUBE[3:4] + 8, [[16, 12, 13]]])
     surface = np.r_[np.zeros(12, int), np.ones(6, int)]
-    mesh, report = clean(vertices, faces, surface)
+    mesh, report = clean_mesh(vertices, faces, surface)
     assert report.duplicate == 6
     assert (report.merged, report.unreferenced) == (4, 5)
     assert (mesh.surface == 0).all()
@@ -217,14 +217,14 @@ def test_a_face_given_twice_is_kept_once_in_whatever_winding_and_on_whatever_cop
 
 def test_a_soup_of_separate_triangles_becomes_watertight():
     vertices = CORNERS[CUBE].reshape(-1, 3)
-    mesh, report = clean(vertices, np.arange(36).reshape(12, 3), 0)
+    mesh, report = clean_mesh(vertices, np.arange(36).reshape(12, 3), 0)
     assert report.merged == 28
     assert len(mesh.vertices) == 8 and world(mesh) == exact(CORNERS, CUBE)
 
 
 def test_merged_meshes_keep_every_triangle_where_it_was():
-    near, _ = clean(CORNERS, CUBE, 0)
-    far, _ = clean(CORNERS + np.array([4e6, -3e6, 0.5]), CUBE, 1)
+    near, _ = clean_mesh(CORNERS, CUBE, 0)
+    far, _ = clean_mesh(CORNERS + np.array([4e6, -3e6, 0.5]), CUBE, 1)
     both = merge([near, far])
     assert world(both) == world(near) + world(far)
     assert both.surface.tolist() == [0] * 12 + [1] * 12
@@ -245,7 +245,7 @@ def test_merged_meshes_keep_every_triangle_where_it_was():
 )
 def test_what_no_ray_could_hit_is_refused(vertices, faces, surface, match):
     with pytest.raises(ValueError, match=match):
-        clean(vertices, faces, surface)
+        clean_mesh(vertices, faces, surface)
 
 
 def test_a_mesh_made_by_hand_is_checked_too():

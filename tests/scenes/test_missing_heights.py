@@ -6,9 +6,9 @@ import rasterio
 from PIL import Image
 from rasterio import Affine
 
-from sweep.scenes.files import SceneError
-from sweep.scenes.heights import HEIGHT_MAX
+from sweep.scenes.height_checks import HEIGHT_MAX
 from sweep.scenes.rasters import read_array, read_image, read_raster
+from sweep.scenes.scene_files import SceneError
 
 HILLS = 300 + 80 * np.sin(np.arange(30)[:, None] / 5) * np.cos(np.arange(40) / 7)
 """Heights of 220 to 380 m, at steps of 30 m."""

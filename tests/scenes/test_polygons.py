@@ -8,12 +8,12 @@ import struct
 import numpy as np
 import pytest
 import trimesh
-from facet_areas import areas
+from facet_areas import triangle_areas
 from matplotlib.path import Path as Outline
 
-from sweep.scenes.files import SceneError
 from sweep.scenes.meshes import FACES_MAX, read_mesh
 from sweep.scenes.polygons import PolygonError, Polygons, triangulate
+from sweep.scenes.scene_files import SceneError
 
 U = np.array([[0, 0], [3, 0], [3, 3], [2, 3], [2, 1], [1, 1], [1, 3], [0, 3]], float)
 """A U of eight corners: 3 x 3 with a notch of 1 x 2, an area of 7."""
@@ -77,14 +77,14 @@ WRITERS = {
 def test_a_polygon_that_is_not_convex_covers_itself_and_not_its_notch(tmp_path, name):
     WRITERS[name](tmp_path / name, flat(U, 5.0), [list(range(8))])
     facets = read_mesh(tmp_path / name)
-    assert areas(facets.vertices, facets.faces).sum() == pytest.approx(7.0, rel=1e-12)
+    assert triangle_areas(facets.vertices, facets.faces).sum() == pytest.approx(7.0, rel=1e-12)
     corners = facets.vertices[facets.faces]
     inside = [Outline(corner[:, :2]).contains_point((1.5, 2.0)) for corner in corners]
     assert not any(inside)  # the middle of the notch
     up = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert (up[:, 2] > 0).all()  # wound as the polygon is
-    _, report = facets.mesh()
-    assert "1 polygon cut into triangles, 1 of them not convex" in report.text()
+    _, report = facets.to_mesh()
+    assert "1 polygon cut into triangles, 1 of them not convex" in report.summary()
 
 
 @pytest.mark.parametrize("name", WRITERS)
@@ -99,7 +99,7 @@ def test_triangles_and_quads_mixed_read_the_same_in_every_format(tmp_path, name)
     expected += [[2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]
     assert facets.faces.tolist() == expected
     np.testing.assert_array_equal(facets.vertices, corners)
-    assert "4 polygons cut into triangles; nothing to mend" in facets.mesh()[1].text()
+    assert "4 polygons cut into triangles; nothing to mend" in facets.to_mesh()[1].summary()
 
 
 @pytest.mark.parametrize("name", WRITERS)
@@ -131,7 +131,7 @@ def test_a_hole_has_to_be_gone_round_against_its_outline():
     outline = [[0, 0], [4, 0], [4, 4], [0, 4], [0, 0]]
     hole = [[1, 1], [1, 3], [3, 3], [3, 1], [1, 1]]
     points = flat(outline + hole)
-    assert areas(points, cut(points).faces).sum() == pytest.approx(12.0, rel=1e-12)
+    assert triangle_areas(points, cut(points).faces).sum() == pytest.approx(12.0, rel=1e-12)
     with pytest.raises(PolygonError, match="face 1 of 10 corners covers a part of its plane twice"):
         cut(flat(outline + hole[::-1]))
     turn = np.arange(40) * np.pi / 10
@@ -170,7 +170,7 @@ def test_corners_in_line_stay_corners_so_that_neighbours_share_their_edges():
     outline = [[0, 0], [1, 0], [2, 0], [2, 1], [2, 2], [1, 2], [0, 2], [0, 1]]
     result = cut(flat(outline))
     assert sorted(set(result.faces.ravel().tolist())) == list(range(8))
-    assert areas(flat(outline), result.faces).sum() == pytest.approx(4.0)
+    assert triangle_areas(flat(outline), result.faces).sum() == pytest.approx(4.0)
     edges = {tuple(edge) for face in result.faces for edge in (face[:2], face[1:], face[[2, 0]])}
     assert {(k, (k + 1) % 8) for k in range(8)} <= edges
 
@@ -183,28 +183,28 @@ def test_thousands_of_corners_in_line_are_cut_in_no_time():
     result = cut(flat(halved))
     x, y = halved.T
     area = 0.5 * (x * np.roll(y, -1) - y * np.roll(x, -1)).sum()
-    assert areas(flat(halved), result.faces).sum() == pytest.approx(area)
+    assert triangle_areas(flat(halved), result.faces).sum() == pytest.approx(area)
     assert len(result.faces) > 15_000
 
 
 def test_corners_given_twice_spikes_and_bridged_holes_are_cut_as_they_should():
     twice = flat([[0, 0], [0, 0], [2, 0], [2, 0], [2, 2], [0, 2]])
-    assert areas(twice, cut(twice).faces).sum() == pytest.approx(4.0)
+    assert triangle_areas(twice, cut(twice).faces).sum() == pytest.approx(4.0)
     spike = flat([[0, 0], [2, 0], [2, 2], [3, 3], [2, 2], [0, 2]])
-    assert areas(spike, cut(spike).faces).sum() == pytest.approx(4.0)
+    assert triangle_areas(spike, cut(spike).faces).sum() == pytest.approx(4.0)
     hole = [[0, 0], [4, 0], [4, 4], [0, 4], [0, 0], [1, 1], [1, 2], [2, 2], [2, 1], [1, 1]]
-    assert areas(flat(hole), cut(flat(hole)).faces).sum() == pytest.approx(15.0)
+    assert triangle_areas(flat(hole), cut(flat(hole)).faces).sum() == pytest.approx(15.0)
 
 
 def test_polygons_without_area_or_data_are_dropped_and_counted(tmp_path):
     points = [*flat([[0, 0], [1, 0], [2, 0], [3, 0]]), *flat([[0, 0], [1, 0], [1, 1], [0, 1]], 1.0)]
     faces = [[0, 1, 2, 3], [4, 5, 6, 7], [0, 0, 1, 1], [4, 5]]
     write_obj(tmp_path / "a.obj", points, faces)
-    mesh, report = read_mesh(tmp_path / "a.obj").mesh()
+    mesh, report = read_mesh(tmp_path / "a.obj").to_mesh()
     assert len(mesh.faces) == 2 and report.degenerate == 5
     points[0][0] = np.nan
     write_obj(tmp_path / "b.obj", points, faces[:2])
-    mesh, report = read_mesh(tmp_path / "b.obj").mesh()
+    mesh, report = read_mesh(tmp_path / "b.obj").to_mesh()
     assert len(mesh.faces) == 2 and report.non_finite == 2 and report.degenerate == 0
 
 
@@ -213,7 +213,7 @@ def test_bent_polygons_are_told_and_those_bent_too_far_refused(tmp_path):
     write_obj(tmp_path / "a.obj", quad, [[0, 1, 2, 3]])
     assert (
         "1 polygon departs from a plane by up to 0.02 units"
-        in read_mesh(tmp_path / "a.obj").mesh()[1].text()
+        in read_mesh(tmp_path / "a.obj").to_mesh()[1].summary()
     )
     with pytest.raises(PolygonError, match="face 1 is bent by 35 % of its size"):
         cut(flat([[0, 0], [1, 0], [1, 1], [0, 1]], [0, 0.7, 0, 0.7]))
@@ -296,4 +296,4 @@ def test_a_mesh_larger_than_the_memory_is_refused_before_it_is_read(tmp_path, mo
 def test_a_vertex_too_far_off_to_compute_with_is_refused(tmp_path, place):
     write_obj(tmp_path / "a.obj", [[0, 0, 0], [1, 0, 0], [0, 1, place]], [[0, 1, 2]])
     with pytest.raises(ValueError, match="farther than 1e"):
-        read_mesh(tmp_path / "a.obj").mesh()
+        read_mesh(tmp_path / "a.obj").to_mesh()

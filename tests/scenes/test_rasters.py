@@ -12,15 +12,15 @@ import rasterio
 from PIL import Image
 from rasterio import Affine
 
-from sweep.scenes.files import SceneError
 from sweep.scenes.rasters import (
-    degree_at,
-    jacksboro,
+    degree_lengths,
     raster_digest,
     read_array,
     read_image,
+    read_jacksboro,
     read_raster,
 )
+from sweep.scenes.scene_files import SceneError
 
 HEIGHTS = np.arange(20, dtype=np.float32).reshape(4, 5)
 SOUTHWARDS = Affine(2.0, 0.0, 500_000.0, 0.0, -3.0, 4_000_000.0)
@@ -118,7 +118,7 @@ def test_degrees_become_metres_of_a_stated_size(tiff):
         read_raster(path)
     # The remedy gives the size on the raster's own ellipsoid, to be copied.
     said = str(refused.value).split("[")[1].split("]")[0].split(",")
-    assert [float(size) for size in said] == pytest.approx(degree_at(36.498333), abs=0.06)
+    assert [float(size) for size in said] == pytest.approx(degree_lengths(36.498333), abs=0.06)
 
 
 def test_degrees_of_the_moon_are_measured_on_the_moon(tiff):
@@ -177,7 +177,7 @@ def test_files_that_are_no_raster_or_not_there_are_refused(tmp_path, tiff):
 
 
 def test_a_raster_too_large_to_read_asks_for_a_window(tiff, monkeypatch):
-    monkeypatch.setattr("sweep.scenes.rasters.MOST_CELLS", 15)
+    monkeypatch.setattr("sweep.scenes.rasters.GRID_CELLS_MAX", 15)
     with pytest.raises(SceneError, match="give a window"):
         read_raster(tiff())
     assert read_raster(tiff(), window=(5e5, 3_999_988.0, 500_006.0, 4e6)).heights.size == 12
@@ -202,8 +202,8 @@ def test_a_degree_of_longitude_and_of_latitude_are_those_of_the_ellipsoid():
 
     north, _ = quad(speed, 44.5, 45.5)
     east = math.radians(point(45.0)[0])
-    assert degree_at(45.0) == pytest.approx((east, north), rel=1e-6)
-    assert degree_at(60.0, radius=1e6, flattening=0.0) == pytest.approx(
+    assert degree_lengths(45.0) == pytest.approx((east, north), rel=1e-6)
+    assert degree_lengths(60.0, radius=1e6, flattening=0.0) == pytest.approx(
         (math.radians(5e5), math.radians(1e6))
     )
 
@@ -384,7 +384,7 @@ def test_pictures_that_are_no_heights_are_refused(tmp_path):
 
 def test_the_default_terrain_has_the_size_and_heights_of_the_survey():
     """344 x 403 posts of 3 arc seconds, 236 to 1076 m; a minute of latitude is a nautical mile."""
-    ground = jacksboro()
+    ground = read_jacksboro()
     assert ground.heights.shape == (344, 403)
     assert (ground.heights.min(), ground.heights.max()) == (236, 1076)
     assert -ground.spacing[1] == pytest.approx(1852 / 20, rel=2e-3)
@@ -557,7 +557,7 @@ def test_only_the_heights_of_an_archive_are_unpacked(tmp_path):
 
 def test_pictures_are_refused_by_their_headers_and_formats(tmp_path, monkeypatch):
     image = saved(tmp_path / "z.png", np.zeros((50, 50), np.uint8))
-    monkeypatch.setattr("sweep.scenes.rasters.MOST_CELLS", 100)
+    monkeypatch.setattr("sweep.scenes.rasters.GRID_CELLS_MAX", 100)
     with pytest.raises(SceneError, match="50 x 50 heights, more than"):
         read_image(image, pixel=1.0, white=1.0)
     (tmp_path / "z.eps").write_text("%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n")

@@ -4,15 +4,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from facet_areas import areas
+from facet_areas import triangle_areas
 from hypothesis import given
 from hypothesis import strategies as st
 
 from sweep.model.geometry.quaternion import about
 from sweep.scenes import terrain as ground_
-from sweep.scenes.meshes import Facets, clean, join
+from sweep.scenes.meshes import Facets, clean_mesh, join_facets
 from sweep.scenes.rasters import read_image, read_raster
-from sweep.scenes.terrain import Terrain, fractal, hills, refine, smooth
+from sweep.scenes.terrain import Terrain, draw_fractal_relief, draw_hills, refine, smooth
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 GALE = DATA / "gale_crater_hirise_1m.tif"
@@ -30,11 +30,11 @@ def hilly(rows, columns, seed=1):
 
 
 def plan_area(vertices, faces):
-    return areas(vertices * [1, 1, 0], faces).sum()
+    return triangle_areas(vertices * [1, 1, 0], faces).sum()
 
 
 def heightfield(z, *, spacing):
-    facets = Terrain(np.asarray(z, float), spacing, np.zeros(3)).facets()
+    facets = Terrain(np.asarray(z, float), spacing, np.zeros(3)).to_facets()
     return facets.vertices, facets.faces
 
 
@@ -70,7 +70,7 @@ def test_the_height_at_a_place_is_that_of_the_facet_over_it(seed, spacing):
     ground = terrain(z, spacing)
     west, south, east, north = ground.bounds
     x, y = generator.uniform(west, east, 40), generator.uniform(south, north, 40)
-    facets = ground.facets()
+    facets = ground.to_facets()
     expected = np.full(40, np.nan)
     for a, b, c in (facets.vertices + facets.origin)[facets.faces]:
         matrix = np.array([[a[0], b[0], c[0]], [a[1], b[1], c[1]], [1, 1, 1]])
@@ -90,16 +90,16 @@ def test_there_is_no_height_beside_the_grid():
 
 def test_far_off_ground_has_the_same_facets_to_the_last_bit():
     z = hilly(6, 6)
-    near, far = terrain(z).facets(), terrain(z, origin=FAR).facets()
+    near, far = terrain(z).to_facets(), terrain(z, origin=FAR).to_facets()
     np.testing.assert_array_equal(near.vertices, far.vertices)
     np.testing.assert_array_equal(far.origin, FAR)
 
 
 def test_joined_facets_keep_their_place_digits_and_surfaces():
     shift = np.array([3.0, -4.0, 5.0])
-    one = terrain(hilly(3, 3), origin=FAR).facets()
-    other = terrain(hilly(4, 4), origin=FAR + shift).facets()
-    both = join([one, replace(other, surface=other.surface + 1)])
+    one = terrain(hilly(3, 3), origin=FAR).to_facets()
+    other = terrain(hilly(4, 4), origin=FAR + shift).to_facets()
+    both = join_facets([one, replace(other, surface=other.surface + 1)])
     # Taking the first origin from the second rounds to the spacing of floats at 8e6 m.
     expected = np.concatenate([one.vertices, other.vertices + shift])
     np.testing.assert_allclose(both.vertices, expected, rtol=0, atol=2 * np.spacing(8.2e6))
@@ -109,21 +109,23 @@ def test_joined_facets_keep_their_place_digits_and_surfaces():
 
 
 def test_a_placed_object_is_scaled_and_turned_about_its_origin():
-    corner = Facets.of([[1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 2]], origin=(10, 20, 30))
-    placed = corner.placed(rotation=about(2, math.pi / 2), scale=2.0)
+    corner = Facets.on_one_surface(
+        [[1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 2]], origin=(10, 20, 30)
+    )
+    placed = corner.transform(rotation=about(2, math.pi / 2), scale=2.0)
     corners = [[10, 22, 30], [8, 20, 30], [10, 20, 32]]
     np.testing.assert_allclose(placed.vertices + placed.origin, corners, atol=1e-12)
 
 
 def test_facets_become_a_mesh_at_the_same_place():
-    facets = terrain(hilly(5, 5), origin=FAR).facets()
-    mesh, report = replace(facets, surface=facets.surface + 3).mesh()
+    facets = terrain(hilly(5, 5), origin=FAR).to_facets()
+    mesh, report = replace(facets, surface=facets.surface + 3).to_mesh()
     np.testing.assert_allclose(
         np.sort(mesh.vertices + mesh.origin, axis=0),
         np.sort(facets.vertices + facets.origin, axis=0),
         atol=1e-8,
     )
-    assert (mesh.surface == 3).all() and report.faces == len(mesh.faces) == 32
+    assert (mesh.surface == 3).all() and report.n_faces == len(mesh.faces) == 32
 
 
 def test_refining_keeps_the_given_heights_and_reproduces_cubics():
@@ -152,12 +154,14 @@ def test_smoothing_keeps_planes_and_holes_and_spreads_a_step_like_an_error_funct
 
     z = np.where(np.arange(60) < 30, 0.0, 1.0) + np.zeros((40, 60))
     z[5, 5] = np.nan
-    smoothed = smooth(terrain(z, spacing=(0.5, 0.5)), width=2.0).heights
+    smoothed = smooth(terrain(z, spacing=(0.5, 0.5)), standard_deviation=2.0).heights
     assert np.isnan(smoothed[5, 5]) and np.isnan(smoothed).sum() == 1
     x = (np.arange(60) - 29.5) * 0.5
     expected = 0.5 * (1 + erf(x / (2.0 * math.sqrt(2))))
     np.testing.assert_allclose(smoothed[30], expected, atol=2e-3)  # a kernel of 4 sigma, sampled
-    assert smooth(terrain(np.full((9, 9), 7.0)), width=3.0).heights == pytest.approx(7.0)
+    assert smooth(terrain(np.full((9, 9), 7.0)), standard_deviation=3.0).heights == pytest.approx(
+        7.0
+    )
 
 
 @pytest.mark.parametrize(
@@ -175,7 +179,7 @@ def test_real_martian_ground_has_the_heights_and_size_its_description_gives():
     assert ground.heights.shape == (337, 348) and ground.spacing == (1.0, -1.0)
     assert ground.heights.min() == pytest.approx(-4472.67, abs=0.005)
     assert ground.heights.max() == pytest.approx(-4437.88, abs=0.005)
-    facets = ground.facets()
+    facets = ground.to_facets()
     assert len(facets.faces) == 2 * 336 * 347
     assert plan_area(facets.vertices, facets.faces) == pytest.approx(336 * 347, rel=1e-9)
     assert facets.origin[0] == 8142406.5 and facets.origin[1] == -276455.5
@@ -186,7 +190,7 @@ def test_real_lunar_ground_in_grey_levels_loses_its_terraces_when_smoothed():
     ground = read_image(APOLLO, pixel=2.0, white=49.0)
     step = 49.0 / 255
     assert ground.bounds == (0.0, -512.0, 512.0, 0.0)
-    smoothed = smooth(ground, width=4.0)
+    smoothed = smooth(ground, standard_deviation=4.0)
     flat = (np.diff(ground.heights, axis=1) == 0).mean()
     assert flat > 0.2  # a fifth of the steps lie on one grey level
     assert (np.diff(smoothed.heights, axis=1) == 0).mean() < 1e-3
@@ -197,7 +201,9 @@ FIVE_SIGMA = 5.0
 
 
 def surfaces(number, **parameters):
-    return np.stack([fractal(np.random.default_rng(seed), **parameters) for seed in range(number)])
+    return np.stack(
+        [draw_fractal_relief(np.random.default_rng(seed), **parameters) for seed in range(number)]
+    )
 
 
 @pytest.mark.parametrize("hurst", [0.2, 0.75, 0.95])
@@ -221,7 +227,7 @@ def test_differences_of_height_follow_the_power_law_at_every_distance_and_direct
 @pytest.mark.parametrize("shape", [(40, 40), (16, 200)])
 def test_the_embedding_is_a_covariance(hurst, shape):
     """The spectrum on the torus is not negative, so that nothing was cut off the surface."""
-    period, _, covariance = ground_._stein(2 * hurst)
+    period, _, covariance = ground_._stein_covariance(2 * hurst)
     step = 1 / math.hypot(*shape)
     size = ground_.fft.next_fast_len(math.ceil(period / step), real=True)
     along = np.minimum(np.arange(size), size - np.arange(size)) * step
@@ -233,7 +239,9 @@ def test_the_same_seed_gives_the_same_ground_and_another_seed_another():
     parameters = {
         "shape": (20, 30), "spacing": (1.0, -1.0), "hurst": 0.7, "rms_slope": 0.1, "baseline": 5.0,
     }  # fmt: skip
-    once, again, other = (fractal(np.random.default_rng(seed), **parameters) for seed in (1, 1, 2))
+    once, again, other = (
+        draw_fractal_relief(np.random.default_rng(seed), **parameters) for seed in (1, 1, 2)
+    )
     np.testing.assert_array_equal(once, again)
     assert once.shape == (20, 30) and np.abs(once - other).max() > 0.1
 
@@ -243,7 +251,7 @@ def test_hills_have_the_height_slope_and_correlation_they_were_asked_for():
     number, rms, length = 800, 4.0, 10.0
     z = np.stack(
         [
-            hills(
+            draw_hills(
                 np.random.default_rng(seed),
                 shape=(12, 40),
                 spacing=(1.0, 1.0),
@@ -270,10 +278,10 @@ def test_a_grid_is_the_mesh_that_cleaning_its_triangles_would_make(spacing, hole
     heights = random.standard_normal((13, 17))
     heights.ravel()[random.choice(heights.size, holes, replace=False)] = np.nan
     heights[0, 0] = -0.0
-    facets = terrain(heights, spacing, (5e5, 4e6, 0.0)).facets()
-    mesh, report = facets.mesh()
-    expected, mended = clean(facets.vertices, facets.faces, facets.surface)
-    assert report == mended and report.text().endswith("nothing to mend")
+    facets = terrain(heights, spacing, (5e5, 4e6, 0.0)).to_facets()
+    mesh, report = facets.to_mesh()
+    expected, mended = clean_mesh(facets.vertices, facets.faces, facets.surface)
+    assert report == mended and report.summary().endswith("nothing to mend")
     np.testing.assert_array_equal(mesh.vertices, expected.vertices)
     np.testing.assert_array_equal(mesh.faces, expected.faces)
     np.testing.assert_array_equal(mesh.origin, expected.origin + facets.origin)

@@ -1,11 +1,11 @@
 """Beams in specs: given by one of two numbers, and such as an aperture can make."""
 
 import pytest
-from written_specs import written
+from base_spec import changed_spec
 
-from sweep.cli.terminal import warn_of
-from sweep.spec import Spec, SpecError
-from sweep.spec.grid_rules import too_narrow
+from sweep.cli.terminal import print_spec_warnings
+from sweep.spec import GridSpec, SpecError
+from sweep.spec.grid_checks import describe_narrow_beam
 
 MODE = {"instrument.telescope.coupling": "single_mode"}
 WAIST = {"instrument.laser.beam_divergence": ...}
@@ -44,7 +44,7 @@ WRONG = [
 @pytest.mark.parametrize(("changes", "axes", "path", "words"), WRONG)
 def test_a_beam_that_cannot_be_is_refused(changes, axes, path, words):
     with pytest.raises(SpecError) as error:
-        Spec.from_mapping(written(changes, axes=axes))
+        GridSpec.from_mapping(changed_spec(changes, axes=axes))
     (mistake,) = error.value.mistakes
     assert mistake.path == path and words in str(mistake)
 
@@ -59,21 +59,21 @@ RIGHT = [
 
 @pytest.mark.parametrize("changes", RIGHT)
 def test_a_beam_that_can_be_is_read_and_comes_back(changes):
-    spec = Spec.from_mapping(written(changes))
-    assert Spec.from_stored(spec.to_json()).parameters() == spec.parameters()
+    spec = GridSpec.from_mapping(changed_spec(changes))
+    assert GridSpec.from_stored(spec.to_json()).parameters() == spec.parameters()
 
 
 def test_one_mode_is_the_default():
     with pytest.raises(SpecError, match=r"4 M.2 lambda"):
-        Spec.from_mapping(written({"instrument.telescope.coupling": ...}))
+        GridSpec.from_mapping(changed_spec({"instrument.telescope.coupling": ...}))
 
 
 @pytest.mark.parametrize("changes", [{}, MODE | {"instrument.receiver.architecture": "direct"}])
 def test_a_beam_narrower_than_its_aperture_makes_is_told_where_all_light_mixes(changes, capsys):
     """Table 4.1: 50 urad from 25 mm, which make 79 urad."""
-    warn_of(Spec.from_mapping(written(changes)))
+    print_spec_warnings(GridSpec.from_mapping(changed_spec(changes)))
     told = capsys.readouterr()
     assert not told.out and "a beam of 50 urad is narrower than an aperture of 25 mm" in told.err
     assert "78.9 urad" in told.err
-    wide = Spec.from_mapping(written(changes | WIDE))
-    assert not too_narrow(wide.parameters_off_axes(), wide.axes)
+    wide = GridSpec.from_mapping(changed_spec(changes | WIDE))
+    assert not describe_narrow_beam(wide.parameters_off_axes(), wide.axes)

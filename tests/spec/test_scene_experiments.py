@@ -8,7 +8,7 @@ import pytest
 
 from sweep.model.eyepoints import observe
 from sweep.spec import SceneSpec, SpecError, load
-from sweep.spec.reading import read_document
+from sweep.spec.yaml_document import read_document
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 SHIPPED = (
@@ -22,17 +22,17 @@ GALE = EXPERIMENTS / "gale_crater_descent.yaml"
 def flown(name):
     """A study and what each of its scanners sees."""
     spec = load(EXPERIMENTS / f"{name}.yaml")
-    world = spec.world()
+    world = spec.build_scene()
     return spec, {
         scanner: observe(
-            np.arange(spec.cycles(scanner) * spec.shots_a_cycle(scanner)),
-            flight=spec.flight(),
-            scanner=spec.scan(scanner),
+            np.arange(spec.number_of_cycles(scanner) * spec.shots_per_cycle(scanner)),
+            flight=spec.build_flight(),
+            scanner=spec.scan_pattern(scanner),
             caster=world.caster,
-            bodies=world.bodies,
+            bodies=world.body_flights,
             beam_divergence=spec.instrument.laser.beam_divergence,
             number=spec.footprint.beamlets,
-            pattern=spec.pattern,
+            pattern=spec.beamlet_pattern,
         )
         for scanner in spec.scanners
     }
@@ -71,13 +71,17 @@ def test_every_beam_meets_the_ground(name):
 )
 def test_a_descent_is_that_of_the_thesis(name, first, last, speeds, cycles):
     spec, eyes = only(name)
-    flight, (scanner,) = spec.flight(), spec.scanners
+    flight, (scanner,) = spec.build_flight(), spec.scanners
     assert flight.stop == pytest.approx(2 * (first - last) / sum(speeds))
     ends = flight.state(np.array([0.0, flight.stop]))
     np.testing.assert_allclose(ends.position, [[0, 0, first], [0, 0, last]], atol=1e-9)
     np.testing.assert_allclose(ends.velocity[:, 2], [-speeds[0], -speeds[1]], rtol=1e-12)
     rate = 1 if scanner == "three" else 20
-    assert spec.cycles(scanner) == cycles == int(flight.stop * rate - 0.7499 * (rate > 1)) + 1
+    assert (
+        spec.number_of_cycles(scanner)
+        == cycles
+        == int(flight.stop * rate - 0.7499 * (rate > 1)) + 1
+    )
     # v cos(angle from nadir), to the 25 urad by which the reference beamlet may lie off the axis.
     np.testing.assert_allclose(
         eyes.radial_velocity, eyes.velocity[:, 2] * eyes.direction[:, 2], rtol=25e-6
@@ -105,7 +109,7 @@ def test_a_square_shrinks_as_the_lidar_comes_down(name, angle):
 
 def test_a_diagonal_path_shows_three_velocities():
     spec, eyes = only("oblique_descent")
-    path = spec.flight().state(np.array([0.0, spec.flight().stop])).position
+    path = spec.build_flight().state(np.array([0.0, spec.build_flight().stop])).position
     way = path[1] - path[0]
     assert np.linalg.norm(way) == pytest.approx(400, abs=1e-3) and path[0, 2] == 500
     np.testing.assert_allclose(way / 400, [0.5, 0.5, -np.sqrt(0.5)], atol=1e-5)
@@ -145,7 +149,7 @@ def test_fore_and_aft_beams_see_opposite_velocities_of_two_bins():
     laser, processing = spec.instrument.laser, spec.instrument.processing
     velocity_bin = laser.wavelength * processing.sample_rate / (2 * processing.fft_size)
     assert velocity_bin < np.abs(expected).min() < 2 * velocity_bin
-    assert spec.scan("sweep").rate < 1 / (3 * spec.instrument.chirp.duration)
+    assert spec.scan_pattern("sweep").rate < 1 / (3 * spec.instrument.chirp.duration)
 
 
 def test_the_scan_covers_hills_with_a_clump_of_trees_in_their_middle():
@@ -175,7 +179,7 @@ def test_the_shot_that_is_drawn_sees_a_leaf_and_the_ground_in_equal_parts():
 
 def test_patterns_are_compared_at_like_reach_and_rate_of_shots():
     spec, eyes = flown("scan_pattern_comparison")
-    assert [spec.shots_a_cycle(name) for name in spec.scanners] == [3, 4, 16]
+    assert [spec.shots_per_cycle(name) for name in spec.scanners] == [3, 4, 16]
     times = {name: len(seen.time) / seen.time[-1] for name, seen in eyes.items()}
     assert times["four"] == pytest.approx(times["sixteen"], rel=0.01)
     angles = np.degrees(np.arctan(eyes["sixteen"].direction[:16, :2]
@@ -193,11 +197,11 @@ def test_gale_crater_says_where_its_terrain_is_missing(tmp_path):
         load(tmp_path / "gale.yaml")
     (mistake,) = caught.value.mistakes
     assert mistake.path == "scene.objects.ground.file" and mistake.line > 5
-    assert "gale_crater_hirise_1m.tif" in mistake.value and "does not exist" in mistake.rule
+    assert "gale_crater_hirise_1m.tif" in mistake.value and "does not exist" in mistake.problem
 
 
 def test_gale_crater_is_real_ground_under_all_beams_where_it_is_there():
-    terrain = read_document(GALE).value["scene"]["objects"]["ground"]["file"]
+    terrain = read_document(GALE).content["scene"]["objects"]["ground"]["file"]
     if not (GALE.parent / terrain).exists():
         pytest.skip("the terrain is no part of the repository")
     spec = load(GALE)
@@ -205,5 +209,5 @@ def test_gale_crater_is_real_ground_under_all_beams_where_it_is_there():
     spec, eyes = only("gale_crater_descent")
     assert eyes.seen.all() and (eyes.surface == 0).all()
     assert 10 < eyes.range.min() < 12 and np.abs(grounded(eyes)[:, :2]).max() < 170
-    origin = spec.world().origin
+    origin = spec.build_scene().origin
     assert np.abs(origin[:2]).max() > 1e5 and -4473 < origin[2] < -4437

@@ -5,14 +5,14 @@ from decimal import Decimal
 
 import numpy as np
 import pytest
-from written_scenes import written
+from base_scene_spec import changed_scene
 
 from sweep.model.geometry.quaternion import rotate
 from sweep.spec import SceneSpec, from_stored, load
 
 
 def spec_of(changes=None, *, base=".", **sections):
-    return SceneSpec.from_mapping(written(changes, **sections), base=base)
+    return SceneSpec.from_mapping(changed_scene(changes, **sections), base=base)
 
 
 def with_path(**path):
@@ -22,12 +22,12 @@ def with_path(**path):
 def beams_of(**scanner):
     """Direction of every shot of the first two cycles, and their times."""
     spec = spec_of(scanners={"one": scanner})
-    shots = spec.scan("one").shots(np.arange(2 * spec.shots_a_cycle("one")))
+    shots = spec.scan_pattern("one").shots(np.arange(2 * spec.shots_per_cycle("one")))
     return shots
 
 
 def test_a_straight_path_covers_its_distance_at_its_speeds():
-    flight = spec_of().flight()
+    flight = spec_of().build_flight()
     assert flight.stop == pytest.approx(2 * 400 / (60 + 20), rel=1e-15)
     t = np.array([0.0, 2.5, 10.0])
     fallen = 60 * t - 0.5 * 4 * t**2
@@ -37,40 +37,42 @@ def test_a_straight_path_covers_its_distance_at_its_speeds():
 
 
 def test_a_straight_path_keeps_its_speed_where_no_other_is_stated():
-    assert spec_of({"platform.path.final_speed": ...}).flight().stop == pytest.approx(400 / 60)
+    assert spec_of({"platform.path.final_speed": ...}).build_flight().stop == pytest.approx(
+        400 / 60
+    )
 
 
 @pytest.mark.parametrize(("rate", "cycles"), [("2 Hz", 21), ("1 Hz", 11), ("0.15 Hz", 2)])
 def test_cycles_are_those_whose_shots_all_begin_in_the_flight(rate, cycles):
     spec = spec_of({"scanners.three.rate": rate})
-    assert (spec.cycles("three"), spec.shots_a_cycle("three")) == (cycles, 3)
-    last = spec.scan("three").shots(np.array([cycles * 3 - 1, cycles * 3])).time
+    assert (spec.number_of_cycles("three"), spec.shots_per_cycle("three")) == (cycles, 3)
+    last = spec.scan_pattern("three").shots(np.array([cycles * 3 - 1, cycles * 3])).time
     assert last[0] <= 10.0 < last[1]
 
 
 def test_a_cycle_that_the_flight_cuts_short_does_not_count():
     spec = spec_of(scanners={"one": {"kind": "corners", "angle": "5 deg", "rate": "2 Hz"}})
-    assert spec.cycles("one") == 20  # the 21st begins at the end, and lasts 3/8 s more
+    assert spec.number_of_cycles("one") == 20  # the 21st begins at the end, and lasts 3/8 s more
 
 
 def test_paths_are_those_of_the_model(tmp_path):
     thrown = with_path(
         kind="acceleration", position=["1 km", "0 m", "2 m"], velocity=["3 m/s", "0 m/s", "4 m/s"],
         acceleration=["0 m/s^2", "0 m/s^2", "-2 m/s^2"], duration="5 s",
-    ).flight()  # fmt: skip
+    ).build_flight()  # fmt: skip
     np.testing.assert_allclose(thrown.state(np.array([3.0])).position[0], [1009, 0, 2 + 12 - 9])
-    still = with_path(kind="still", position=["1 m", "2 m", "300 m"], duration="7 s").flight()
+    still = with_path(kind="still", position=["1 m", "2 m", "300 m"], duration="7 s").build_flight()
     assert still.stop == 7
     np.testing.assert_array_equal(still.state(np.array([6.0])).velocity, 0)
     table = "time [s], x [m], y [m], z [km]\n0, 0, 0, 0.5\n5, 10, 0, 0.4\n10, 20, 0, 0.3\n"
     (tmp_path / "path.csv").write_text(table)
     path = {"kind": "waypoints", "file": "path.csv"}
-    flown = spec_of({"platform.path": path}, base=tmp_path).flight()
+    flown = spec_of({"platform.path": path}, base=tmp_path).build_flight()
     np.testing.assert_allclose(flown.state(np.array([2.5])).position[0], [5, 0, 450])
 
 
 def forward(changes, t=0.0, base="."):
-    state = spec_of(changes, base=base).flight().state(np.array([t]))
+    state = spec_of(changes, base=base).build_flight().state(np.array([t]))
     return rotate(state.attitude, np.array([1.0, 0, 0]))[0], state
 
 
@@ -175,8 +177,8 @@ def test_squares_take_turns_from_the_widest_to_the_narrowest():
     spec = spec_of(
         scanners={"one": {"kind": "squares", "elements": ["15 deg", "7.5 deg"], "rate": "4 Hz"}}
     )
-    assert spec.shots_a_cycle("one") == 4
-    shots = spec.scan("one").shots(np.arange(16))
+    assert spec.shots_per_cycle("one") == 4
+    shots = spec.scan_pattern("one").shots(np.arange(16))
     assert len(set(shots.beam)) == 16
     angles = angle_from_nadir(shots.direction).reshape(4, 4)
     assert (np.diff(angles.mean(axis=1)) <= 1e-9).all() and np.ptp(angles, axis=1).max() < 1e-9
@@ -199,8 +201,8 @@ def test_a_line_sweeps_its_fan_from_side_to_side():
             "along": ["250 urad", "-250 urad"], "wave": "sine",
         }}
     )  # fmt: skip
-    assert spec.shots_a_cycle("one") == 2
-    shots = spec.scan("one").shots(np.arange(10))
+    assert spec.shots_per_cycle("one") == 2
+    shots = spec.scan_pattern("one").shots(np.arange(10))
     across = np.degrees(np.arctan2(shots.direction[:, 1], -shots.direction[:, 2]))[::2]
     np.testing.assert_allclose(across, -5 * np.cos(np.pi * np.arange(5) / 4), atol=1e-12)
     np.testing.assert_allclose(shots.direction[:2, 0], [np.sin(250e-6), -np.sin(250e-6)])
@@ -210,7 +212,7 @@ def test_defaults_are_those_that_the_specs_promise():
     spec = spec_of()
     assert (spec.draws.number, spec.draws.method, spec.draws.returns) == (1, "probabilities", 4)
     assert (spec.storage.block_shots, spec.storage.block_draws) == (4096, 64)
-    assert spec.pointing_jitter() is None and spec.pattern == "hexagonal"
+    assert spec.pointing_jitter() is None and spec.beamlet_pattern == "hexagonal"
     assert spec.parameters()["target.solar_irradiance"] == 0.0
     assert not any(p.startswith("target.") for p in spec.parameters() if "solar" not in p)
 
@@ -225,7 +227,7 @@ def test_defaults_are_those_that_the_specs_promise():
 )
 def test_beamlets_are_laid_out_as_the_model_lays_them_out(phases, architecture, pattern):
     changes = {"footprint.phases": phases, "instrument.receiver.architecture": architecture}
-    assert spec_of(changes).pattern == pattern
+    assert spec_of(changes).beamlet_pattern == pattern
 
 
 def test_jitter_and_sunlight_are_handed_on():
@@ -238,7 +240,7 @@ def test_jitter_and_sunlight_are_handed_on():
 
 def test_parameters_are_set_anew_where_the_rays_stay_the_same():
     spec = spec_of()
-    assert spec.parameters_at({"power": "3 W"})["instrument.laser.power"] == 3.0
+    assert spec.parameters_with({"power": "3 W"})["instrument.laser.power"] == 3.0
     for at, words in (
         ({"beam_divergence": "1 mrad"}, "moves the beamlets"),
         ({"architecture": "direct"}, "moves the beamlets"),
@@ -247,14 +249,14 @@ def test_parameters_are_set_anew_where_the_rays_stay_the_same():
         ({"power": "3 s"}, "needs a unit like W"),
     ):
         with pytest.raises(Exception, match=words):
-            spec.parameters_at(at)
+            spec.parameters_with(at)
 
 
 def test_a_scene_is_told_from_a_target_by_what_the_file_holds(tmp_path):
     import yaml
-    from written_specs import written as grid
+    from base_spec import changed_spec as grid
 
-    (tmp_path / "scene.yaml").write_text(yaml.safe_dump(written()))
+    (tmp_path / "scene.yaml").write_text(yaml.safe_dump(changed_scene()))
     (tmp_path / "grid.yaml").write_text(yaml.safe_dump(grid()))
     scene, target = load(tmp_path / "scene.yaml"), load(tmp_path / "grid.yaml")
     assert isinstance(scene, SceneSpec) and not isinstance(target, SceneSpec)
@@ -270,7 +272,7 @@ def test_tables_of_gps_seconds_share_the_origin_of_the_platforms_first_time(tmp_
     (tmp_path / "path.csv").write_text(header + "".join(rows))
     late = [f"{first + second}, {10 * second}, 0, 5\n" for second in (-1, 0, 1, 2)]
     (tmp_path / "target.csv").write_text(header + "".join(late))
-    mapping = written(
+    mapping = changed_scene(
         platform={"path": {"kind": "waypoints", "file": "path.csv"}},
         scene={"origin": "world", "objects": {
             "ball": {"kind": "sphere", "radius": "20 m", "reflectance": 0.1,
@@ -279,7 +281,7 @@ def test_tables_of_gps_seconds_share_the_origin_of_the_platforms_first_time(tmp_
     )  # fmt: skip
     spec = SceneSpec.from_mapping(mapping, base=tmp_path)
     assert spec.files.time_origin == first
-    flight, (ball,) = spec.flight(), spec.world().bodies
+    flight, (ball,) = spec.build_flight(), spec.build_scene().body_flights
     assert (flight.start, flight.stop) == (0, 1)
     state = flight.state(np.linspace(0, 1, 333))
     assert np.abs(state.acceleration).max() < 1e-8

@@ -9,15 +9,21 @@ import shutil
 import numpy as np
 import pytest
 import trimesh
-from written_scenes import BOULDERS, RELIEF, RICH, with_object, written
+from base_scene_spec import (
+    BOULDERS_OBJECT,
+    RELIEF_OBJECT,
+    SCENE_WITH_EVERYTHING,
+    changed_scene,
+    scene_with_object,
+)
 
-from sweep.scenes.files import SceneError
-from sweep.spec import SceneSpec, difference, from_stored
-from sweep.spec.axes import without_fields_on_axes
-from sweep.spec.grounds import OPTICAL
-from sweep.spec.identity import ROOTS, field_rules
-from sweep.spec.parts import all_parts, fields_of, leaves, rule_of
-from sweep.spec.sections import SECTIONS
+from sweep.scenes.scene_files import SceneError
+from sweep.spec import SceneSpec, describe_differences, from_stored
+from sweep.spec.axes import remove_fields_on_axes
+from sweep.spec.differences import SCENE_SECTIONS, rules_by_field_name
+from sweep.spec.fields import fields_by_name, iter_values, reachable_models, rule_of_field
+from sweep.spec.ground_sections import OPTICAL_FIELDS
+from sweep.spec.sections import MODEL_BY_SECTION
 
 
 def spec_of(mapping, base="."):
@@ -25,14 +31,14 @@ def spec_of(mapping, base="."):
 
 
 def changed(path, value):
-    mapping = json.loads(json.dumps(RICH))
+    mapping = json.loads(json.dumps(SCENE_WITH_EVERYTHING))
     *parents, name = path.split(".")
     part = mapping
     for parent in parents:
         part = part.setdefault(parent, {})
     part[name] = value
     mapping["instrument"]["laser"].setdefault("power", "0.1 W")  # where it is on no axis any more
-    return spec_of(without_fields_on_axes(mapping))
+    return spec_of(remove_fields_on_axes(mapping))
 
 
 OTHER_GEOMETRY = {
@@ -94,8 +100,8 @@ SAME_STUDY = ("title", "question", "execution", "figures", "interface")
 
 
 def objects_with_another_ground():
-    mapping = json.loads(json.dumps(RICH))
-    mapping["scene"]["objects"]["other"] = RELIEF
+    mapping = json.loads(json.dumps(SCENE_WITH_EVERYTHING))
+    mapping["scene"]["objects"]["other"] = RELIEF_OBJECT
     return mapping
 
 
@@ -107,57 +113,57 @@ def test_whatever_moves_a_ray_makes_another_geometry_and_another_study(path):
         mapping["scene"]["objects"]["forest"]["on"] = "other"
         there = spec_of(mapping)
     else:
-        here, there = spec_of(RICH), changed(path, OTHER_GEOMETRY[path])
+        here, there = spec_of(SCENE_WITH_EVERYTHING), changed(path, OTHER_GEOMETRY[path])
     assert here.geometry_id("three") != there.geometry_id("three")
     assert here.id != there.id
 
 
 @pytest.mark.parametrize("path", SAME_GEOMETRY)
 def test_radiometry_leaves_the_geometry_alone(path):
-    here, there = spec_of(RICH), changed(path, SAME_GEOMETRY[path])
+    here, there = spec_of(SCENE_WITH_EVERYTHING), changed(path, SAME_GEOMETRY[path])
     assert here.geometry_id("three") == there.geometry_id("three")
     assert (here.id == there.id) is (path in SAME_STUDY)
 
 
 def test_every_field_of_a_scene_is_in_its_geometry_unless_it_is_optical():
-    spec = spec_of(RICH)
-    text = json.dumps(spec.geometry("three"))
+    spec = spec_of(SCENE_WITH_EVERYTHING)
+    text = json.dumps(spec.geometry_identity("three"))
     for part in (*spec.scene.objects.values(), spec.platform, spec.scanners["three"]):
-        for path, _, _ in leaves(part):
+        for path, _, _ in iter_values(part):
             told = f'"{".".join(path)}"' in text
-            assert told is (path[-1] not in OPTICAL), path
+            assert told is (path[-1] not in OPTICAL_FIELDS), path
 
 
 def test_a_geometry_knows_no_names():
-    text = json.dumps(RICH)
+    text = json.dumps(SCENE_WITH_EVERYTHING)
     for old, new in (("ground", "soil"), ("forest", "wood"), ("three", "trio")):
         text = text.replace(f'"{old}"', f'"{new}"')
-    here, there = spec_of(RICH), spec_of(json.loads(text))
+    here, there = spec_of(SCENE_WITH_EVERYTHING), spec_of(json.loads(text))
     assert here.geometry_id("three") == there.geometry_id("trio")
     assert here.id != there.id
 
 
 def test_the_order_of_objects_numbers_their_surfaces():
-    mapping = json.loads(json.dumps(RICH))
+    mapping = json.loads(json.dumps(SCENE_WITH_EVERYTHING))
     objects = mapping["scene"]["objects"]
     mapping["scene"]["objects"] = {"ball": objects.pop("ball")} | objects
-    here, there = spec_of(RICH), spec_of(mapping)
+    here, there = spec_of(SCENE_WITH_EVERYTHING), spec_of(mapping)
     assert here.geometry_id("three") != there.geometry_id("three") and here.id != there.id
     assert there.surfaces()[0].name == "ball" and here.surfaces()[0].name == "ground"
 
 
 def test_a_geometry_is_seen_through_one_scanner():
-    mapping = json.loads(json.dumps(RICH))
+    mapping = json.loads(json.dumps(SCENE_WITH_EVERYTHING))
     mapping["scanners"]["again"] = mapping["scanners"]["three"]
     mapping["scanners"]["wide"] = mapping["scanners"]["three"] | {"half_angle": "30 deg"}
     spec = spec_of(mapping)
     assert spec.geometry_id("again") == spec.geometry_id("three") != spec.geometry_id("wide")
-    assert spec_of(RICH).geometry_id("three") == spec.geometry_id("three")
+    assert spec_of(SCENE_WITH_EVERYTHING).geometry_id("three") == spec.geometry_id("three")
 
 
 def test_a_seed_is_part_of_a_geometry_only_where_it_moves_the_beams():
     steady = [changed("platform.jitter", "0 rad")]
-    mapping = json.loads(json.dumps(RICH)) | {"seed": 2}
+    mapping = json.loads(json.dumps(SCENE_WITH_EVERYTHING)) | {"seed": 2}
     mapping["platform"]["jitter"] = "0 urad"
     steady.append(spec_of(mapping))
     assert steady[0].geometry_id("three") == steady[1].geometry_id("three")
@@ -166,25 +172,27 @@ def test_a_seed_is_part_of_a_geometry_only_where_it_moves_the_beams():
 
 def test_equal_quantities_make_equal_studies_however_they_are_spelt():
     spelt = changed("scene.objects.ball.radius", "100 cm")
-    assert spelt.id == spec_of(RICH).id
+    assert spelt.id == spec_of(SCENE_WITH_EVERYTHING).id
     turned = changed("platform.mounting", {"pitch": "0.017453292519943295 rad"})
-    assert turned.id == spec_of(RICH).id
+    assert turned.id == spec_of(SCENE_WITH_EVERYTHING).id
 
 
-@pytest.mark.parametrize("mapping", [written(), RICH, with_object(BOULDERS)])
+@pytest.mark.parametrize(
+    "mapping", [changed_scene(), SCENE_WITH_EVERYTHING, scene_with_object(BOULDERS_OBJECT)]
+)
 def test_a_stored_study_is_the_same_again(mapping):
     spec = spec_of(mapping)
     again = from_stored(spec.to_json())
     assert again == spec and again.id == spec.id
-    assert again.geometry("three") == spec.geometry("three")
+    assert again.geometry_identity("three") == spec.geometry_identity("three")
     assert again.to_json() == spec.to_json() and hash(again) == hash(spec)
     assert pickle.loads(pickle.dumps(spec)) == spec
 
 
 def test_every_default_is_written_out_so_that_a_store_keeps_it():
-    spec = spec_of(RICH)
+    spec = spec_of(SCENE_WITH_EVERYTHING)
     whole = spec.to_yaml_mapping()
-    for path, rule, value in leaves(spec):
+    for path, rule, value in iter_values(spec):
         if path[0] in ("title", "question", "execution", "axes", "figures"):
             continue
         if ".".join(path) in spec.to_yaml_mapping()["axes"]:
@@ -204,7 +212,7 @@ def study_with_files(tmp_path):
     trimesh.creation.box(extents=[2.0, 2, 2]).export(folder / "box.stl")
     (folder / "path.csv").write_text("time [s], x [m], y [m], z [m]\n0, 0, 0, 500\n10, 0, 0, 100\n")
     mesh = {"kind": "mesh", "file": "box.stl", "reflectance": 1, "position": ["0 m", "0 m", "1 m"]}
-    mapping = with_object(mesh)
+    mapping = scene_with_object(mesh)
     mapping["platform"]["path"] = {"kind": "waypoints", "file": "path.csv"}
     return folder, mapping
 
@@ -232,11 +240,11 @@ def test_a_stored_study_needs_its_files_only_where_rays_do(study_with_files):
     lost = from_stored(text)
     assert lost.id == spec.id and lost.geometry_id("three") == spec.geometry_id("three")
     assert [surface.name for surface in lost.surfaces()] == ["ground", "thing"]
-    for look in (lost.flight, lost.world):
+    for look in (lost.build_flight, lost.build_scene):
         with pytest.raises(SceneError, match="does not exist"):
             look()
     found = from_stored(text, base=moved)
-    assert found.cycles("three") == 21 and found.world().reports
+    assert found.number_of_cycles("three") == 21 and found.build_scene().mesh_reports
     assert found.files.base == moved and found == lost
 
 
@@ -245,10 +253,10 @@ def test_a_file_that_has_changed_since_is_refused(study_with_files):
     spec = spec_of(mapping, folder)
     stored = from_stored(spec.to_json(), base=folder)
     trimesh.creation.box(extents=[2.0, 2, 3]).export(folder / "box.stl")
-    assert spec.flight().stop == 10
+    assert spec.build_flight().stop == 10
     for one in (spec, stored):
         with pytest.raises(SceneError, match=r"box\.stl: has changed since .* bring the old"):
-            one.world()
+            one.build_scene()
 
 
 def test_a_raster_counts_by_what_is_read_of_it(tmp_path):
@@ -270,7 +278,7 @@ def test_a_raster_counts_by_what_is_read_of_it(tmp_path):
         '<SourceFilename relativeToVRT="1">dem.tif</SourceFilename><SourceBand>1</SourceBand>'
         "</SimpleSource></VRTRasterBand></VRTDataset>"
     )
-    mapping = copy.deepcopy(RICH)
+    mapping = copy.deepcopy(SCENE_WITH_EVERYTHING)
     mapping["scene"]["objects"]["ground"] = {
         "kind": "raster", "file": "dem.vrt", "reflectance": 0.1
     }  # fmt: skip
@@ -280,12 +288,12 @@ def test_a_raster_counts_by_what_is_read_of_it(tmp_path):
     name = next(iter(flat.scanners))
     assert flat.id != raised.id and flat.geometry_id(name) != raised.geometry_id(name)
     with pytest.raises(SceneError, match=r"dem\.vrt: has changed since"):
-        from_stored(flat.to_json(), base=tmp_path).world()
-    assert from_stored(raised.to_json(), base=tmp_path).world().reports
+        from_stored(flat.to_json(), base=tmp_path).build_scene()
+    assert from_stored(raised.to_json(), base=tmp_path).build_scene().mesh_reports
 
 
 def test_a_gltf_counts_with_the_buffers_that_it_names(tmp_path):
-    from sweep.scenes.files import file_digest
+    from sweep.scenes.scene_files import file_digest
 
     for name, side in (("a", 1.0), ("b", 2.0)):
         (tmp_path / name).mkdir()
@@ -302,33 +310,44 @@ def test_a_gltf_counts_with_the_buffers_that_it_names(tmp_path):
 
 def test_differences_are_told_with_units():
     there = changed("scene.objects.ground.size", "120 m")
-    assert difference(spec_of(RICH), there) == ["scene.objects.ground.size: 100 m -> 120 m"]
+    assert describe_differences(spec_of(SCENE_WITH_EVERYTHING), there) == [
+        "scene.objects.ground.size: 100 m -> 120 m"
+    ]
     there = changed("platform.lever_arm", ["1 m", "0 m", "2 m"])
-    assert difference(spec_of(RICH), there) == ["platform.lever_arm: [1, 0, 0] m -> [1, 0, 2] m"]
+    assert describe_differences(spec_of(SCENE_WITH_EVERYTHING), there) == [
+        "platform.lever_arm: [1, 0, 0] m -> [1, 0, 2] m"
+    ]
     there = changed("scanners.three.half_angle", "7.3 deg")
-    assert difference(spec_of(RICH), there) == ["scanners.three.half_angle: 20 deg -> 7.3 deg"]
+    assert describe_differences(spec_of(SCENE_WITH_EVERYTHING), there) == [
+        "scanners.three.half_angle: 20 deg -> 7.3 deg"
+    ]
     pointed = {"scanners": {"two.beams": [[math.radians(22.5), 0.0], [0.0, 0.6, -0.8]]}}
-    assert difference({}, pointed) == [
+    assert describe_differences({}, pointed) == [
         "scanners.two.beams: (none) -> [[22.5, 0] deg, [0, 0.6, -0.8]]"
     ]
-    lines = difference(spec_of(RICH), spec_of(written()))
+    lines = describe_differences(spec_of(SCENE_WITH_EVERYTHING), spec_of(changed_scene()))
     assert "objects: ground, forest, rocks, ball, crate -> ground" in lines
     assert "scene.objects.ball.radius: 1 m -> (none)" in lines
     assert "axes: power -> (none)" in lines
 
 
 def test_a_name_has_one_unit_wherever_it_stands():
-    for model in all_parts(*SECTIONS.values(), *ROOTS):
-        for name, field in fields_of(model).items():
-            rule = rule_of(field)
-            assert rule is None or field_rules()[name].units == rule.units, name
-    assert field_rules()["half_angle"].units == "rad" and len(all_parts(*ROOTS)) > 30
+    for model in reachable_models(*MODEL_BY_SECTION.values(), *SCENE_SECTIONS):
+        for name, field in fields_by_name(model).items():
+            rule = rule_of_field(field)
+            assert rule is None or rules_by_field_name()[name].value_unit == rule.value_unit, name
+    assert (
+        rules_by_field_name()["half_angle"].value_unit == "rad"
+        and len(reachable_models(*SCENE_SECTIONS)) > 30
+    )
 
 
 def test_random_things_of_one_seed_share_no_numbers():
-    from sweep.spec.grounds import generator
+    from sweep.spec.ground_sections import random_generator
 
-    first = {use: generator(use, 7).random(4) for use in ("relief", "hills", "craters", "trees")}
+    first = {
+        use: random_generator(use, 7).random(4) for use in ("relief", "hills", "craters", "trees")
+    }
     values = np.array(list(first.values()))
     assert len(np.unique(values)) == values.size
-    assert (generator("hills", 7).random(4) == first["hills"]).all()
+    assert (random_generator("hills", 7).random(4) == first["hills"]).all()

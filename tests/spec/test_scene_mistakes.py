@@ -7,10 +7,19 @@ import pickle
 
 import pytest
 import yaml
-from written_scenes import BOULDERS, BOX, HILLS, RELIEF, SPHERE, TREES, with_object, written
-from written_specs import written as grid
+from base_scene_spec import (
+    BOULDERS_OBJECT,
+    BOX_OBJECT,
+    HILLS_OBJECT,
+    RELIEF_OBJECT,
+    SPHERE_OBJECT,
+    TREES_OBJECT,
+    changed_scene,
+    scene_with_object,
+)
+from base_spec import changed_spec as grid
 
-from sweep.spec import SceneSpec, Spec, SpecError, load
+from sweep.spec import GridSpec, SceneSpec, SpecError, load
 
 
 def mistakes_of(mapping, base="."):
@@ -72,51 +81,111 @@ FIELDS = [
 @pytest.mark.parametrize(("path", "value", "words"), FIELDS)
 def test_a_wrong_field_is_reported_once_with_path_rule_and_remedy(path, value, words):
     if words is None:
-        SceneSpec.from_mapping(written({path: value}))
+        SceneSpec.from_mapping(changed_scene({path: value}))
         return
-    (mistake,) = mistakes_of(written({path: value}))
+    (mistake,) = mistakes_of(changed_scene({path: value}))
     assert words in str(mistake)
     # A part that is wrong as a whole is blamed at its own place or at the field that spoils it.
     assert mistake.path.startswith(path) or path.startswith(mistake.path)
 
 
 OBJECTS = [
-    (TREES, {"on": "grund"}, "on", "is no object of the scene (you wrote 'grund'); did you mean"),
-    (TREES, {"on": "thing"}, "on", "is no ground (you wrote 'thing'); the grounds are ground"),
-    (TREES, {"trunk": ...}, "trunk", "is missing; write 'trunk:' with reflectance"),
-    (TREES, {"tree": {"crown_base": "12 m"}}, "tree.crown_base", "must lie below the top, 12 m"),
-    (TREES, {"tree": {"height": "2 m"}}, "tree.crown_base",
-     "is 3 m by default, and must lie below the top, 2 m; lower it"),
-    (BOULDERS, {"largest": "0.5 m"}, "largest", "must exceed the smallest diameter, 0.5 m"),
-    (SPHERE, {"motion": MOVING}, "position", "stands beside a motion"),
-    (BOX, {"motion": SHORT}, "motion.path", "lasts from 0 to 9 s, and the flight from 0 to 10 s"),
-    (BOX, {"motion": MOVING | {"attitude": {"kind": "along_track"}}}, "motion.attitude",
-     "has no heading"),
-    (BOX, {"position": ["0 m"] * 3, "rotation": {"heading": "1 deg", "quaternion": [1, 0, 0, 0]}},
-     "rotation", "leave one of them out"),
-    (HILLS, {"correlation_length": "6 m"}, "spacing", "over three grid steps"),
-    (RELIEF, {"spacing": "1 km"}, None, None),
-    (RELIEF, {"craters": {"smallest": "5 m", "largest": "9 m"}}, "craters.smallest",
-     "must be three grid steps of 2 m or more"),
-    (RELIEF, {"factor": 2, "craters": {"smallest": "5 m", "largest": "9 m"}}, None, None),
-    (RELIEF, {"craters": {"smallest": "9 m", "largest": "8 m"}}, "craters.largest",
-     "must exceed the smallest diameter, 9 m"),
-    ({"kind": "jacksboro", "reflectance": 1}, {"size": "1 km", "middle": ["90 km", "0 km"]},
-     "middle", "there is no ground within 500 m of (90000, 0) m"),
-    ({"kind": "jacksboro", "reflectance": 1}, {"craters": {"smallest": "50 m", "largest": "1 km"}},
-     "craters.smallest", "three grid steps of 92.5 m"),
-    ({"kind": "mesh", "reflectance": 1, "file": "no.stl"}, {}, "file",
-     "names a file that does not exist (you wrote 'no.stl'); check the path"),
-    ({"kind": "raster", "reflectance": 1, "file": "."}, {}, "file",
-     "names a file that is a folder"),
-    ({"kind": "array", "reflectance": 1, "file": 3}, {"spacing": ["1 m", "1 m"]}, "file",
-     "must be the path of a file"),
-]  # fmt: skip
+    (
+        TREES_OBJECT,
+        {"on": "grund"},
+        "on",
+        "is no object of the scene (you wrote 'grund'); did you mean",
+    ),
+    (
+        TREES_OBJECT,
+        {"on": "thing"},
+        "on",
+        "is no ground (you wrote 'thing'); the grounds are ground",
+    ),
+    (TREES_OBJECT, {"trunk": ...}, "trunk", "is missing; write 'trunk:' with reflectance"),
+    (
+        TREES_OBJECT,
+        {"tree": {"crown_base": "12 m"}},
+        "tree.crown_base",
+        "must lie below the top, 12 m",
+    ),
+    (
+        TREES_OBJECT,
+        {"tree": {"height": "2 m"}},
+        "tree.crown_base",
+        "is 3 m by default, and must lie below the top, 2 m; lower it",
+    ),
+    (BOULDERS_OBJECT, {"largest": "0.5 m"}, "largest", "must exceed the smallest diameter, 0.5 m"),
+    (SPHERE_OBJECT, {"motion": MOVING}, "position", "stands beside a motion"),
+    (
+        BOX_OBJECT,
+        {"motion": SHORT},
+        "motion.path",
+        "lasts from 0 to 9 s, and the flight from 0 to 10 s",
+    ),
+    (
+        BOX_OBJECT,
+        {"motion": MOVING | {"attitude": {"kind": "along_track"}}},
+        "motion.attitude",
+        "has no heading",
+    ),
+    (
+        BOX_OBJECT,
+        {"position": ["0 m"] * 3, "rotation": {"heading": "1 deg", "quaternion": [1, 0, 0, 0]}},
+        "rotation",
+        "leave one of them out",
+    ),
+    (HILLS_OBJECT, {"correlation_length": "6 m"}, "spacing", "over three grid steps"),
+    (RELIEF_OBJECT, {"spacing": "1 km"}, None, None),
+    (
+        RELIEF_OBJECT,
+        {"craters": {"smallest": "5 m", "largest": "9 m"}},
+        "craters.smallest",
+        "must be three grid steps of 2 m or more",
+    ),
+    (RELIEF_OBJECT, {"factor": 2, "craters": {"smallest": "5 m", "largest": "9 m"}}, None, None),
+    (
+        RELIEF_OBJECT,
+        {"craters": {"smallest": "9 m", "largest": "8 m"}},
+        "craters.largest",
+        "must exceed the smallest diameter, 9 m",
+    ),
+    (
+        {"kind": "jacksboro", "reflectance": 1},
+        {"size": "1 km", "middle": ["90 km", "0 km"]},
+        "middle",
+        "there is no ground within 500 m of (90000, 0) m",
+    ),
+    (
+        {"kind": "jacksboro", "reflectance": 1},
+        {"craters": {"smallest": "50 m", "largest": "1 km"}},
+        "craters.smallest",
+        "three grid steps of 92.5 m",
+    ),
+    (
+        {"kind": "mesh", "reflectance": 1, "file": "no.stl"},
+        {},
+        "file",
+        "names a file that does not exist (you wrote 'no.stl'); check the path",
+    ),
+    (
+        {"kind": "raster", "reflectance": 1, "file": "."},
+        {},
+        "file",
+        "names a file that is a folder",
+    ),
+    (
+        {"kind": "array", "reflectance": 1, "file": 3},
+        {"spacing": ["1 m", "1 m"]},
+        "file",
+        "must be the path of a file",
+    ),
+]
 
 
 @pytest.mark.parametrize(("thing", "changes", "path", "words"), OBJECTS)
 def test_a_wrong_object_is_reported_once_with_path_rule_and_remedy(thing, changes, path, words):
-    mapping = with_object({k: v for k, v in (thing | changes).items() if v is not ...})
+    mapping = scene_with_object({k: v for k, v in (thing | changes).items() if v is not ...})
     if path is None:
         SceneSpec.from_mapping(mapping)
         return
@@ -127,18 +196,18 @@ def test_a_wrong_object_is_reported_once_with_path_rule_and_remedy(thing, change
 
 def test_names_of_objects_are_words_and_not_the_world():
     for name in ("Rock", "a.b", "1st", "x" * 61, ""):
-        mapping = written()
-        mapping["scene"]["objects"][name] = SPHERE
+        mapping = changed_scene()
+        mapping["scene"]["objects"][name] = SPHERE_OBJECT
         (mistake,) = mistakes_of(mapping)
         assert "is no name; take small letters" in str(mistake)
-    (mistake,) = mistakes_of(with_object(SPHERE, "world"))
+    (mistake,) = mistakes_of(scene_with_object(SPHERE_OBJECT, "world"))
     assert "is a name that the scene has taken" in str(mistake)
 
 
 def test_a_unit_of_a_mesh_is_one_of_length(tmp_path):
     (tmp_path / "a.stl").write_text("")
     mesh = {"kind": "mesh", "file": "a.stl", "reflectance": 1, "unit": "mn"}
-    (mistake,) = mistakes_of(with_object(mesh), tmp_path)
+    (mistake,) = mistakes_of(scene_with_object(mesh), tmp_path)
     assert mistake.path == "scene.objects.thing.unit" and "unknown unit 'mn'" in str(mistake)
 
 
@@ -159,9 +228,9 @@ TABLES = [
 def test_a_table_that_is_no_path_is_blamed_at_the_field_that_names_it(tmp_path, table, words):
     (tmp_path / "path.csv").write_text(table)
     path = {"kind": "waypoints", "file": "path.csv"}
-    (mistake,) = mistakes_of(written({"platform.path": path}), tmp_path)
+    (mistake,) = mistakes_of(changed_scene({"platform.path": path}), tmp_path)
     assert mistake.path == "platform.path.file" and words in str(mistake)
-    (mistake,) = mistakes_of(written({"platform.path": path | {"file": "pth.csv"}}), tmp_path)
+    (mistake,) = mistakes_of(changed_scene({"platform.path": path | {"file": "pth.csv"}}), tmp_path)
     assert mistake.path == "platform.path.file" and "there is: path.csv" in str(mistake)
 
 
@@ -169,14 +238,14 @@ def test_a_table_without_attitude_can_not_be_tracked(tmp_path):
     (tmp_path / "path.csv").write_text("time [s], x [m], y [m], z [m]\n0, 0, 0, 9\n9, 0, 0, 5\n")
     changes = {"platform.path": {"kind": "waypoints", "file": "path.csv"},
                "platform.attitude": {"kind": "track"}}  # fmt: skip
-    (mistake,) = mistakes_of(written(changes), tmp_path)
+    (mistake,) = mistakes_of(changed_scene(changes), tmp_path)
     assert mistake.path == "platform.attitude.file"
     assert "has no attitude to follow; add heading" in str(mistake)
 
 
 def test_a_flight_too_short_for_a_cycle_is_told():
     (mistake,) = mistakes_of(
-        written(scanners={"one": {"kind": "corners", "angle": "1 deg", "rate": "0.05 Hz"}})
+        changed_scene(scanners={"one": {"kind": "corners", "angle": "1 deg", "rate": "0.05 Hz"}})
     )
     assert mistake.path == "scanners.one.rate"
     assert "makes no whole cycle of 4 shots in a flight of 10 s" in str(mistake)
@@ -200,27 +269,27 @@ AXES = [
 
 @pytest.mark.parametrize(("axes", "path", "words"), AXES)
 def test_an_axis_that_would_move_rays_is_refused(axes, path, words):
-    (mistake,) = mistakes_of(written(axes=axes))
+    (mistake,) = mistakes_of(changed_scene(axes=axes))
     assert mistake.path == f"axes.{path}" and words in str(mistake)
 
 
 def test_an_axis_of_radiometry_is_read_and_stands_in_for_its_field():
     architectures = {"instrument.receiver.architecture": ["homodyne", "heterodyne"]}
     spec = SceneSpec.from_mapping(
-        written({"instrument.laser.power": ...}, axes=architectures
+        changed_scene({"instrument.laser.power": ...}, axes=architectures
                 | {"instrument.laser.power": ["1 W", "2 W"]})
     )  # fmt: skip
     assert [axis.size for axis in spec.axes] == [2, 2]
-    coherent = written({"footprint.phases": "coherent"}, axes={
+    coherent = changed_scene({"footprint.phases": "coherent"}, axes={
         "instrument.receiver.architecture": ["homodyne", "direct"]})  # fmt: skip
-    assert SceneSpec.from_mapping(coherent).pattern == "sunflower"
+    assert SceneSpec.from_mapping(coherent).beamlet_pattern == "sunflower"
 
 
 def test_no_parameter_that_may_vary_bears_the_name_of_an_array():
-    from sweep.spec.scene_check import stored_names
+    from sweep.spec.scene_checks import stored_names
     from sweep.spec.sections import parameter_rules
 
-    free = {p.rsplit(".", 1)[-1] for p in parameter_rules() if SceneSpec.may_vary(p)}
+    free = {p.rsplit(".", 1)[-1] for p in parameter_rules() if SceneSpec.may_be_on_axis(p)}
     assert len(free) > 20 and not free & stored_names()
 
 
@@ -248,7 +317,7 @@ FIGURES = [
 
 @pytest.mark.parametrize(("figure", "path", "words"), FIGURES)
 def test_a_wrong_figure_is_reported_with_path_rule_and_remedy(figure, path, words):
-    mapping = written(
+    mapping = changed_scene(
         {"scanners.pair": PAIR}, axes={"instrument.laser.power": ["1 W", "2 W"]}, figures=[figure]
     )
     (mistake,) = mistakes_of(mapping)
@@ -256,7 +325,7 @@ def test_a_wrong_figure_is_reported_with_path_rule_and_remedy(figure, path, word
 
 
 def test_navigation_needs_a_scanner_that_has_it():
-    mapping = written(scanners={"pair": PAIR}, figures=[{"kind": "navigation_table"}])
+    mapping = changed_scene(scanners={"pair": PAIR}, figures=[{"kind": "navigation_table"}])
     (mistake,) = mistakes_of(mapping)
     assert mistake.path == "figures[0]" and "needs a scanner of 3 shots a cycle" in str(mistake)
 
@@ -268,9 +337,9 @@ def test_figures_that_share_a_file_are_told_and_others_have_names_of_their_own()
         {"kind": "scatter", "y": "snr"}, {"kind": "scatter", "y": "snr", "x": "altitude"},
         {"kind": "shot_spectra"}, {"kind": "shot_spectra", "shot": 3},
     ]  # fmt: skip
-    spec = SceneSpec.from_mapping(written(figures=several))
-    assert len({figure.stem for figure in spec.figures}) == len(several)
-    (mistake,) = mistakes_of(written(figures=[CLOUD, CLOUD]))
+    spec = SceneSpec.from_mapping(changed_scene(figures=several))
+    assert len({figure.file_stem for figure in spec.figures}) == len(several)
+    (mistake,) = mistakes_of(changed_scene(figures=[CLOUD, CLOUD]))
     assert mistake.path == "figures[1]" and "give it a name" in str(mistake)
 
 
@@ -278,7 +347,7 @@ def test_figures_hold_what_was_written_in_si():
     view = {"azimuth": "-90 deg", "elevation": "30 deg"}
     figure = CLOUD | {"view": view, "x": ["1 km", "2 km"], "time": ["0 s", "90 ms"]}
     shot = {"kind": "shot_spectra", "shot": 12}
-    cloud, spectra = SceneSpec.from_mapping(written(figures=[figure, shot])).figures
+    cloud, spectra = SceneSpec.from_mapping(changed_scene(figures=[figure, shot])).figures
     assert (cloud.x, cloud.time, cloud.y) == ((1000.0, 2000.0), (0.0, 0.09), None)
     assert cloud.view == pytest.approx({"azimuth": -math.pi / 2, "elevation": math.pi / 6})
     assert spectra.shot == 12
@@ -301,7 +370,7 @@ def test_what_is_wrong_with_a_companion_of_a_mesh_is_told_of_it(uri, told, tmp_p
     (tmp_path / "a.gltf").write_text(json.dumps({"asset": {"version": "2.0"}, "buffers": buffers}))
     thing = {"kind": "mesh", "file": "a.gltf", "reflectance": 0.1}
     with pytest.raises(SpecError) as refused:
-        SceneSpec.from_mapping(written({"scene.objects.thing": thing}), base=tmp_path)
+        SceneSpec.from_mapping(changed_scene({"scene.objects.thing": thing}), base=tmp_path)
     assert told.format(folder=tmp_path) in str(refused.value)
     assert "scene.objects.thing.file" in str(refused.value)
 
@@ -358,12 +427,12 @@ def places(value, path=()):
         yield from places(value[key], (*path, key))
 
 
-EVERYTHING = written(
+EVERYTHING = changed_scene(
     {
-        "scene.objects.forest": TREES,
-        "scene.objects.rocks": BOULDERS,
-        "scene.objects.hills": HILLS | {"craters": {"smallest": "9 m", "largest": "20 m"}},
-        "scene.objects.crate": BOX | {"motion": MOVING},
+        "scene.objects.forest": TREES_OBJECT,
+        "scene.objects.rocks": BOULDERS_OBJECT,
+        "scene.objects.hills": HILLS_OBJECT | {"craters": {"smallest": "9 m", "largest": "20 m"}},
+        "scene.objects.crate": BOX_OBJECT | {"motion": MOVING},
         "scanners.pair": PAIR,
     },
     axes={"instrument.laser.power": ["1 W", "2 W"]},
@@ -392,7 +461,7 @@ def test_no_junk_anywhere_gets_past_as_a_traceback(junk):
 @pytest.mark.parametrize(
     ("kind", "mapping"),
     [
-        (Spec, grid({"target.range": ...}, axes={"target.range": ["5 m", "6 m"]})),
+        (GridSpec, grid({"target.range": ...}, axes={"target.range": ["5 m", "6 m"]})),
         (SceneSpec, EVERYTHING),
     ],
 )
@@ -406,5 +475,5 @@ def test_no_axis_over_wavelength_moves_the_rays_of_a_single_mode():
     mode = {"instrument.telescope.coupling": "single_mode"}
     mode |= {"instrument.laser.beam_divergence": "100 urad"}
     axes = {"instrument.laser.wavelength": ["1550 nm", "1551 nm"]}
-    (mistake,) = mistakes_of(written(mode, axes=axes))
+    (mistake,) = mistakes_of(changed_scene(mode, axes=axes))
     assert "the beam's radius follows from it" in str(mistake)

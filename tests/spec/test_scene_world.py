@@ -6,11 +6,20 @@ import numpy as np
 import pytest
 import rasterio
 import trimesh
-from written_scenes import BOULDERS, BOX, HILLS, RELIEF, SPHERE, TREES, with_object, written
+from base_scene_spec import (
+    BOULDERS_OBJECT,
+    BOX_OBJECT,
+    HILLS_OBJECT,
+    RELIEF_OBJECT,
+    SPHERE_OBJECT,
+    TREES_OBJECT,
+    changed_scene,
+    scene_with_object,
+)
 
 from sweep.model.eyepoints import observe
 from sweep.model.geometry.rays import Pose
-from sweep.scenes.files import SceneError
+from sweep.scenes.scene_files import SceneError
 from sweep.spec import SceneSpec
 
 FAR = np.array([500_123.375, 4_777_000.25])
@@ -19,20 +28,20 @@ FAR = np.array([500_123.375, 4_777_000.25])
 
 def built(mapping, base="."):
     spec = SceneSpec.from_mapping(mapping, base=base)
-    return spec, spec.world()
+    return spec, spec.build_scene()
 
 
 def seen(spec, world, name="three"):
     """Eyepoints of a whole flight."""
     return observe(
-        np.arange(spec.cycles(name) * spec.shots_a_cycle(name)),
-        flight=spec.flight(),
-        scanner=spec.scan(name),
+        np.arange(spec.number_of_cycles(name) * spec.shots_per_cycle(name)),
+        flight=spec.build_flight(),
+        scanner=spec.scan_pattern(name),
         caster=world.caster,
-        bodies=world.bodies,
+        bodies=world.body_flights,
         beam_divergence=spec.instrument.laser.beam_divergence,
         number=spec.footprint.beamlets,
-        pattern=spec.pattern,
+        pattern=spec.beamlet_pattern,
     )
 
 
@@ -40,27 +49,27 @@ def straight_down(world, x, y, height=1000.0, time=0.0):
     """Heights [m] and surfaces straight below places (n,)."""
     places = np.column_stack(np.broadcast_arrays(np.asarray(x, float), y, height))
     down = np.broadcast_to([0.0, 0.0, -1.0], places.shape)
-    poses = [None if b is None else b.state(np.array([time])) for b in world.bodies]
+    poses = [None if b is None else b.state(np.array([time])) for b in world.body_flights]
     poses = [None if p is None else Pose(p.position[0], p.attitude[0]) for p in poses]
     hits = world.caster.bundle(places, down[:, None], poses=poses)
     return height - hits.range, hits.surface[:, 0]
 
 
 def test_a_plane_is_seen_at_its_distance_and_closing_speed():
-    spec, world = built(written())
+    spec, world = built(changed_scene())
     eyes = seen(spec, world)
     slant = math.cos(math.radians(20))
     np.testing.assert_allclose(eyes.range, eyes.position[:, 2] / slant, rtol=1e-9)
     np.testing.assert_allclose(eyes.radial_velocity, -eyes.velocity[:, 2] * slant, rtol=1e-9)
     np.testing.assert_allclose(np.arccos(eyes.cos_incidence[:, 0]), math.radians(20), rtol=1e-9)
-    assert (eyes.surface == 0).all() and world.bodies == (None,)
+    assert (eyes.surface == 0).all() and world.body_flights == (None,)
     assert world.surfaces == spec.surfaces() and world.surfaces[0].reflectance == 0.1
 
 
 def test_a_plane_slopes_and_rises_where_it_says():
     plane = {"slope": "10 deg", "uphill": "90 deg", "height": "7 m", "spacing": "500 m"}
     changes = {f"scene.objects.ground.{name}": value for name, value in plane.items()}
-    _, world = built(written(changes | {"scene.origin": "world"}))
+    _, world = built(changed_scene(changes | {"scene.origin": "world"}))
     height, _ = straight_down(world, [0, 300, 0], [0, 0, 300])
     np.testing.assert_allclose(height, [7, 7, 7 + 300 * math.tan(math.radians(10))], atol=1e-9)
 
@@ -84,7 +93,7 @@ def ramp(rows=41, columns=61, pixel=2.0, base=-4400.0):
 def raster_study(tmp_path, **changes):
     write_raster(tmp_path / "ground.tif", 2 * ramp())  # in half metres
     ground = {"kind": "raster", "file": "ground.tif", "reflectance": 0.1, "scale": 0.5}
-    return written({"scene.objects.ground": ground} | changes)
+    return changed_scene({"scene.objects.ground": ground} | changes)
 
 
 def test_a_far_raster_is_brought_to_its_middle_exactly(tmp_path):
@@ -134,7 +143,7 @@ def test_arrays_and_images_lie_about_their_position(tmp_path, monkeypatch):
         "reflectance": 1,
     }
     _, world = built(
-        written(
+        changed_scene(
             {
                 "scene.origin": "world",
                 "scene.objects.ground.position": ["0 m", "0 m", "-100 m"],
@@ -151,16 +160,16 @@ def test_arrays_and_images_lie_about_their_position(tmp_path, monkeypatch):
 
 
 def test_jacksboro_is_cut_about_its_middle_and_refined_through_its_posts():
-    from sweep.scenes.rasters import jacksboro
+    from sweep.scenes.rasters import read_jacksboro
 
-    survey = jacksboro()
+    survey = read_jacksboro()
     row, column = 150, 250
     spot = survey.origin[:2] + np.multiply([column, row], survey.spacing)
     ground = {
         "kind": "jacksboro", "size": "1.1 km", "factor": 4, "reflectance": 0.1,
         "middle": [f"{c!r} m" for c in spot.tolist()],
     }  # fmt: skip
-    _, world = built(written({"scene.objects.ground": ground, "scene.origin": "world"}))
+    _, world = built(changed_scene({"scene.objects.ground": ground, "scene.origin": "world"}))
     node = [[0, 0], [3, 0], [-2, 5]]
     x, y = (np.array(node) * survey.spacing).T
     height, _ = straight_down(world, x + 1e-6, y + 1e-6, height=2000.0)
@@ -172,7 +181,7 @@ def test_relief_is_added_and_its_seed_draws_it_anew():
     def heights(**relief):
         fractal = {"hurst": 0.3, "rms_slope": 0.2, "baseline": "10 m"} | relief
         changes = {"scene.objects.ground.spacing": "20 m", "scene.objects.ground.relief": fractal}
-        _, world = built(written(changes | {"scene.origin": "world"}))
+        _, world = built(changed_scene(changes | {"scene.origin": "world"}))
         x, y = (v.ravel() for v in np.meshgrid(*[np.arange(-900, 900, 20.0)] * 2))
         return straight_down(world, x + 0.1, y + 0.1, height=5000.0)[0].reshape(90, 90)
 
@@ -190,20 +199,20 @@ def test_relief_is_added_and_its_seed_draws_it_anew():
 def test_craters_dig_into_their_ground():
     craters = {"smallest": "200 m", "largest": "600 m", "least_fresh": 1, "seed": 5}
     ground = {"scene.objects.ground.spacing": "20 m", "scene.objects.ground.craters": craters}
-    _, world = built(written(ground | {"scene.origin": "world"}))
+    _, world = built(changed_scene(ground | {"scene.origin": "world"}))
     x, y = (v.ravel() for v in np.meshgrid(*[np.arange(-990, 990, 15.0)] * 2))
     height, _ = straight_down(world, x, y)
     assert height.min() < -0.15 * 200 and height.max() > 0.03 * 200
     fewer = craters | {"equilibrium_diameter": "100 m"}
-    _, world = built(written(ground | {"scene.objects.ground.craters": fewer}))
+    _, world = built(changed_scene(ground | {"scene.objects.ground.craters": fewer}))
     assert np.abs(straight_down(world, x, y)[0]).mean() < np.abs(height).mean()
 
 
-@pytest.mark.parametrize("ground", [HILLS, RELIEF], ids=lambda g: g["kind"])
+@pytest.mark.parametrize("ground", [HILLS_OBJECT, RELIEF_OBJECT], ids=lambda g: g["kind"])
 def test_drawn_ground_is_the_same_for_a_seed_and_another_for_another(ground):
     def heights(**changes):
         things = {"scene.objects.ground": ground | changes, "scene.origin": "world"}
-        _, world = built(written(things))
+        _, world = built(changed_scene(things))
         return straight_down(world, np.linspace(-45, 45, 30), 3.0)[0]
 
     np.testing.assert_array_equal(heights(), heights())
@@ -213,7 +222,7 @@ def test_drawn_ground_is_the_same_for_a_seed_and_another_for_another(ground):
 
 
 def test_trees_have_leaves_and_trunks_of_their_own_on_the_ground():
-    mapping = with_object(TREES, "forest", radius="8 m", number=3)
+    mapping = scene_with_object(TREES_OBJECT, "forest", radius="8 m", number=3)
     spec, world = built(mapping)
     assert [surface.name for surface in spec.surfaces()] == [
         "ground",
@@ -231,7 +240,7 @@ def test_trees_have_leaves_and_trunks_of_their_own_on_the_ground():
 
 def test_boulders_lie_in_their_square_only():
     centre = ["30 m", "-20 m"]
-    mapping = with_object(BOULDERS, centre=centre)
+    mapping = scene_with_object(BOULDERS_OBJECT, centre=centre)
     mapping["scene"]["objects"]["ground"]["spacing"] = "5 m"
     _, world = built(mapping)
     mesh = world.caster.meshes[0]
@@ -242,8 +251,11 @@ def test_boulders_lie_in_their_square_only():
 
 def test_a_power_law_strews_as_many_boulders_as_it_says():
     law = {"kind": "power", "density": "0.02 m^-2", "exponent": 3}
-    _, world = built(with_object(BOULDERS, law=law, smallest="1 m", largest="5 m", within="1 km",
-                                 subdivisions=0))  # fmt: skip
+    _, world = built(
+        scene_with_object(
+            BOULDERS_OBJECT, law=law, smallest="1 m", largest="5 m", within="1 km", subdivisions=0
+        )
+    )
     faces = (world.caster.meshes[0].surface == 1).sum()
     expected = 0.02 * (1 - 5**-3) * 1000**2
     assert faces / 12 == pytest.approx(expected, abs=5 * math.sqrt(expected))
@@ -255,7 +267,7 @@ def test_a_mesh_is_scaled_turned_and_placed(tmp_path):
         "kind": "mesh", "file": "box.stl", "unit": "mm", "scale": 2, "reflectance": 0.3,
         "position": ["50 m", "0 m", "10 m"], "rotation": {"heading": "90 deg"},
     }  # fmt: skip
-    _, world = built(with_object(mesh), tmp_path)
+    _, world = built(scene_with_object(mesh), tmp_path)
     x = np.array([50, 51.9, 52.1, 50, 50])
     y = np.array([0, 0, 0, 0.9, 1.1])
     height, surface = straight_down(world, x, y)
@@ -277,8 +289,8 @@ def test_a_mesh_without_a_position_shares_the_coordinates_of_the_ground(tmp_path
 
 
 def test_solids_are_what_they_are_called():
-    mapping = with_object(SPHERE, "ball", subdivisions=5)
-    mapping["scene"]["objects"]["crate"] = BOX | {"position": ["20 m", "0 m", "3 m"]}
+    mapping = scene_with_object(SPHERE_OBJECT, "ball", subdivisions=5)
+    mapping["scene"]["objects"]["crate"] = BOX_OBJECT | {"position": ["20 m", "0 m", "3 m"]}
     _, world = built(mapping)
     x, y = np.array([0, 0, 0.6, 20.9, 21.1, 20]), np.array([9, 9.6, 9, 0, 0, 1.9])
     height, surface = straight_down(world, x, y)
@@ -290,14 +302,14 @@ def test_solids_are_what_they_are_called():
 
 @pytest.mark.parametrize("subdivisions", [1, 3])
 def test_facets_of_a_sphere_lie_as_near_as_promised(subdivisions):
-    from sweep.scenes.meshes import box, sphere
+    from sweep.scenes.meshes import box_facets, sphere_facets
 
-    ball = sphere(radius=2.0, subdivisions=subdivisions)
+    ball = sphere_facets(radius=2.0, subdivisions=subdivisions)
     middles = np.linalg.norm(ball.vertices[ball.faces].mean(axis=1), axis=1)
     assert len(ball.faces) == 20 * 4**subdivisions
     np.testing.assert_allclose(np.linalg.norm(ball.vertices, axis=1), 2)
     assert 0.2 * 2 / 4**subdivisions < 2 - middles.min() < 0.3 * 2 / 4**subdivisions
-    for shape, volume in ((ball, None), (box(size=(1, 2, 3)), 6.0)):
+    for shape, volume in ((ball, None), (box_facets(size=(1, 2, 3)), 6.0)):
         a, b, c = np.moveaxis(shape.vertices[shape.faces], 1, 0)
         enclosed = np.einsum("ij,ij->", a, np.cross(b, c)) / 6
         assert 0 < enclosed < 4 / 3 * math.pi * 8 if volume is None else enclosed == volume
@@ -311,8 +323,8 @@ def test_a_moving_box_is_met_where_it_is_and_closes_at_its_own_speed():
         }
     }  # fmt: skip
     nadir = {"down": {"kind": "fixed", "beams": [[0, 0, -1]], "rate": "1 Hz"}}
-    spec, world = built(with_object(BOX, motion=rising) | {"scanners": nadir})
-    assert [body is None for body in world.bodies] == [True, False]
+    spec, world = built(scene_with_object(BOX_OBJECT, motion=rising) | {"scanners": nadir})
+    assert [body is None for body in world.body_flights] == [True, False]
     eyes = seen(spec, world, "down")
     top = 50 + 5 * eyes.time + 3
     aloft = eyes.position[:, 2] > top
@@ -330,7 +342,7 @@ def test_a_spinning_box_stays_throughout_a_flight_that_begins_late(tmp_path):
         "path": {"kind": "still", "position": ["0 m", "0 m", "10 m"]},
         "attitude": {"kind": "spin", "angular_velocity": ["3 rad/s", "0 rad/s", "0 rad/s"]},
     }
-    mapping = with_object(BOX | {"size": ["9 m", "9 m", "2 m"]}, motion=spin)
+    mapping = scene_with_object(BOX_OBJECT | {"size": ["9 m", "9 m", "2 m"]}, motion=spin)
     mapping["platform"]["path"] = {"kind": "waypoints", "file": "path.csv"}
     mapping["scanners"] = {"down": {"kind": "fixed", "beams": [[0, 0, -1]], "rate": "1 Hz"}}
     spec, world = built(mapping, tmp_path)
@@ -342,11 +354,11 @@ def test_a_spinning_box_stays_throughout_a_flight_that_begins_late(tmp_path):
 
 def test_nothing_at_rest_makes_a_world_of_moving_bodies_alone():
     motion = {"path": {"kind": "still", "position": ["0 m", "0 m", "10 m"]}}
-    mapping = written(
-        {"scene.objects": {"crate": BOX | {"motion": motion}}, "scene.origin": "world"}
+    mapping = changed_scene(
+        {"scene.objects": {"crate": BOX_OBJECT | {"motion": motion}}, "scene.origin": "world"}
     )
     _, world = built(mapping)
-    assert len(world.bodies) == 1 and world.bodies[0] is not None
+    assert len(world.body_flights) == 1 and world.body_flights[0] is not None
 
 
 def test_a_report_tells_of_each_object_what_was_mended(tmp_path):
@@ -354,20 +366,20 @@ def test_a_report_tells_of_each_object_what_was_mended(tmp_path):
         "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 2 0 0\nf 1 2 3\nf 1 2 3\nf 1 2 4\n"
     )
     mesh = {"kind": "mesh", "file": "bad.obj", "reflectance": 1}
-    mapping = with_object(mesh, "scrap", position=["0 m", "0 m", "5 m"])
+    mapping = scene_with_object(mesh, "scrap", position=["0 m", "0 m", "5 m"])
     _, world = built(mapping, tmp_path)
-    assert world.reports[0].startswith("ground: 2 faces on 4 vertices")
-    assert "scrap: 3 faces" in world.reports[1]
-    assert "1 faces without area dropped; 1 duplicate faces dropped" in world.reports[1]
+    assert world.mesh_reports[0].startswith("ground: 2 faces on 4 vertices")
+    assert "scrap: 3 faces" in world.mesh_reports[1]
+    assert "1 faces without area dropped; 1 duplicate faces dropped" in world.mesh_reports[1]
 
 
 def test_an_object_that_can_not_be_made_is_named_in_plain_words():
     with pytest.raises(
         SceneError, match=r"scene.objects.forest: can not be made: 500 trees .* fit"
     ):
-        built(with_object(TREES, "forest", radius="5 m", number=500))
+        built(scene_with_object(TREES_OBJECT, "forest", radius="5 m", number=500))
     with pytest.raises(SceneError, match="thing: can not be made: there is no ground within"):
-        built(with_object(BOULDERS, centre=["5 km", "0 m"]))
+        built(scene_with_object(BOULDERS_OBJECT, centre=["5 km", "0 m"]))
 
 
 @pytest.mark.parametrize(
@@ -381,7 +393,7 @@ def test_a_ground_larger_than_the_memory_is_refused_before_it_is_made(changes, m
     """9e6 nodes take 220 bytes each while their tree is built."""
     monkeypatch.setattr("psutil.virtual_memory", lambda: type("M", (), {"available": 1.5e9}))
     with pytest.raises(SceneError, match=r"of 9,.* (2|1\.9\d*|2\.\d+) GB of memory, of which 1\.5"):
-        built(written(changes | {"scene.objects.ground.size": "3 km"}))
+        built(changed_scene(changes | {"scene.objects.ground.size": "3 km"}))
 
 
 def test_tiles_of_a_survey_make_ground_without_a_seam(tmp_path):
@@ -391,7 +403,7 @@ def test_tiles_of_a_survey_make_ground_without_a_seam(tmp_path):
     write_raster(tmp_path / "east.tif", heights[:, 31:], np.add(FAR, [31.0, 0.0]))
     ground = {"kind": "raster", "reflectance": 0.1}
     _, world = built(
-        written(
+        changed_scene(
             {
                 "scene.objects.ground": ground | {"file": "ground.tif"},
                 "scene.objects.east": ground | {"file": "east.tif", "reflectance": 0.2},
@@ -410,7 +422,7 @@ def test_rasters_of_two_maps_or_of_none_are_refused_or_told(tmp_path):
     write_raster(tmp_path / "ground.tif", ramp())
     write_raster(tmp_path / "east.tif", ramp(), np.add(FAR, [500.0, 0.0]), crs="EPSG:32632")
     ground = {"kind": "raster", "reflectance": 0.1}
-    mapping = written(
+    mapping = changed_scene(
         {
             "scene.objects.ground": ground | {"file": "ground.tif"},
             "scene.objects.east": ground | {"file": "east.tif"},

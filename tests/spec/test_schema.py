@@ -6,17 +6,17 @@ from pathlib import Path
 import jsonschema
 import pytest
 import yaml
-from written_scenes import BOX, RICH, SPHERE, with_object
-from written_scenes import written as flight
-from written_specs import written
+from base_scene_spec import BOX_OBJECT, SCENE_WITH_EVERYTHING, SPHERE_OBJECT, scene_with_object
+from base_scene_spec import changed_scene as flight
+from base_spec import changed_spec
 
 from sweep.model import window as model_window
 from sweep.model.ground import LAWS
-from sweep.spec import SceneSpec, Spec, SpecError, json_schema, load
-from sweep.spec.parts import all_parts, digest, fields_of, rule_of
-from sweep.spec.reading import read_document
-from sweep.spec.rules import WINDOWS, Numeric
+from sweep.spec import GridSpec, SceneSpec, SpecError, json_schema, load
+from sweep.spec.fields import fields_by_name, identity_digest, reachable_models, rule_of_field
+from sweep.spec.rules import COSINE_SUM_WINDOWS, NumericRule
 from sweep.spec.sections import parameter_rules
+from sweep.spec.yaml_document import read_document
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 IDS = {
@@ -91,16 +91,16 @@ def test_every_experiment_that_the_project_promises_is_there():
 @pytest.mark.parametrize("name", IDS)
 def test_a_shipped_study_keeps_its_id_and_agrees_with_the_schema(name, validator):
     path = EXPERIMENTS / f"{name}.yaml"
-    validator.validate(read_document(path).value)
+    validator.validate(read_document(path).content)
     text = path.read_text()
     assert text.startswith("# ")
     study = loaded(name)
     parts = [study.identity()]
     if isinstance(study, SceneSpec):
-        parts += [study.geometry(scanner) for scanner in study.scanners]
+        parts += [study.geometry_identity(scanner) for scanner in study.scanners]
         assert max(map(len, text.splitlines())) <= 100
     # The version of the model is no part of these ids.
-    assert [digest(part | {"model": ""})[:8] for part in parts] == IDS[name].split()
+    assert [identity_digest(part | {"model": ""})[:8] for part in parts] == IDS[name].split()
     assert study.question.endswith("?")
 
 
@@ -111,7 +111,7 @@ def test_a_shipped_grid_has_its_points_and_comes_back_from_a_store(name, validat
     for axis in study.axes:
         points *= axis.size
     assert points == POINTS[name]
-    assert Spec.from_stored(study.to_json()) == study
+    assert GridSpec.from_stored(study.to_json()) == study
     validator.validate(study.to_yaml_mapping())
 
 
@@ -144,15 +144,16 @@ def test_table_5_1_differs_from_table_4_1_in_its_aperture_and_in_two_beats():
         yaml.safe_load((EXPERIMENTS / "instruments" / f"{name}.yaml").read_text())
         for name in ("table_4_1", "table_5_1")
     )
-    assert Spec.from_mapping(written(instrument=b)).instrument.telescope.aperture == 0.05
+    assert GridSpec.from_mapping(changed_spec(instrument=b)).instrument.telescope.aperture == 0.05
     b["telescope"]["aperture"] = "25 mm"
     assert b["processing"].pop("two_beats") == "fast"
     assert (
-        Spec.from_mapping(written(instrument=a)).id == Spec.from_mapping(written(instrument=b)).id
+        GridSpec.from_mapping(changed_spec(instrument=a)).id
+        == GridSpec.from_mapping(changed_spec(instrument=b)).id
     )
 
 
-VARIED = written(
+VARIED = changed_spec(
     axes={
         "target.range": ["1 m", {"step": ["5 m", "9 m", "1 m"]}],
         "instrument.processing.fft_size": ["2^16", 131072],
@@ -164,11 +165,11 @@ VARIED = written(
 )
 FIGURE = {"kind": "cloud", "colour": "snr", "view": {"azimuth": "1 deg", "elevation": "2 deg"}}
 READ = {
-    "target": written(),
+    "target": changed_spec(),
     "axes": VARIED,
     "plane": flight({"figures": [FIGURE]}),
-    "rich": RICH,
-    "whole": SceneSpec.from_mapping(RICH).to_yaml_mapping(),
+    "rich": SCENE_WITH_EVERYTHING,
+    "whole": SceneSpec.from_mapping(SCENE_WITH_EVERYTHING).to_yaml_mapping(),
 }
 
 
@@ -195,7 +196,7 @@ def test_a_study_that_is_read_agrees_with_the_schema(name, validator):
     ],
 )
 def test_an_editor_sees_the_mistake_in_a_grid_by_the_schema(changes, validator):
-    assert list(validator.iter_errors(written(changes)))
+    assert list(validator.iter_errors(changed_spec(changes)))
 
 
 @pytest.mark.parametrize(
@@ -212,7 +213,7 @@ def test_an_editor_sees_the_mistake_in_a_grid_by_the_schema(changes, validator):
         {"figures": [FIGURE | {"kind": "surface"}]},
         {"figures": [FIGURE | {"view": {"azimuth": "1 deg"}}]},
         {"target": {"range": "1 m"}},
-        {"scene.objects.crate": BOX | {"size": ["1 m"]}},
+        {"scene.objects.crate": BOX_OBJECT | {"size": ["1 m"]}},
     ],
 )
 def test_an_editor_sees_the_mistake_in_a_flight_by_the_schema(changes, validator):
@@ -221,7 +222,7 @@ def test_an_editor_sees_the_mistake_in_a_flight_by_the_schema(changes, validator
 
 @pytest.mark.parametrize("law", LAWS)
 def test_every_law_of_the_model_is_one_that_surfaces_take(law, validator):
-    mapping = with_object(SPHERE, reflectance_law=law)
+    mapping = scene_with_object(SPHERE_OBJECT, reflectance_law=law)
     validator.validate(mapping)
     assert SceneSpec.from_mapping(mapping).surfaces()[1].law == law
 
@@ -231,19 +232,19 @@ def test_every_parameter_is_described_with_an_example():
     for path, rule in parameter_rules().items():
         described = definitions[f"{path}.value"]
         assert described["description"]
-        assert not isinstance(rule, Numeric) or described["examples"] == [rule.example]
+        assert not isinstance(rule, NumericRule) or described["examples"] == [rule.example]
     receiver = definitions["Receiver"]["properties"]
     assert receiver["local_oscillator_power"]["default"] == "0.001 W"
     assert receiver["noise_figure"]["default"] == "0 dB"
 
 
-@pytest.mark.parametrize("kind", [Spec, SceneSpec])
+@pytest.mark.parametrize("kind", [GridSpec, SceneSpec])
 def test_every_field_is_described_and_its_default_reads_back_as_it_is_written(kind):
     definitions, looked_at = json.loads(json.dumps(json_schema()["$defs"])), 0
-    for model in all_parts(kind):
+    for model in reachable_models(kind):
         properties = definitions[model.__name__]["properties"]
-        for name, field in fields_of(model).items():
-            rule, described = rule_of(field), properties[name]
+        for name, field in fields_by_name(model).items():
+            rule, described = rule_of_field(field), properties[name]
             if rule is None or name == "axes":
                 continue
             assert described["description"], (model, name)
@@ -251,7 +252,7 @@ def test_every_field_is_described_and_its_default_reads_back_as_it_is_written(ki
                 jsonschema.Draft202012Validator(described).validate(described["default"])
                 read = rule.read(described["default"])
                 assert read == field.default, (model, name)
-                assert json.loads(json.dumps(rule.written(read))) == described["default"]
+                assert json.loads(json.dumps(rule.format(read))) == described["default"]
                 looked_at += 1
             if rule.example and not rule.example.startswith("["):
                 rule.read(rule.example)
@@ -259,10 +260,11 @@ def test_every_field_is_described_and_its_default_reads_back_as_it_is_written(ki
 
 
 @pytest.mark.parametrize(
-    "name", [*WINDOWS, *model_window.ALIASES, "kaiser(8.6)", "chebwin(100)", "tukey( 0.5 )"]
+    "name",
+    [*COSINE_SUM_WINDOWS, *model_window.ALIASES, "kaiser(8.6)", "chebwin(100)", "tukey( 0.5 )"],
 )
 def test_every_window_that_a_spec_takes_the_model_makes(name):
-    read = Spec.from_mapping(
-        written({"instrument.processing.window": name})
+    read = GridSpec.from_mapping(
+        changed_spec({"instrument.processing.window": name})
     ).instrument.processing.window
     assert model_window.samples(read, 32).shape == (32,)

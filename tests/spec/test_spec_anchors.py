@@ -5,9 +5,9 @@ import json
 import jsonschema
 import pytest
 import yaml
-from written_specs import BASE, written
+from base_spec import BASE_SPEC, changed_spec
 
-from sweep.spec import Spec, SpecError, json_schema, load, load_cluster
+from sweep.spec import GridSpec, SpecError, json_schema, load, load_cluster_config
 
 MERGED = """\
 title: A study
@@ -46,7 +46,8 @@ def mistakes_of(tmp_path, text):
 def test_merged_fields_count_as_if_they_were_written_and_written_ones_come_first(tmp_path):
     spec = loaded(tmp_path, MERGED)
     assert (
-        spec.id == Spec.from_mapping(written({"instrument.receiver.optical_passband": "30 nm"})).id
+        spec.id
+        == GridSpec.from_mapping(changed_spec({"instrument.receiver.optical_passband": "30 nm"})).id
     )
     assert spec.instrument.receiver.detector_bandwidth == 400e6  # the first of the list
     assert yaml.safe_load(MERGED)["instrument"]["receiver"]["detector_bandwidth"] == "400 MHz"
@@ -110,18 +111,20 @@ def test_merges_that_double_end_in_words(tmp_path):
 
 
 def test_files_of_instruments_and_clusters_and_plain_data_take_them_too(tmp_path):
-    instrument = {"x-note": 1, **BASE["instrument"]}
+    instrument = {"x-note": 1, **BASE_SPEC["instrument"]}
     (tmp_path / "instrument.yaml").write_text(json.dumps(instrument))
-    spec = written({"instrument": {"file": "instrument.yaml"}}, **{"x-note": {"any": ["thing"]}})
-    assert Spec.from_mapping(spec, base=tmp_path).id == Spec.from_mapping(BASE).id
+    spec = changed_spec(
+        {"instrument": {"file": "instrument.yaml"}}, **{"x-note": {"any": ["thing"]}}
+    )
+    assert GridSpec.from_mapping(spec, base=tmp_path).id == GridSpec.from_mapping(BASE_SPEC).id
     (tmp_path / "local.yaml").write_text(
         "x-w: &w {threads: 2}\nkind: local\nworkers: 1\nworker: {<<: *w, memory: 1 GB}\n"
     )
-    assert load_cluster(tmp_path / "local.yaml").worker.threads == 2
+    assert load_cluster_config(tmp_path / "local.yaml").worker.threads == 2
 
 
 def test_an_editor_takes_sections_x():
     schema = json_schema()
-    jsonschema.validate(written(**{"x-note": [1]}), schema)
+    jsonschema.validate(changed_spec(**{"x-note": [1]}), schema)
     with pytest.raises(jsonschema.ValidationError):
-        jsonschema.validate(written(note=[1]), schema)
+        jsonschema.validate(changed_spec(note=[1]), schema)

@@ -3,35 +3,35 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from base_spec import axis_member_content, changed_spec
 from hypothesis import given
 from hypothesis import strategies as st
-from written_specs import content, written
 
-from sweep.analysis.tables import reference
+from sweep.analysis.tables import noise_only_reference
 from sweep.model.threshold import PFA_SHOT, TNR, tnr_of
-from sweep.spec import Spec, SpecError
-from sweep.tasks.grid_study import GridStudy
+from sweep.spec import GridSpec, SpecError
+from sweep.tasks.studies.grid_study import GridStudy
 
 
 def axes_of(**kinds):
-    return Spec.from_mapping(written(axes=kinds)).axes
+    return GridSpec.from_mapping(changed_spec(axes=kinds)).axes
 
 
 def member(path, values):
-    return Spec.from_mapping(written(axes={path: values})).axes[0].members[0]
+    return GridSpec.from_mapping(changed_spec(axes={path: values})).axes[0].parameters[0]
 
 
 def test_a_list_keeps_the_users_unit_beside_si():
     power = member("instrument.laser.power", ["1 W", "3000 mW", "5 W"])
-    assert (power.name, power.units) == ("power", "W")
-    assert power.values.tolist() == power.display.tolist() == [1.0, 3.0, 5.0]
+    assert (power.coordinate, power.units) == ("power", "W")
+    assert power.values.tolist() == power.display_values.tolist() == [1.0, 3.0, 5.0]
 
 
 def test_display_values_are_in_the_unit_of_the_first_value():
     angle = member("target.grazing_angle", ["15 deg", "0.5 rad", "90 deg"])
     assert angle.units == "deg"
-    assert angle.display[[0, 2]].tolist() == [15.0, 90.0]
-    assert angle.display[1] == pytest.approx(np.degrees(0.5), rel=1e-15)
+    assert angle.display_values[[0, 2]].tolist() == [15.0, 90.0]
+    assert angle.display_values[1] == pytest.approx(np.degrees(0.5), rel=1e-15)
     assert angle.values[1] == 0.5
 
 
@@ -46,7 +46,7 @@ def test_units_have_one_plain_spelling():
 def test_decibels_are_shown_as_such_and_spaced_as_such():
     figure = member("instrument.receiver.noise_figure", {"linear": ["0 dB", "20 dB"], "number": 3})
     assert figure.units == "dB"
-    assert figure.display.tolist() == [0.0, 10.0, 20.0]
+    assert figure.display_values.tolist() == [0.0, 10.0, 20.0]
     assert figure.values.tolist() == [1.0, 10.0, 100.0]
 
 
@@ -54,7 +54,7 @@ def test_temperatures_step_in_celsius():
     step = {"step": ["-10 degC", "20 degC", "10 degC"]}
     temperature = member("instrument.receiver.temperature", step)
     assert temperature.values.tolist() == [263.15, 273.15, 283.15, 293.15]
-    assert temperature.display.tolist() == [-10.0, 0.0, 10.0, 20.0]
+    assert temperature.display_values.tolist() == [-10.0, 0.0, 10.0, 20.0]
 
 
 @given(
@@ -68,14 +68,14 @@ def test_a_step_gives_the_floats_of_its_values_written_out(start, step, number, 
     numbers = [start + step * i for i in range(number)]
     generated = member("target.range", {"step": [text(start), text(numbers[-1]), text(step)]})
     listed = member("target.range", [text(value) for value in numbers])
-    assert content(generated) == content(listed)
-    assert generated.display.tolist() == [float(Fraction(value, parts)) for value in numbers]
+    assert axis_member_content(generated) == axis_member_content(listed)
+    assert generated.display_values.tolist() == [float(Fraction(value, parts)) for value in numbers]
 
 
 def test_degrees_stepped_are_the_floats_of_degrees_written_out():
     generated = member("target.grazing_angle", {"step": ["1 deg", "90 deg", "0.1 deg"]})
     listed = member("target.grazing_angle", [f"{i / 10} deg" for i in range(10, 901)])
-    assert content(generated) == content(listed)
+    assert axis_member_content(generated) == axis_member_content(listed)
     assert len(generated.values) == 891
 
 
@@ -93,7 +93,7 @@ def test_linear_values_are_evenly_spaced_with_exact_ends():
 def test_ends_of_a_generator_may_differ_in_unit():
     mixed = member("target.range", {"linear": ["1 m", "10 km"], "number": 4})
     plain = member("target.range", {"linear": ["1 m", "10000 m"], "number": 4})
-    assert content(mixed) == content(plain)
+    assert axis_member_content(mixed) == axis_member_content(plain)
 
 
 def test_log_values_have_one_ratio_and_exact_ends_in_whatever_unit():
@@ -103,13 +103,13 @@ def test_log_values_have_one_ratio_and_exact_ends_in_whatever_unit():
     assert np.ptp(ratios) < 1e-13
     assert metres.values[[0, -1]].tolist() == [3.0, 10000.0]
     assert metres.values.tolist() == millimetres.values.tolist()
-    assert millimetres.display[[0, -1]].tolist() == [3000.0, 1e7]
+    assert millimetres.display_values[[0, -1]].tolist() == [3000.0, 1e7]
 
 
 def test_decades_come_out_clean():
     decades = member("target.range", {"log": ["1 mm", "1 km"], "number": 7})
     assert decades.values.tolist() == [0.001, 0.01, 0.1, 1.0, 10.0, 100.0, 1000.0]
-    assert decades.display.tolist() == [1.0, 10.0, 100.0, 1e3, 1e4, 1e5, 1e6]
+    assert decades.display_values.tolist() == [1.0, 10.0, 100.0, 1e3, 1e4, 1e5, 1e6]
 
 
 def test_whole_fields_take_whole_values_only_and_stay_whole():
@@ -117,7 +117,7 @@ def test_whole_fields_take_whole_values_only_and_stay_whole():
                            [65536, 131072.0, "262144"]):  # fmt: skip
         sizes = member("instrument.processing.fft_size", written_values)
         assert sizes.values.dtype == np.int64
-        assert sizes.values.tolist() == sizes.display.tolist() == [65536, 131072, 262144]
+        assert sizes.values.tolist() == sizes.display_values.tolist() == [65536, 131072, 262144]
         assert sizes.units == ""
 
 
@@ -129,7 +129,7 @@ def test_a_list_may_hold_generators():
 def test_words_make_an_axis():
     window = member("instrument.processing.window", ["hann", "kaiser( 8.6 )"])
     assert window.values == ("hann", "kaiser(8.6)")
-    assert window.display.tolist() == ["hann", "kaiser(8.6)"]
+    assert window.display_values.tolist() == ["hann", "kaiser(8.6)"]
     assert window.units == ""
 
 
@@ -143,11 +143,11 @@ def test_zipped_pieces_are_laid_end_to_end_with_single_values_repeated():
             ]
         }
     )
-    assert (cut.name, cut.size, cut.zipped) == ("cut", 6, True)
-    distance, angle = cut.members
-    assert (distance.name, distance.units) == ("range", "m")
+    assert (cut.name, cut.size, cut.is_zipped) == ("cut", 6, True)
+    distance, angle = cut.parameters
+    assert (distance.coordinate, distance.units) == ("range", "m")
     assert distance.values.tolist() == [5.0, 6.0, 7.0, 3500.0, 3500.0, 9.0]
-    assert angle.display.tolist() == [15.0, 15.0, 15.0, 1.0, 2.0, 90.0]
+    assert angle.display_values.tolist() == [15.0, 15.0, 15.0, 1.0, 2.0, 90.0]
 
 
 def test_a_zipped_axis_may_hold_words_and_repeat_points():
@@ -155,20 +155,20 @@ def test_a_zipped_axis_may_hold_words_and_repeat_points():
         pair={"zip": {"instrument.processing.window": ["hann", "hann", "hamming"],
                       "footprint.phases": "coherent", "target.range": "1 m"}}
     )  # fmt: skip
-    assert pair.members[0].values == ("hann", "hann", "hamming")
-    assert pair.members[1].values == ("coherent",) * 3
-    assert pair.members[2].values.tolist() == [1.0, 1.0, 1.0]
+    assert pair.parameters[0].values == ("hann", "hann", "hamming")
+    assert pair.parameters[1].values == ("coherent",) * 3
+    assert pair.parameters[2].values.tolist() == [1.0, 1.0, 1.0]
 
 
 def test_axes_keep_the_order_of_the_file_and_their_plain_names():
     axes = axes_of(**{"target.range": ["1 m"], "instrument.processing.tnr": [1, 5]})
     assert [(axis.name, axis.size) for axis in axes] == [("range", 1), ("tnr", 2)]
-    assert not axes[0].zipped
+    assert not axes[0].is_zipped
 
 
 def test_a_field_on_an_axis_need_not_be_written_twice():
-    spec = Spec.from_mapping(
-        written({"target.range": ...}, axes={"target.range": {"step": ["5 m", "9 m", "1 m"]}})
+    spec = GridSpec.from_mapping(
+        changed_spec({"target.range": ...}, axes={"target.range": {"step": ["5 m", "9 m", "1 m"]}})
     )
     assert spec.parameters()["target.range"] == 5.0
 
@@ -187,7 +187,7 @@ def test_arrays_of_an_axis_are_read_only():
 )
 def test_ten_million_values_take_seconds(values):
     start = time.perf_counter()
-    spec = Spec.from_mapping(written(axes={"target.range": values}))
+    spec = GridSpec.from_mapping(changed_spec(axes={"target.range": values}))
     assert (spec.axes[0].size, len(spec.id)) == (10**7, 32)
     assert time.perf_counter() - start < 30.0  # one by one in Python it would be minutes
     assert len(spec.to_json()) < 5000
@@ -195,41 +195,41 @@ def test_ten_million_values_take_seconds(values):
 
 def test_a_threshold_is_set_in_one_way_on_an_axis_or_off():
     axes = {PFA_SHOT: {"log": [1e-9, 1e-3], "number": 3}}
-    spec = Spec.from_mapping(written({TNR: ..., PFA_SHOT: 1e-6}, axes=axes))
+    spec = GridSpec.from_mapping(changed_spec({TNR: ..., PFA_SHOT: 1e-6}, axes=axes))
     assert spec.parameters()[PFA_SHOT] == 1e-9 and TNR not in spec.parameters()
-    assert Spec.from_mapping(spec.to_yaml_mapping()).id == spec.id
+    assert GridSpec.from_mapping(spec.to_yaml_mapping()).id == spec.id
     found = GridStudy(spec).evaluate(0)
     # all but the few bins that the target takes
     assert found["pfa_shot"].ravel() == pytest.approx([1e-9, 1e-6, 1e-3], rel=5e-3)
-    at = spec.parameters_at({"tnr": 10})
+    at = spec.parameters_with({"tnr": 10})
     assert at[TNR] == 10 and PFA_SHOT not in at
     first = tnr_of(spec.parameters() | {PFA_SHOT: 1e-9})
-    assert reference(spec, {})[0]["tnr"] == pytest.approx(float(first))
+    assert noise_only_reference(spec, {})[0]["tnr"] == pytest.approx(float(first))
     with pytest.raises(SpecError, match=r"has no threshold; write 'tnr: 10', or threshold_to_mean"):
-        Spec.from_mapping(written({TNR: ...}))
+        GridSpec.from_mapping(changed_spec({TNR: ...}))
     with pytest.raises(SpecError, match=r"by tnr and by design_pfa_shot; keep one of them"):
-        Spec.from_mapping(written({PFA_SHOT: 1e-6}, axes={TNR: [5, 10]}))
+        GridSpec.from_mapping(changed_spec({PFA_SHOT: 1e-6}, axes={TNR: [5, 10]}))
 
 
 def test_a_field_and_its_axis_must_agree_and_a_store_keeps_the_axis_alone():
     """Whether typed in a file or given as a mapping, told with every other mistake."""
     axes = {"target.range": ["1 km", "3 km"]}
-    mapping = written(axes=axes)
+    mapping = changed_spec(axes=axes)
     both = {**mapping, "target": {**mapping["target"], "range": "2 km"}}
     with pytest.raises(SpecError, match=r"range: is on the axis range too.*\(you wrote '2 km'\)"):
-        Spec.from_mapping(both)
+        GridSpec.from_mapping(both)
     with pytest.raises(SpecError) as refusal:
-        Spec.from_mapping({**both, "seed": -1})
+        GridSpec.from_mapping({**both, "seed": -1})
     assert {mistake.path for mistake in refusal.value.mistakes} == {"target.range", "seed"}
     agreeing = {**mapping, "target": {**mapping["target"], "range": "3000 m"}}
-    assert Spec.from_mapping(agreeing).to_json() == Spec.from_mapping(mapping).to_json()
-    assert "range" not in Spec.from_mapping(agreeing).to_yaml_mapping()["target"]
+    assert GridSpec.from_mapping(agreeing).to_json() == GridSpec.from_mapping(mapping).to_json()
+    assert "range" not in GridSpec.from_mapping(agreeing).to_yaml_mapping()["target"]
 
 
 def test_no_coordinate_bears_the_name_of_a_variable(tmp_path):
     beamlets = member("footprint.beamlets", [19, 37])
-    assert beamlets.name == "footprint_beamlets"
+    assert beamlets.coordinate == "footprint_beamlets"
     pieces = [{"target.range": f"{r} km", "target.grazing_angle": "45 deg"} for r in (1, 2)]
     for name in ("pd_shot", "range_error", "effects", "n_draws", "range_bias"):
         with pytest.raises(SpecError, match=f"axes.{name}: bears the name of a variable"):
-            Spec.from_mapping(written(axes={name: {"zip": pieces}}))
+            GridSpec.from_mapping(changed_spec(axes={name: {"zip": pieces}}))

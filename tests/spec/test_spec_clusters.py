@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from sweep.spec import SpecError, cluster_of, load_cluster
+from sweep.spec import SpecError, cluster_config_from_mapping, load_cluster_config
 
 DEPLOY = Path(__file__).parents[2] / "deploy"
 
@@ -59,48 +59,48 @@ def changed(**changes):
 )  # fmt: skip
 def test_a_mistake_is_told_with_its_place_and_a_remedy(mapping, told):
     with pytest.raises(SpecError) as caught:
-        cluster_of(mapping)
+        cluster_config_from_mapping(mapping)
     assert told in str(caught.value)
 
 
 def test_certificates_must_be_there(tmp_path):
     security = {name: f"{name}.pem" for name in ("ca", "certificate", "key")}
     with pytest.raises(SpecError) as caught:
-        cluster_of(changed(security=security), base=tmp_path)
+        cluster_config_from_mapping(changed(security=security), base=tmp_path)
     assert [mistake.path for mistake in caught.value.mistakes] == [
         "security.ca", "security.certificate", "security.key",
     ]  # fmt: skip
     assert "sweep certificates" in str(caught.value)
     for name in security.values():
         (tmp_path / name).touch()
-    cluster = cluster_of(changed(security=security), base=tmp_path)
-    assert cluster.certificates() == tuple(str(tmp_path / name) for name in security.values())
+    cluster = cluster_config_from_mapping(changed(security=security), base=tmp_path)
+    assert cluster.certificate_paths() == tuple(str(tmp_path / name) for name in security.values())
     plain = {"kind": "scheduler", "address": "tcp://a:1", "security": security}
     with pytest.raises(SpecError, match="is not encrypted"):
-        cluster_of(plain, base=tmp_path)
+        cluster_config_from_mapping(plain, base=tmp_path)
 
 
 def test_mistakes_come_together_each_with_its_line(tmp_path):
     file = tmp_path / "slurm.yaml"
     file.write_text("kind: slurm\nworkers: 0\nworker: {memory: 4}\nscheduler: {interface: ib0}\n")
     with pytest.raises(SpecError) as caught:
-        load_cluster(file)
+        load_cluster_config(file)
     assert [(m.path, m.line) for m in caught.value.mistakes] == [
         ("job", 1), ("workers", 2), ("worker.memory", 3),
     ]  # fmt: skip
 
 
 def test_values_are_bytes_seconds_and_bounds():
-    cluster = cluster_of(changed(workers={"least": 2, "most": 40}))
+    cluster = cluster_config_from_mapping(changed(workers={"least": 2, "most": 40}))
     assert cluster.worker.memory == 4e9
     assert cluster.job.walltime == 7200
     assert cluster.workers == (2, 40)
-    assert cluster_of(SLURM).workers == (8, 8)
+    assert cluster_config_from_mapping(SLURM).workers == (8, 8)
 
 
 @pytest.mark.parametrize("name", ["local", "scheduler", "ssh", "slurm", "pbs", "kubernetes"])
 def test_the_files_that_come_along_can_be_read(name):
-    assert load_cluster(DEPLOY / f"{name}.yaml").kind == name
+    assert load_cluster_config(DEPLOY / f"{name}.yaml").kind == name
 
 
 def test_each_kind_has_its_file():
@@ -115,10 +115,10 @@ def test_a_file_of_an_unknown_user_is_told_as_missing():
         "security": dict.fromkeys(("ca", "certificate", "key"), "~nobody-here/key.pem"),
     }  # fmt: skip
     with pytest.raises(SpecError, match=r"security.ca: names a file that is not there .*~nobody-h"):
-        cluster_of(given)
+        cluster_config_from_mapping(given)
     given = {
         "kind": "ssh", "workers": 1, "hosts": ["node1"], "worker": {"memory": "1 GB"},
         "scheduler": {"host": "localhost"}, "identity": "~nobody-here/id",
     }  # fmt: skip
-    cluster = cluster_of(given)
-    assert cluster.path(cluster.identity).endswith("~nobody-here/id")
+    cluster = cluster_config_from_mapping(given)
+    assert cluster.resolve_path(cluster.identity).endswith("~nobody-here/id")

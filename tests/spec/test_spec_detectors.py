@@ -2,17 +2,17 @@
 
 import jsonschema
 import pytest
-from written_scenes import written as flight
-from written_specs import written
+from base_scene_spec import changed_scene as flight
+from base_spec import changed_spec
 
-from sweep.spec import SceneSpec, Spec, SpecError, json_schema
+from sweep.spec import GridSpec, SceneSpec, SpecError, json_schema
 
 PROCESSING = "instrument.processing."
 SPECTRA = {"method": "spectra", "number": 10}
 
 
 def spec(changes=None, **sections):
-    return Spec.from_mapping(written(changes, **sections))
+    return GridSpec.from_mapping(changed_spec(changes, **sections))
 
 
 def test_they_may_vary_and_their_coordinates_bear_their_names():
@@ -23,9 +23,9 @@ def test_they_may_vary_and_their_coordinates_bear_their_names():
     }
     study = spec(axes=axes, draws=SPECTRA)
     assert [axis.name for axis in study.axes] == ["detector", "estimator", "training"]
-    assert study.parameters_at({"detector": "ca_cfar"})[PROCESSING + "detector.kind"] == "ca_cfar"
+    assert study.parameters_with({"detector": "ca_cfar"})[PROCESSING + "detector.kind"] == "ca_cfar"
     jsonschema.validate(study.to_yaml_mapping(), json_schema())
-    assert Spec.from_stored(study.to_json()).id == study.id
+    assert GridSpec.from_stored(study.to_json()).id == study.id
 
 
 @pytest.mark.parametrize(

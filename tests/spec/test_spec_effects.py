@@ -6,21 +6,28 @@ import jsonschema
 import numpy as np
 import pytest
 import yaml
+from base_scene_spec import changed_scene as flight
+from base_spec import changed_spec
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from written_scenes import written as flight
-from written_specs import written
 
-import sweep.spec.parts
+import sweep.spec.fields
 from sweep.model.effects.catalogue import EFFECTS, NAMES, PARAMETERS
 from sweep.model.effects.effect import Parameter
-from sweep.spec import SceneSpec, Spec, SpecError, difference, from_stored, json_schema
+from sweep.spec import (
+    GridSpec,
+    SceneSpec,
+    SpecError,
+    describe_differences,
+    from_stored,
+    json_schema,
+)
 from sweep.spec.axes import read_axes
-from sweep.spec.grid_rules import Grid
-from sweep.spec.parts import Part, rule_of, with_modes, with_parameters
-from sweep.spec.reading import read_document
-from sweep.spec.rules import Numeric
+from sweep.spec.fields import SpecSection, add_effect_modes, add_effect_parameters, rule_of_field
+from sweep.spec.grid_checks import GridValues
+from sweep.spec.rules import NumericRule
 from sweep.spec.sections import Effects, Laser, parameter_rules
+from sweep.spec.yaml_document import read_document
 
 BROUGHT = pytest.mark.parametrize("parameter", PARAMETERS, ids=lambda p: p.path)
 RANDOM = {"target.roughness": "speckle", "target.pointing_jitter": "pointing_jitter",
@@ -37,7 +44,7 @@ NEEDED = {"instrument.processing.full_scale": "1 V", "atmosphere.extinction": "0
 
 
 def spec(changes=None, **sections):
-    return Spec.from_mapping(written(changes, **sections))
+    return GridSpec.from_mapping(changed_spec(changes, **sections))
 
 
 def mistakes(kind, mapping):
@@ -66,14 +73,14 @@ def test_a_parameter_of_an_effect_is_a_field_by_itself(parameter, validator):
     default = spec(plain).parameters()[parameter.path]
     assert default == parameter.default and type(default) is type(parameter.default)
     for value in values(parameter):
-        mapping = written(NEEDED | {parameter.path: value})
+        mapping = changed_spec(NEEDED | {parameter.path: value})
         validator.validate(mapping)
-        read = Spec.from_mapping(mapping)
+        read = GridSpec.from_mapping(mapping)
         assert parameter.path in read.identity()["parameters"]
-        assert Spec.from_stored(read.to_json()).parameters() == read.parameters()
+        assert GridSpec.from_stored(read.to_json()).parameters() == read.parameters()
     rule = parameter_rules()[parameter.path]
-    assert rule.read(rule.written(parameter.default)) == parameter.default
-    assert spec(plain | {parameter.path: rule.written(parameter.default)}).id == spec(plain).id
+    assert rule.read(rule.format(parameter.default)) == parameter.default
+    assert spec(plain | {parameter.path: rule.format(parameter.default)}).id == spec(plain).id
 
 
 @BROUGHT
@@ -81,13 +88,13 @@ def test_a_parameter_of_an_effect_may_be_an_axis(parameter, validator):
     if parameter.table:  # one for a whole study (test_spec_reading)
         return
     written_values = values(parameter)
-    mapping = written(NEEDED, axes={parameter.path: written_values})
+    mapping = changed_spec(NEEDED, axes={parameter.path: written_values})
     validator.validate(mapping)
-    (axis,) = Spec.from_mapping(mapping).axes
+    (axis,) = GridSpec.from_mapping(mapping).axes
     rule = parameter_rules()[parameter.path]
-    assert list(axis.members[0].values) == [rule.read(value) for value in written_values]
-    coordinate = Spec.from_mapping(mapping).coordinate_value(axis.name, written_values[-1])
-    assert coordinate == axis.members[0].display[-1]
+    assert list(axis.parameters[0].values) == [rule.read(value) for value in written_values]
+    coordinate = GridSpec.from_mapping(mapping).read_coordinate(axis.name, written_values[-1])
+    assert coordinate == axis.parameters[0].display_values[-1]
 
 
 @BROUGHT
@@ -105,29 +112,29 @@ def test_any_value_of_a_numeric_parameter_is_written_so_that_it_reads_back(data)
     parameter = data.draw(st.sampled_from([p for p in PARAMETERS if not (p.options or p.table)]))
     value = data.draw(st.floats(1e-300, 1e300, allow_nan=False))
     rule = parameter_rules()[parameter.path]
-    assert isinstance(rule, Numeric)
-    if rule.si_unit != "dB" and rule.first_outside(np.array([value])) is None:
-        assert rule.read(rule.written(value)) == value
+    assert isinstance(rule, NumericRule)
+    if rule.si_unit != "dB" and rule.first_out_of_bounds(np.array([value])) is None:
+        assert rule.read(rule.format(value)) == value
 
 
 def test_a_new_parameter_or_effect_touches_no_section(monkeypatch):
     """Both decorators read the catalogue: what is added there is in the sections."""
     new = Parameter(path="instrument.laser.colours", about="Colours", default=2.0,
                     example="3", limits=("1", None))  # fmt: skip
-    monkeypatch.setattr(sweep.spec.parts, "PARAMETERS", (new,))
-    monkeypatch.setattr(sweep.spec.parts, "EFFECTS", EFFECTS[:1])
+    monkeypatch.setattr(sweep.spec.fields, "PARAMETERS", (new,))
+    monkeypatch.setattr(sweep.spec.fields, "EFFECTS", EFFECTS[:1])
 
-    class Bare(Part):
+    class Bare(SpecSection):
         """A section."""
 
-    Lamp = with_parameters("instrument.laser")(Bare)
+    Lamp = add_effect_parameters("instrument.laser")(Bare)
     assert Lamp.model_validate({}).colours == 2 and Lamp.model_validate({"colours": 3}).colours == 3
     assert Lamp.__doc__ == "A section." and Lamp.__name__ == "Bare"
     assert Lamp.__module__ == __name__
-    assert set(with_modes(Bare).model_fields) == {EFFECTS[0].name}
-    assert not with_parameters("instrument")(Bare).model_fields
+    assert set(add_effect_modes(Bare).model_fields) == {EFFECTS[0].name}
+    assert not add_effect_parameters("instrument")(Bare).model_fields
     with pytest.raises(TypeError, match="has colours already"):
-        with_parameters("instrument.laser")(Lamp)
+        add_effect_parameters("instrument.laser")(Lamp)
 
 
 def test_a_section_keeps_its_name_and_words():
@@ -141,10 +148,10 @@ def test_a_section_keeps_its_name_and_words():
 
 def test_every_effect_is_simulated_where_the_scene_calls_for_it_by_default():
     for study in (spec(), SceneSpec.from_mapping(flight())):
-        assert study.modes() == dict.fromkeys(NAMES, "auto")
-        assert study.identity()["effects"] == study.modes()
+        assert study.effect_modes() == dict.fromkeys(NAMES, "auto")
+        assert study.identity()["effects"] == study.effect_modes()
     for effect in EFFECTS:
-        about = rule_of(Effects.model_fields[effect.name]).about
+        about = rule_of_field(Effects.model_fields[effect.name]).description
         assert about[0].isupper() and about[1:] == effect.about[1:]
 
 
@@ -155,40 +162,42 @@ def test_every_effect_is_simulated_where_the_scene_calls_for_it_by_default():
 )  # fmt: skip
 def test_a_mode_is_read_from_yaml_with_or_without_quotes(text, mode, tmp_path, validator):
     path = tmp_path / "study.yaml"
-    path.write_text(yaml.safe_dump(written()) + f"effects: {{leakage: {text}}}\n")
+    path.write_text(yaml.safe_dump(changed_spec()) + f"effects: {{leakage: {text}}}\n")
     document = read_document(path)
-    validator.validate(document.value)
-    study = Spec.from_document(document, tmp_path)
-    assert study.modes()["leakage"] == mode
-    assert Spec.from_stored(study.to_json()).modes() == study.modes()
+    validator.validate(document.content)
+    study = GridSpec.from_document(document, tmp_path)
+    assert study.effect_modes()["leakage"] == mode
+    assert GridSpec.from_stored(study.to_json()).effect_modes() == study.effect_modes()
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("kind", [Spec, SceneSpec])
+@pytest.mark.parametrize("kind", [GridSpec, SceneSpec])
 def test_a_mode_is_part_of_the_identity(name, kind):
-    base = {Spec: written, SceneSpec: flight}[kind]
+    base = {GridSpec: changed_spec, SceneSpec: flight}[kind]
     plain, off = (kind.from_mapping(m) for m in (base(), base({f"effects.{name}": "off"})))
     assert plain.id != off.id
-    assert difference(plain, off) == [f"effects.{name}: auto -> off"]
+    assert describe_differences(plain, off) == [f"effects.{name}: auto -> off"]
     assert kind.from_mapping(base({f"effects.{name}": False})).id == off.id
 
 
 @pytest.mark.parametrize("effect", [e for e in EFFECTS if e.within], ids=lambda e: e.name)
 def test_an_effect_is_on_only_within_one_that_is_not_off(effect):
     on, off = f"effects.{effect.name}", f"effects.{effect.within}"
-    (mistake,) = mistakes(Spec, written({on: True, off: False}))
+    (mistake,) = mistakes(GridSpec, changed_spec({on: True, off: False}))
     assert mistake.startswith(f"{on}: acts within {effect.within}, which is off")
     assert f"turn {effect.within} on" in mistake
     for changes in ({on: "auto", off: "off"}, {on: "on"}, {on: "off", off: "on"}):
-        assert not mistakes(Spec, written(changes))
+        assert not mistakes(GridSpec, changed_spec(changes))
 
 
 def test_a_mode_that_cannot_be_read_is_reported_alone():
     (mistake,) = mistakes(
-        Spec, written({"effects.footprint": "of", "effects.doppler_spread": "on"})
+        GridSpec, changed_spec({"effects.footprint": "of", "effects.doppler_spread": "on"})
     )
     assert mistake.startswith("effects.footprint: ")
-    (mistake,) = mistakes(Spec, written({"effects.speckle": "of", "target.roughness": "1 um"}))
+    (mistake,) = mistakes(
+        GridSpec, changed_spec({"effects.speckle": "of", "target.roughness": "1 um"})
+    )
     assert mistake.startswith("effects.speckle: ")
 
 
@@ -209,22 +218,22 @@ def test_the_random_effects_are_those_looked_at_here():
 @pytest.mark.parametrize("path", RANDOM)
 def test_a_random_effect_needs_draws_or_is_off(path):
     there, name = {path: THERE[path]}, RANDOM[path]
-    (mistake,) = mistakes(Spec, written(there))
+    (mistake,) = mistakes(GridSpec, changed_spec(there))
     assert mistake.startswith(f"{path}: is simulated by draws")
     assert "set draws.limit to draw until accuracy.tolerance is met, draws.number" in mistake
     assert mistake.endswith(f"or effects.{name}: off")
-    default = parameter_rules()[path].written(parameter_rules()[path].read(THERE[path]))
-    (mistake,) = mistakes(Spec, written(axes={path: [default]}))
+    default = parameter_rules()[path].format(parameter_rules()[path].read(THERE[path]))
+    (mistake,) = mistakes(GridSpec, changed_spec(axes={path: [default]}))
     assert mistake.startswith(f"axes.{path}: is simulated by draws")
-    assert not mistakes(Spec, written(there | {"draws.number": 1}))
-    assert not mistakes(Spec, written(there | {"draws.limit": 1}))
-    assert not mistakes(Spec, written(there | {f"effects.{name}": "off"}))
+    assert not mistakes(GridSpec, changed_spec(there | {"draws.number": 1}))
+    assert not mistakes(GridSpec, changed_spec(there | {"draws.limit": 1}))
+    assert not mistakes(GridSpec, changed_spec(there | {f"effects.{name}": "off"}))
 
 
 def test_what_only_says_how_a_random_effect_acts_asks_for_no_draws():
     how = {"atmosphere.structure_constant": "1e-15 m^(-2/3)",
            "atmosphere.scintillation_law": "log_normal"}  # fmt: skip
-    assert not mistakes(Spec, written(how))
+    assert not mistakes(GridSpec, changed_spec(how))
 
 
 @pytest.mark.parametrize("name", RANDOM.values())
@@ -255,16 +264,16 @@ def test_speckle_is_refused_for_direct_detection(on_axis):
         changes |= receiver
     with pytest.raises(SpecError, match="makes speckle, of which direct detection averages"):
         spec(changes)
-    assert spec(changes | {"effects.speckle": "off"}).modes()["speckle"] == "off"
+    assert spec(changes | {"effects.speckle": "off"}).effect_modes()["speckle"] == "off"
 
 
 BITS, FULL_SCALE = "instrument.processing.bits", "instrument.processing.full_scale"
 PROFILE, EXTINCTION = "atmosphere.profile", "atmosphere.extinction"
 
 
-@pytest.mark.parametrize("kind", [Spec, SceneSpec])
+@pytest.mark.parametrize("kind", [GridSpec, SceneSpec])
 def test_a_parameter_needs_the_one_without_which_it_means_nothing(kind):
-    base = {Spec: written, SceneSpec: flight}[kind]
+    base = {GridSpec: changed_spec, SceneSpec: flight}[kind]
     (mistake,) = mistakes(kind, base({BITS: 12}))
     assert mistake.startswith(f"{BITS}: needs {FULL_SCALE}, which is 0; set {FULL_SCALE}")
     assert not mistakes(kind, base({BITS: 12, FULL_SCALE: "1 V"}))
@@ -277,21 +286,21 @@ def test_a_parameter_needs_the_one_without_which_it_means_nothing(kind):
 
 def test_a_need_is_held_against_the_points_of_the_grid_and_no_others():
     scales = ["0 V", "1 V"]
-    (mistake,) = mistakes(Spec, written({BITS: 12}, axes={FULL_SCALE: scales}))
+    (mistake,) = mistakes(GridSpec, changed_spec({BITS: 12}, axes={FULL_SCALE: scales}))
     assert mistake.startswith(f"{BITS}: ")
-    (mistake,) = mistakes(Spec, written(axes={BITS: [0, 12], FULL_SCALE: scales}))
+    (mistake,) = mistakes(GridSpec, changed_spec(axes={BITS: [0, 12], FULL_SCALE: scales}))
     assert mistake.startswith(f"axes.{BITS}: ")
     together = {"zip": {BITS: [0, 12], FULL_SCALE: scales}}
-    assert not mistakes(Spec, written(axes={"adc": together}))
+    assert not mistakes(GridSpec, changed_spec(axes={"adc": together}))
     crossed = {"zip": {BITS: [12, 0], FULL_SCALE: scales}}
-    (mistake,) = mistakes(Spec, written(axes={"adc": crossed}))
+    (mistake,) = mistakes(GridSpec, changed_spec(axes={"adc": crossed}))
     assert mistake.startswith("axes.adc: ")
 
 
 def test_a_point_asked_for_later_is_held_to_the_same_needs():
     with pytest.raises(SpecError, match=f"needs {FULL_SCALE}"):
-        spec().parameters_at({"bits": 12})
-    at = spec().parameters_at({"bits": 12, "full_scale": "1 V", "roughness": "1 um"})
+        spec().parameters_with({"bits": 12})
+    at = spec().parameters_with({"bits": 12, "full_scale": "1 V", "roughness": "1 um"})
     assert at["target.roughness"] == 1e-6
 
 
@@ -308,9 +317,9 @@ def test_a_grid_has_a_point_just_when_one_of_its_points_meets_all_conditions(a, 
     conditions = {one: lambda v: v > x, two: lambda v: v < y, three: lambda v: v == 1}
     points = zip(a, b, strict=True) if zipped else [(i, j) for i in a for j in b]
     expected = any(i > x and j < y for i, j in points)
-    assert Grid({three: 1.0}, axes).has_point(conditions) == expected
-    assert not Grid({three: 2.0}, axes).has_point(conditions)
-    assert not Grid({}, axes).has_point(conditions)
+    assert GridValues({three: 1.0}, axes).has_point(conditions) == expected
+    assert not GridValues({three: 2.0}, axes).has_point(conditions)
+    assert not GridValues({}, axes).has_point(conditions)
 
 
 # Decibels beside a plain unit
@@ -320,12 +329,12 @@ def test_an_axis_in_decibels_per_hertz_is_shown_in_them():
     path = "instrument.laser.relative_intensity_noise"
     steps = {"step": ["-160 dB/Hz", "-140 dB/Hz", "10 dB/Hz"]}
     study = spec(axes={path: steps})
-    member = study.axes[0].members[0]
+    member = study.axes[0].parameters[0]
     assert member.values.tolist() == [1e-16, 1e-15, 1e-14] and member.units == "dB/Hz"
-    assert study.coordinate_value("relative_intensity_noise", "-150 dB/Hz") == -150
-    assert study.coordinate_value("relative_intensity_noise", "1e-15 1/Hz") == -150
-    mixed = spec(axes={path: ["-160 dB/Hz", "0 1/Hz"]}).axes[0].members[0]
-    assert mixed.display.tolist() == [1e-16, 0] and mixed.units == "1/Hz"
+    assert study.read_coordinate("relative_intensity_noise", "-150 dB/Hz") == -150
+    assert study.read_coordinate("relative_intensity_noise", "1e-15 1/Hz") == -150
+    mixed = spec(axes={path: ["-160 dB/Hz", "0 1/Hz"]}).axes[0].parameters[0]
+    assert mixed.display_values.tolist() == [1e-16, 0] and mixed.units == "1/Hz"
 
 
 @pytest.mark.parametrize(
@@ -338,4 +347,4 @@ def test_an_axis_in_decibels_per_hertz_is_shown_in_them():
 )
 def test_what_does_not_go_with_leaked_light_is_refused(changes, words):
     with pytest.raises(SpecError, match=words):
-        Spec.from_mapping(written({"instrument.telescope.leak_path": "2 m", **changes}))
+        GridSpec.from_mapping(changed_spec({"instrument.telescope.leak_path": "2 m", **changes}))

@@ -4,17 +4,17 @@ import subprocess
 import sys
 
 import pytest
+from base_spec import axis_member_content, changed_spec
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from written_specs import content, written
 
-import sweep.spec.study
+import sweep.spec.specs
 from sweep.model.threshold import PFA_BIN, PFA_SEGMENT, PFA_SHOT, TNR, WAYS
 from sweep.model.waveform import ENDS, PEAKS
-from sweep.spec import Spec, difference
-from sweep.spec.grid_rules import is_method
-from sweep.spec.rules import Choice
-from sweep.spec.sections import SECTIONS, default_of, parameter_rules
+from sweep.spec import GridSpec, describe_differences
+from sweep.spec.grid_checks import is_detector_or_estimator
+from sweep.spec.rules import ChoiceRule
+from sweep.spec.sections import MODEL_BY_SECTION, default_value, parameter_rules
 
 AXES = {"target.range": {"step": ["1 m", "100 m", "1 m"]}, "instrument.laser.power": ["1 W", "3 W"]}
 
@@ -26,7 +26,7 @@ CUT = {"zip": [{"target.grazing_angle": ["1 deg", "2 deg"], "footprint.beamlets"
 
 
 def spec(changes=None, **sections):
-    return Spec.from_mapping(written(changes, **sections))
+    return GridSpec.from_mapping(changed_spec(changes, **sections))
 
 
 @pytest.mark.parametrize(
@@ -73,8 +73,8 @@ def shuffled(mapping, random):
 @settings(deadline=None)
 @given(st.randoms(use_true_random=False))
 def test_the_order_of_keys_leaves_the_id_alone(random):
-    mapping = written(axes=AXES, seed=3)
-    assert Spec.from_mapping(shuffled(mapping, random)).id == Spec.from_mapping(mapping).id
+    mapping = changed_spec(axes=AXES, seed=3)
+    assert GridSpec.from_mapping(shuffled(mapping, random)).id == GridSpec.from_mapping(mapping).id
 
 
 def test_the_order_of_axes_is_part_of_the_id_as_it_lays_out_the_arrays():
@@ -156,9 +156,9 @@ def other_value(path):
         "instrument.processing.estimator.kind": "candan",
     }
     rule = parameter_rules()[path]
-    if type(rule) is Choice and path not in special:
+    if type(rule) is ChoiceRule and path not in special:
         return next(
-            word for word in rule.options if word not in (default_of(path), EVERY.get(path))
+            word for word in rule.options if word not in (default_value(path), EVERY.get(path))
         )
     return special.get(path) or f"77 {rule.si_unit}".strip()
 
@@ -166,7 +166,9 @@ def other_value(path):
 @pytest.mark.parametrize("path", sorted(parameter_rules()))
 def test_every_parameter_is_part_of_the_id(path):
     # What looks at whole spectra is one of studies that draw some.
-    spectra = {"draws.method": "spectra", "draws.number": 5} if is_method(path) else {}
+    spectra = (
+        {"draws.method": "spectra", "draws.number": 5} if is_detector_or_estimator(path) else {}
+    )
     every = EVERY | spectra
     if path == "instrument.laser.beam_waist":  # one of the two that say how wide a beam is
         every |= {"instrument.laser.beam_divergence": "none", path: "4 mm"}
@@ -185,7 +187,7 @@ def test_every_parameter_is_part_of_the_id(path):
     instead = {TNR: ...} if path in WAYS and path != TNR else {}
     base, changed = spec(every), spec(every | instead | {path: other_value(path)})
     assert changed.id != base.id
-    lines = difference(base, changed)
+    lines = describe_differences(base, changed)
     assert len(lines) == 1 + len(instead)
     assert any(line.startswith(f"{path}: ") for line in lines)
 
@@ -200,18 +202,18 @@ def test_draws_seed_and_blocks_are_part_of_the_id(changes):
 
 def test_the_models_version_is_part_of_the_id(monkeypatch):
     before, id_before = spec().identity(), spec().id
-    monkeypatch.setattr(sweep.spec.study, "VERSION", "another")
+    monkeypatch.setattr(sweep.spec.specs, "VERSION", "another")
     assert spec().id != id_before
-    (line,) = difference(before, spec())
+    (line,) = describe_differences(before, spec())
     assert line.startswith("model: ") and line.endswith("-> another")
 
 
 def test_the_id_is_the_same_in_another_process():
     code = (
-        "import json, sys; from sweep.spec import Spec;"
-        "print(Spec.from_mapping(json.load(sys.stdin)).id)"
+        "import json, sys; from sweep.spec import GridSpec;"
+        "print(GridSpec.from_mapping(json.load(sys.stdin)).id)"
     )
-    mapping = written(axes=AXES)
+    mapping = changed_spec(axes=AXES)
     run = subprocess.run(
         [sys.executable, "-c", code],
         input=json.dumps(mapping),
@@ -219,7 +221,7 @@ def test_the_id_is_the_same_in_another_process():
         text=True,
         check=True,
     )
-    assert run.stdout.strip() == Spec.from_mapping(mapping).id
+    assert run.stdout.strip() == GridSpec.from_mapping(mapping).id
 
 
 def test_difference_tells_each_change_with_its_unit():
@@ -231,7 +233,7 @@ def test_difference_tells_each_change_with_its_unit():
             "target.range": {"step": ["1 m", "99 m", "1 m"]},
         },
     )
-    lines = difference(a, json.loads(json.dumps(b.identity())))
+    lines = describe_differences(a, json.loads(json.dumps(b.identity())))
     assert "instrument.telescope.aperture: 0.025 m -> 0.05 m" in lines
     assert "target.reflectance: 0.1 -> 0.2" in lines
     assert "seed: 0 -> 4" in lines
@@ -240,21 +242,23 @@ def test_difference_tells_each_change_with_its_unit():
     (ranges,) = [line for line in lines if line.startswith("axes.range")]
     assert "100 values from 1 to 100 m" in ranges and "99 values from 1 to 99 m" in ranges
     assert len(lines) == 6
-    assert difference(a, a.identity()) == []
+    assert describe_differences(a, a.identity()) == []
 
 
 def test_differences_tell_angles_as_users_write_them():
     angle, divergence = "target.grazing_angle", "instrument.laser.beam_divergence"
     a = spec({angle: "7.3 deg", divergence: "50 urad"})
-    assert difference(a, spec({angle: "11.25 deg", divergence: "0.3 mrad"})) == [
+    assert describe_differences(a, spec({angle: "11.25 deg", divergence: "0.3 mrad"})) == [
         f"{divergence}: 50 urad -> 300 urad", f"{angle}: 7.3 deg -> 11.25 deg",
     ]  # fmt: skip
     turned = spec({divergence: "50 urad"}, axes={angle: ["22.5 deg", "45 deg"]})
-    assert f"axes.grazing_angle.{angle}: (none) -> [22.5, 45] deg" in difference(a, turned)
+    assert f"axes.grazing_angle.{angle}: (none) -> [22.5, 45] deg" in describe_differences(
+        a, turned
+    )
 
 
 def test_an_axis_added_is_told():
-    lines = difference(spec(), spec(axes={"target.range": ["1 m"]}))
+    lines = describe_differences(spec(), spec(axes={"target.range": ["1 m"]}))
     assert lines == ["target.range: 2000 m -> (none)", "axes: (none) -> range",
                      "axes.range.target.range: (none) -> [1] m"]  # fmt: skip
 
@@ -268,12 +272,14 @@ def test_a_stored_spec_comes_back_the_same():
         question="Ψ?", seed=5, draws={"number": "1e3"},
     )  # fmt: skip
     text = original.to_json()
-    again = Spec.from_stored(text)
+    again = GridSpec.from_stored(text)
     assert again == original and hash(again) == hash(original)
     assert again.id == original.id
     for one, other in zip(again.axes, original.axes, strict=True):
         assert one.name == other.name
-        assert list(map(content, one.members)) == list(map(content, other.members))
+        assert list(map(axis_member_content, one.parameters)) == list(
+            map(axis_member_content, other.parameters)
+        )
     assert again.figures == original.figures
     assert again.parameters() == original.parameters()
     assert again.to_json() == text
@@ -295,7 +301,7 @@ def test_parameters_are_all_there_in_si():
         {"target.grazing_angle": "15 deg", "instrument.receiver.noise_figure": "10 dB"}
     ).parameters()
     assert set(parameters) == set(parameter_rules()) - OTHER_WAYS
-    assert {path.split(".")[0] for path in parameters} == set(SECTIONS)
+    assert {path.split(".")[0] for path in parameters} == set(MODEL_BY_SECTION)
     assert parameters["instrument.receiver.noise_equivalent_power"] == 5e-12
     assert parameters["instrument.receiver.noise_figure"] == 10.0
     assert parameters["instrument.receiver.local_oscillator_power"] == 1e-3
@@ -306,7 +312,7 @@ def test_parameters_are_all_there_in_si():
 
 def test_parameters_at_another_point_are_read_like_a_spec():
     base = spec()
-    at = base.parameters_at({"range": "3 km", "instrument.laser.power": "5 W", "window": "hann"})
+    at = base.parameters_with({"range": "3 km", "instrument.laser.power": "5 W", "window": "hann"})
     assert (at["target.range"], at["instrument.laser.power"]) == (3000.0, 5.0)
     assert at["instrument.processing.window"] == "hann"
     assert base.parameters()["target.range"] == 2000.0
@@ -316,10 +322,10 @@ def test_a_written_coordinate_is_found_in_the_unit_of_its_axis():
     cut = {"zip": {"target.grazing_angle": ["15 deg", "85 deg"], "target.range": "3.5 km"}}
     study = spec(axes={"cut": cut, "footprint.phases": ["coherent"]})
     assert (
-        study.coordinate_value("grazing_angle", "15 deg")
-        == study.member("grazing_angle").display[0]
+        study.read_coordinate("grazing_angle", "15 deg")
+        == study.axis_parameter("grazing_angle").display_values[0]
     )
-    assert study.coordinate_value("range", "3500 m") == 3.5
-    assert study.coordinate_value("phases", "coherent") == "coherent"
+    assert study.read_coordinate("range", "3500 m") == 3.5
+    assert study.read_coordinate("phases", "coherent") == "coherent"
     with pytest.raises(KeyError):
-        study.coordinate_value("power", "1 W")
+        study.read_coordinate("power", "1 W")

@@ -2,11 +2,11 @@ import itertools
 
 import numpy as np
 import pytest
+from base_spec import changed_spec
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from written_specs import written
 
-from sweep.spec import Spec, SpecError
+from sweep.spec import GridSpec, SpecError
 
 DURATION = "instrument.chirp.duration"
 DELAY = "instrument.processing.acquisition_delay"
@@ -21,7 +21,7 @@ def values_of_zip(written):
 
 def refused(changes=None, **sections):
     try:
-        Spec.from_mapping(written(changes, **sections))
+        GridSpec.from_mapping(changed_spec(changes, **sections))
     except SpecError as error:
         (mistake,) = error.mistakes
         axes = sections.get("axes", {})
@@ -73,18 +73,18 @@ def test_a_record_of_fewer_than_two_samples_is_refused():
 def test_a_responsivity_of_more_than_one_electron_a_photon_is_refused():
     """q lambda / (h c) is 0.8065544 A/W a micrometre: 1.2501593 A/W at 1550 nm."""
     path, wavelength = "instrument.receiver.responsivity", "instrument.laser.wavelength"
-    Spec.from_mapping(written({path: "1.25015 A/W"}))
-    Spec.from_mapping(written(axes={wavelength: ["1.5 um", "2 um"]}))
+    GridSpec.from_mapping(changed_spec({path: "1.25015 A/W"}))
+    GridSpec.from_mapping(changed_spec(axes={wavelength: ["1.5 um", "2 um"]}))
     for changes, axes, place, over in (
         ({path: "1.25017 A/W"}, {}, path, "1.07e-05 A/W"),
         ({}, {wavelength: ["1 um", "2 um"]}, path, "0.293 A/W"),
         ({}, {path: ["1 A/W", "2 A/W"]}, f"axes.{path}", "0.75 A/W"),
     ):
         with pytest.raises(SpecError) as caught:
-            Spec.from_mapping(written(changes, axes=axes))
+            GridSpec.from_mapping(changed_spec(changes, axes=axes))
         (mistake,) = caught.value.mistakes
         assert mistake.path == place
-        assert over in mistake.rule and "apd_gain" in mistake.suggestion
+        assert over in mistake.problem and "apd_gain" in mistake.suggestion
 
 
 def test_extremes_of_plain_axes_are_combined():
@@ -138,11 +138,11 @@ def test_the_grid_is_refused_just_when_a_point_of_it_is(
 
 
 def test_a_point_asked_for_later_is_held_to_the_same_rules():
-    spec = Spec.from_mapping(written())
+    spec = GridSpec.from_mapping(changed_spec())
     with pytest.raises(SpecError, match="echo's delay"):
-        spec.parameters_at({"range": "80 km"})
+        spec.parameters_with({"range": "80 km"})
     with pytest.raises(SpecError) as caught:
-        spec.parameters_at({"rnge": "2 km", "power": 3})
+        spec.parameters_with({"rnge": "2 km", "power": 3})
     assert "did you mean 'target.range'?" in str(caught.value)
     assert "needs a unit (you wrote 3)" in str(caught.value)
 
@@ -155,4 +155,4 @@ def test_a_grid_beyond_counting_is_refused():
         "instrument.laser.power": {"linear": ["1 W", "9 W"], "number": 10**4},
     }
     with pytest.raises(SpecError, match="a study has at most 1e"):
-        Spec.from_mapping(written(axes=axes))
+        GridSpec.from_mapping(changed_spec(axes=axes))

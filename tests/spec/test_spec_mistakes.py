@@ -1,14 +1,14 @@
 import pytest
-from written_specs import written
+from base_spec import changed_spec
 
-from sweep.spec import Spec, SpecError, load
-from sweep.spec.rules import Numeric
+from sweep.spec import GridSpec, SpecError, load
+from sweep.spec.rules import NumericRule
 from sweep.spec.sections import parameter_rules
 
 
 def mistakes_of(mapping):
     with pytest.raises(SpecError) as caught:
-        Spec.from_mapping(mapping)
+        GridSpec.from_mapping(mapping)
     return caught.value.mistakes
 
 
@@ -105,12 +105,12 @@ FIELDS = [
 
 @pytest.mark.parametrize(("path", "value", "words"), FIELDS)
 def test_a_wrong_field_is_reported_once_with_path_rule_and_remedy(path, value, words):
-    (mistake,) = mistakes_of(written({path: value}))
+    (mistake,) = mistakes_of(changed_spec({path: value}))
     assert mistake.path == path
     assert words in str(mistake)
     for foreign in ("Input should", "pydantic", "type=", "https://", "Extra inputs", "Field "):
         assert foreign not in str(mistake)
-    if isinstance(parameter_rules().get(path), Numeric):
+    if isinstance(parameter_rules().get(path), NumericRule):
         assert mistake.suggestion
 
 
@@ -123,7 +123,7 @@ def test_a_wrong_field_is_reported_once_with_path_rule_and_remedy(path, value, w
     ],
 )
 def test_an_instrument_that_the_library_lacks_is_told_with_those_that_it_has(name, words):
-    (mistake,) = mistakes_of(written({"instrument": {"like": name}}))
+    (mistake,) = mistakes_of(changed_spec({"instrument": {"like": name}}))
     assert mistake.path == "instrument.like" and words in str(mistake)
 
 
@@ -167,7 +167,7 @@ def test_what_a_field_sets_off_in_the_library_s_instrument_is_told_at_the_field(
 
 
 def test_in_plain_data_no_file_of_the_library_is_told():
-    mapping = written({"instrument": {"like": "rogers_2021", "processing": {"tnr": -1}}})
+    mapping = changed_spec({"instrument": {"like": "rogers_2021", "processing": {"tnr": -1}}})
     mapping["target"]["range"] = "900 km"
     mistakes = mistakes_of(mapping)
     assert {(mistake.file, mistake.line) for mistake in mistakes} == {("", None)}
@@ -178,7 +178,7 @@ def test_in_plain_data_no_file_of_the_library_is_told():
 def test_a_filter_before_the_adc_shapes_noise_that_is_to_be_white():
     receiver = "instrument.receiver."
     changes = {f"{receiver}antialias_bandwidth": "200 MHz", f"{receiver}noise_shape": "white"}
-    (mistake,) = mistakes_of(written(changes))
+    (mistake,) = mistakes_of(changed_spec(changes))
     assert mistake.path == f"{receiver}antialias_bandwidth"
     assert "shapes the noise" in str(mistake) and "noise_shape: receiver" in str(mistake)
 
@@ -263,16 +263,18 @@ AXES = [
 
 @pytest.mark.parametrize(("axes", "path", "words"), AXES)
 def test_a_wrong_axis_is_reported_once_with_path_rule_and_remedy(axes, path, words):
-    (mistake,) = mistakes_of(written(axes=axes))
+    (mistake,) = mistakes_of(changed_spec(axes=axes))
     assert mistake.path == f"axes.{path}"
     assert words in str(mistake)
 
 
 def test_a_generator_that_leaves_the_bounds_says_where():
     step = {"step": ["1 deg", "90 deg", "1 deg"]}
-    assert Spec.from_mapping(written(axes={"target.grazing_angle": step})).axes[0].size == 90
+    assert (
+        GridSpec.from_mapping(changed_spec(axes={"target.grazing_angle": step})).axes[0].size == 90
+    )
     (mistake,) = mistakes_of(
-        written(axes={"instrument.receiver.apd_gain": {"linear": [1, 2e9], "number": 3}})
+        changed_spec(axes={"instrument.receiver.apd_gain": {"linear": [1, 2e9], "number": 3}})
     )
     assert mistake.path == "axes.instrument.receiver.apd_gain.linear[1]"
 
@@ -305,7 +307,7 @@ FIGURES = [
 
 @pytest.mark.parametrize(("figure", "path", "words"), FIGURES)
 def test_a_wrong_figure_is_reported_with_path_rule_and_remedy(figure, path, words):
-    mapping = written(axes={"target.range": ["1 m", "2 m"]}, figures=[figure])
+    mapping = changed_spec(axes={"target.range": ["1 m", "2 m"]}, figures=[figure])
     (mistake,) = mistakes_of(mapping)
     assert mistake.path == path
     assert words in str(mistake)
@@ -313,28 +315,28 @@ def test_a_wrong_figure_is_reported_with_path_rule_and_remedy(figure, path, word
 
 def test_two_figures_of_one_file_are_refused():
     figure = {"kind": "slices", "variable": "pd_shot", "x": "range"}
-    (mistake,) = mistakes_of(written(axes={"target.range": ["1 m"]}, figures=[figure, figure]))
+    (mistake,) = mistakes_of(changed_spec(axes={"target.range": ["1 m"]}, figures=[figure, figure]))
     assert mistake.path == "figures[1]"
     assert "give it a name" in str(mistake)
 
 
 def test_a_fixed_number_of_draws_and_a_limit_exclude_each_other():
-    (mistake,) = mistakes_of(written({"draws.number": 5000, "draws.limit": "1e6"}))
+    (mistake,) = mistakes_of(changed_spec({"draws.number": 5000, "draws.limit": "1e6"}))
     assert str(mistake) == (
         "draws.limit: stands beside draws.number, 5000: only one of them can say how much to draw "
         "(you wrote 1000000); keep limit to draw until accuracy.tolerance is met, or number to "
         "draw so many times"
     )
     for draws in ({"number": 0, "limit": 5}, {"number": 5, "limit": 0}, {"limit": "1e12"}):
-        assert Spec.from_mapping(written(draws=draws)).draws.any
+        assert GridSpec.from_mapping(changed_spec(draws=draws)).draws.has_draws
 
 
 @pytest.mark.parametrize("draws", [{"number": 3}, {"limit": 3}])
 @pytest.mark.parametrize("variable", ["n_draws", "pd_up_half_width", "n_detected_up"])
 def test_figures_of_what_is_drawn_ask_for_draws(draws, variable):
     figures = [{"kind": "slices", "variable": variable, "x": "range"}]
-    mapping = written(axes={"target.range": ["1 m", "2 m"]}, figures=figures)
-    assert Spec.from_mapping(mapping | {"draws": draws}).figures
+    mapping = changed_spec(axes={"target.range": ["1 m", "2 m"]}, figures=figures)
+    assert GridSpec.from_mapping(mapping | {"draws": draws}).figures
     (mistake,) = mistakes_of(mapping)
     assert "set draws: {number: ...} or {limit: ...}" in str(mistake)
 
@@ -384,7 +386,7 @@ def test_ten_mistakes_in_one_file_are_reported_at_once_with_their_lines(tmp_path
 
 
 def test_an_axis_that_stands_in_for_a_field_is_blamed_alone():
-    mapping = written({"target.range": ...}, axes={"target.range": [5, "6 m"]})
+    mapping = changed_spec({"target.range": ...}, axes={"target.range": [5, "6 m"]})
     (mistake,) = mistakes_of(mapping)
     assert mistake.path == "axes.target.range[0]"
 
@@ -407,7 +409,9 @@ def test_search_bands_have_four_ends_and_count_what_they_search(band, message):
     changes = {f"instrument.processing.search.{name}": value for name, value in band.items()}
     counted = "all" if band == BAND else "half"
     with pytest.raises(SpecError, match=message):
-        Spec.from_mapping(written(changes | {"instrument.processing.bins_counted": counted}))
+        GridSpec.from_mapping(
+            changed_spec(changes | {"instrument.processing.bins_counted": counted})
+        )
 
 
 @pytest.mark.parametrize(
@@ -436,20 +440,20 @@ def test_search_bands_have_four_ends_and_count_what_they_search(band, message):
 def test_the_strongest_peak_alone_is_refused_where_no_law_of_it_is_known(changes, message):
     strongest = {"instrument.processing.peaks": "strongest"}
     with pytest.raises(SpecError, match=message):
-        Spec.from_mapping(written(changes | strongest))
-    assert not Spec.from_mapping(written(changes)).reports_strongest
-    assert Spec.from_mapping(written(strongest)).reports_strongest
+        GridSpec.from_mapping(changed_spec(changes | strongest))
+    assert not GridSpec.from_mapping(changed_spec(changes)).reports_strongest_peak
+    assert GridSpec.from_mapping(changed_spec(strongest)).reports_strongest_peak
 
 
 @pytest.mark.parametrize("peaks", ["all", "strongest"])
 def test_a_figure_of_wrong_ranges_needs_a_study_that_has_some(peaks):
     figure = {"kind": "slices", "variable": "p_wrong_range_shot", "x": "range"}
-    given = written(
+    given = changed_spec(
         {"instrument.processing.peaks": peaks}, axes={"target.range": ["1 m", "2 m"]},
         figures=[figure],
     )  # fmt: skip
     if peaks == "strongest":
-        assert Spec.from_mapping(given).reports_strongest
+        assert GridSpec.from_mapping(given).reports_strongest_peak
         return
     with pytest.raises(SpecError, match=r"processing\.peaks: strongest"):
-        Spec.from_mapping(given)
+        GridSpec.from_mapping(given)

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 import yaml
-from written_specs import BASE, written
+from base_spec import BASE_SPEC, changed_spec
 
-from sweep.spec import Spec, SpecError, load
+from sweep.spec import GridSpec, SpecError, load
 
 
 def write(path, mapping):
@@ -52,7 +52,7 @@ def test_aliases_that_explode_are_refused(tmp_path):
 
 
 def test_a_missing_file_suggests_its_neighbour(tmp_path):
-    write(tmp_path / "threshold.yaml", BASE)
+    write(tmp_path / "threshold.yaml", BASE_SPEC)
     assert "does not exist; did you mean 'threshold.yaml'?" in refusal(tmp_path / "treshold.yaml")
 
 
@@ -62,13 +62,13 @@ def test_a_directory_is_refused(tmp_path):
 
 def test_a_key_given_twice_is_refused_with_both_lines(tmp_path):
     path = tmp_path / "twice.yaml"
-    path.write_text(yaml.safe_dump(BASE) + "seed: 1\n" + "seed: 2\n")
+    path.write_text(yaml.safe_dump(BASE_SPEC) + "seed: 1\n" + "seed: 2\n")
     number = path.read_text().count("\n")
     assert f"seed: is given twice, on lines {number - 1} and {number}" in refusal(path)
 
 
 def test_numbers_mean_what_they_say_whatever_yaml_makes_of_them(tmp_path):
-    text = yaml.safe_dump(written({"instrument.processing.tnr": 10}))
+    text = yaml.safe_dump(changed_spec({"instrument.processing.tnr": 10}))
     for spelling, value in (("1e1", 10.0), ("010", 10.0), ("'1.5e+1'", 15.0), ("2^4", 16.0)):
         path = tmp_path / "numbers.yaml"
         path.write_text(text.replace("tnr: 10", f"tnr: {spelling}"))
@@ -80,16 +80,16 @@ def test_numbers_mean_what_they_say_whatever_yaml_makes_of_them(tmp_path):
 def instrument_file(tmp_path):
     folder = tmp_path / "instruments"
     folder.mkdir(exist_ok=True)
-    return write(folder / "lidar.yaml", BASE["instrument"])
+    return write(folder / "lidar.yaml", BASE_SPEC["instrument"])
 
 
 def test_an_instrument_kept_in_a_file_is_the_same_study_as_one_written_out(tmp_path, monkeypatch):
     instrument_file(tmp_path)
-    inline = write(tmp_path / "inline.yaml", BASE)
-    named = write(tmp_path / "named.yaml", BASE | {"instrument": "instruments/lidar.yaml"})
+    inline = write(tmp_path / "inline.yaml", BASE_SPEC)
+    named = write(tmp_path / "named.yaml", BASE_SPEC | {"instrument": "instruments/lidar.yaml"})
     assert load(named).id == load(inline).id
     monkeypatch.setenv("HOME", str(tmp_path))
-    at_home = BASE | {"instrument": {"file": "~/instruments/lidar.yaml"}}
+    at_home = BASE_SPEC | {"instrument": {"file": "~/instruments/lidar.yaml"}}
     assert load(write(tmp_path / "home.yaml", at_home)).id == load(inline).id
     assert load(named).to_yaml_mapping() == load(inline).to_yaml_mapping()
 
@@ -98,25 +98,25 @@ def test_an_instrument_is_overridden_field_by_field(tmp_path):
     instrument_file(tmp_path)
     reference = {"file": "instruments/lidar.yaml", "telescope": {"aperture": "50 mm"},
                  "processing": {"window": "hann"}}  # fmt: skip
-    spec = load(write(tmp_path / "study.yaml", BASE | {"instrument": reference}))
-    expected = written(
+    spec = load(write(tmp_path / "study.yaml", BASE_SPEC | {"instrument": reference}))
+    expected = changed_spec(
         {"instrument.telescope.aperture": "50 mm", "instrument.processing.window": "hann"}
     )
-    assert spec.id == Spec.from_mapping(expected).id
+    assert spec.id == GridSpec.from_mapping(expected).id
 
 
 def test_a_mistake_in_the_instrument_file_names_that_file_and_its_line(tmp_path):
     file = instrument_file(tmp_path)
     file.write_text(file.read_text().replace("power: 1 W", "power: 1 V"))
     line = file.read_text().splitlines().index("  power: 1 V") + 1
-    study = write(tmp_path / "study.yaml", BASE | {"instrument": "instruments/lidar.yaml"})
+    study = write(tmp_path / "study.yaml", BASE_SPEC | {"instrument": "instruments/lidar.yaml"})
     assert f"{file}:{line}: instrument.laser.power: needs a unit like W" in refusal(study)
 
 
 def test_a_mistake_in_an_override_names_the_study(tmp_path):
     instrument_file(tmp_path)
     reference = {"file": "instruments/lidar.yaml", "laser": {"power": "1 V"}}
-    study = write(tmp_path / "study.yaml", BASE | {"instrument": reference})
+    study = write(tmp_path / "study.yaml", BASE_SPEC | {"instrument": reference})
     assert f"{study}:5: instrument.laser.power" in refusal(study)
 
 
@@ -131,7 +131,7 @@ def test_a_mistake_in_an_override_names_the_study(tmp_path):
 )
 def test_an_instrument_that_cannot_be_read_is_reported_once(tmp_path, reference, path, words):
     instrument_file(tmp_path)
-    study = write(tmp_path / "study.yaml", BASE | {"instrument": reference, "seed": -1})
+    study = write(tmp_path / "study.yaml", BASE_SPEC | {"instrument": reference, "seed": -1})
     with pytest.raises(SpecError) as caught:
         load(study)
     assert {mistake.path for mistake in caught.value.mistakes} == {path, "seed"}
@@ -158,10 +158,10 @@ def test_endless_numbers_and_control_characters_are_refused_in_words(tmp_path, l
 
 
 def test_an_endless_integer_of_pythons_is_refused_in_words():
-    from sweep.spec import Spec, SpecError
+    from sweep.spec import GridSpec, SpecError
 
     with pytest.raises(SpecError, match="seed: is a number of too many digits"):
-        Spec.from_mapping({"seed": 10**5000})
+        GridSpec.from_mapping({"seed": 10**5000})
 
 
 TABLE = "instrument.chirp.error_table"
@@ -169,22 +169,25 @@ TABLE = "instrument.chirp.error_table"
 
 def test_a_table_of_the_chirps_error_is_the_same_in_a_spec_and_in_a_file_beside_it(tmp_path):
     rows = [[f"{10 * k} us", f"{k * (50 - k)} Hz"] for k in range(51)]
-    inline = Spec.from_mapping(written({TABLE: rows}))
+    inline = GridSpec.from_mapping(changed_spec({TABLE: rows}))
     lines = [f"{10 * k},{k * (50 - k) / 1000!r}" for k in range(51)]
     (tmp_path / "error.csv").write_text("\n".join(["# measured", "time [us], error [kHz]", *lines]))
-    named = load(write(tmp_path / "study.yaml", written({TABLE: "error.csv"})))
-    instrument = written({TABLE: "error.csv"})["instrument"]
+    named = load(write(tmp_path / "study.yaml", changed_spec({TABLE: "error.csv"})))
+    instrument = changed_spec({TABLE: "error.csv"})["instrument"]
     write(tmp_path / "lidar.yaml", instrument)
     (tmp_path / "below").mkdir()
-    beside = written() | {"instrument": "../lidar.yaml"}
+    beside = changed_spec() | {"instrument": "../lidar.yaml"}
     kept = load(write(tmp_path / "below" / "study.yaml", beside))
     values = [np.array([row.split() for row in s.parameters()[TABLE].split(",")], float)
               for s in (inline, named, kept)]  # fmt: skip
     np.testing.assert_allclose(values[1], values[0], rtol=1e-14, atol=1e-18)
-    assert named.id == kept.id != Spec.from_mapping(written()).id
-    again = Spec.from_stored(named.to_json())
+    assert named.id == kept.id != GridSpec.from_mapping(changed_spec()).id
+    again = GridSpec.from_stored(named.to_json())
     assert again == named and again.id == named.id
-    assert Spec.from_mapping(written({TABLE: "none"})).id == Spec.from_mapping(written()).id
+    assert (
+        GridSpec.from_mapping(changed_spec({TABLE: "none"})).id
+        == GridSpec.from_mapping(changed_spec()).id
+    )
 
 
 @pytest.mark.parametrize(
@@ -200,9 +203,9 @@ def test_a_table_of_the_chirps_error_is_the_same_in_a_spec_and_in_a_file_beside_
 )
 def test_a_table_that_cannot_stand_for_the_chirp_is_refused_in_words(rows, words):
     with pytest.raises(SpecError, match=words):
-        Spec.from_mapping(written({TABLE: rows}))
+        GridSpec.from_mapping(changed_spec({TABLE: rows}))
 
 
 def test_a_table_is_no_axis():
     with pytest.raises(SpecError, match="one table for a whole study"):
-        Spec.from_mapping(written(axes={TABLE: ["none"]}))
+        GridSpec.from_mapping(changed_spec(axes={TABLE: ["none"]}))

@@ -54,7 +54,7 @@ def test_a_value_that_its_axis_lacks_is_refused(tmp_path, target, instrument, ax
     with pytest.raises(SpecError) as error:
         sweep.load(path)
     (mistake,) = error.value.mistakes
-    assert mistake.path == told and "on the axis" in mistake.rule and mistake.line
+    assert mistake.path == told and "on the axis" in mistake.problem and mistake.line
     written = text.splitlines()[mistake.line - 1]
     assert told.rsplit(".", 1)[-1] in written
 

@@ -11,91 +11,105 @@ from sweep.model.waveform import SIGNS
 from sweep.model.window import COSINE_SUMS, samples
 
 
-def dirichlet(z: mp.mpf, length: int) -> mp.mpc:
+def dirichlet(bins: mp.mpf, length: int) -> mp.mpc:
     """Sum of exp(-2 pi i n z / L) over n = 0 .. L - 1, z bins."""
-    turns = z / length
+    turns = bins / length
     if mp.almosteq(turns, mp.nint(turns), rel_eps=0, abs_eps=mp.mpf(10) ** (8 - mp.mp.dps)):
         return mp.mpc(length)
-    half = mp.expjpi(-z + turns)
-    return half * mp.sinpi(z) / mp.sinpi(turns)
+    phase_factor = mp.expjpi(-bins + turns)
+    return phase_factor * mp.sinpi(bins) / mp.sinpi(turns)
 
 
-def transform(name: str, length: int, y: mp.mpf) -> mp.mpc:
+def window_transform(window_name: str, length: int, bins: mp.mpf) -> mp.mpc:
     """W(y) of a cosine sum of `length` samples, y bins of fs/L, as a sum of such kernels."""
     total = mp.mpc(0)
-    for m, text in enumerate(COSINE_SUMS[name]):
-        for z in (y - m, y + m):
-            total += (-1) ** m * mp.mpf(text) / 2 * dirichlet(z, length)
+    for m, text in enumerate(COSINE_SUMS[window_name]):
+        for shifted_bins in (bins - m, bins + m):
+            total += (-1) ** m * mp.mpf(text) / 2 * dirichlet(shifted_bins, length)
     return total
 
 
-def summed(weights: np.ndarray, y: mp.mpf) -> mp.mpc:
+def window_transform_from_samples(weights: np.ndarray, bins: mp.mpf) -> mp.mpc:
     """W(y) of any window by its samples, phases exact."""
     length = len(weights)
-    return mp.fsum(mp.mpf(float(w)) * mp.expjpi(-2 * n * y / length) for n, w in enumerate(weights))
+    return mp.fsum(
+        mp.mpf(float(w)) * mp.expjpi(-2 * n * bins / length) for n, w in enumerate(weights)
+    )
 
 
-class Line:
+class ExactLine:
     """One beamlet's beat in one segment of a shot: place [bins], weight at t_0."""
 
-    def __init__(self, shots: Shots, i: int, segment: int, beamlet: int) -> None:
-        row, sign = shots.row[i], SIGNS[segment]
-        rate, carrier = of(shots.chirp_rate, i), of(shots.carriers[segment], i)
-        metres = of(shots.range, i) * (1 + mp.mpf(float(shots.offset[row, beamlet])))
-        delay = 2 * metres / mp.mpf(SPEED_OF_LIGHT)
-        beta = of(shots.beta, i) + mp.mpf(float(shots.doppler[row, beamlet]))
+    def __init__(self, shots: Shots, point: int, segment: int, beamlet: int) -> None:
+        row, sign = shots.row[point], SIGNS[segment]
+        rate, carrier = (
+            point_value(shots.chirp_rate, point),
+            point_value(shots.carriers[segment], point),
+        )
+        range_m = point_value(shots.range, point) * (1 + mp.mpf(float(shots.offset[row, beamlet])))
+        delay = 2 * range_m / mp.mpf(SPEED_OF_LIGHT)
+        beta = point_value(shots.beta, point) + mp.mpf(float(shots.doppler[row, beamlet]))
         self.beat = carrier * beta - sign * rate * delay * (1 + beta)
-        self.bins = self.beat * shots.fft_size / of(shots.sample_rate, i)
-        start = self.beat * of(shots.acquisition_delay, i)
+        self.bins = self.beat * shots.fft_size / point_value(shots.sample_rate, point)
+        start = self.beat * point_value(shots.acquisition_delay, point)
         self.phase = -carrier * delay + sign * rate * delay**2 / 2 + start
-        poles = 1 + 1j * self.beat / of(shots.detector_bandwidth, i)
-        poles *= 1 + 1j * self.beat / of(shots.amplifier_bandwidth, i)
-        scale = of(shots.beat_scale, i) * mp.mpf(float(shots.amplitude[row, beamlet]))
+        poles = 1 + 1j * self.beat / point_value(shots.detector_bandwidth, point)
+        poles *= 1 + 1j * self.beat / point_value(shots.amplifier_bandwidth, point)
+        scale = point_value(shots.beat_scale, point) * mp.mpf(float(shots.amplitude[row, beamlet]))
         self.weight = scale / 2 / poles * mp.expjpi(2 * self.phase)
 
 
-def of(column: np.ndarray | float, i: int) -> mp.mpf:
+def point_value(column: np.ndarray | float, point: int) -> mp.mpf:
     """Point i of a column that may be one value for all, as it stands."""
     column = np.asarray(column)
-    return mp.mpf(float(column[i] if column.ndim else column))
+    return mp.mpf(float(column[point] if column.ndim else column))
 
 
-def magnitudes(
-    shots: Shots, i: int, segment: int, bins: Iterable[int], *, image: bool = True
+def exact_magnitudes(
+    shots: Shots, point: int, segment: int, bins: Iterable[int], *, image: bool = True
 ) -> list[mp.mpf]:
     """|X[k]| of some bins: lines, and images if wanted, as amplitudes or as powers."""
-    window, found = shots.window, []
-    lines = [Line(shots, i, segment, b) for b in range(shots.offset.shape[1])]
+    window, result = shots.window, []
+    lines = [ExactLine(shots, point, segment, b) for b in range(shots.offset.shape[1])]
     weights = None if window.name in COSINE_SUMS else samples(window.name, window.length)
 
-    def at(distance: mp.mpf) -> mp.mpc:
-        y = distance * window.length / shots.fft_size
-        return transform(window.name, window.length, y) if weights is None else summed(weights, y)
+    def transform_at(distance: mp.mpf) -> mp.mpc:
+        bins_of_record = distance * window.length / shots.fft_size
+        return (
+            window_transform(window.name, window.length, bins_of_record)
+            if weights is None
+            else window_transform_from_samples(weights, bins_of_record)
+        )
 
     for k in bins:
         pairs = [
             (
-                line.weight * at(k - line.bins),
-                mp.conj(line.weight) * at(k + line.bins) if image else mp.mpf(0),
+                line.weight * transform_at(k - line.bins),
+                mp.conj(line.weight) * transform_at(k + line.bins) if image else mp.mpf(0),
             )
             for line in lines
         ]
         if shots.incoherent:
-            found.append(mp.sqrt(mp.fsum(abs(x) ** 2 for pair in pairs for x in pair)))
+            result.append(mp.sqrt(mp.fsum(abs(x) ** 2 for pair in pairs for x in pair)))
         else:
-            found.append(abs(mp.fsum(x for pair in pairs for x in pair)))
-    return found
+            result.append(abs(mp.fsum(x for pair in pairs for x in pair)))
+    return result
 
 
-def peak(shots: Shots, i: int, segment: int) -> float:
+def peak_magnitude(shots: Shots, point: int, segment: int) -> float:
     """Height on a bin of a line with the weight of all lines of a segment."""
-    lines = (Line(shots, i, segment, b) for b in range(shots.offset.shape[1]))
+    lines = (ExactLine(shots, point, segment, b) for b in range(shots.offset.shape[1]))
     return float(mp.fsum(abs(line.weight) for line in lines)) * shots.window.sum
 
 
-def departure_of(shots: Shots, segment: int, bins: list[int], found: Iterable[float]) -> float:
+def error_over_peak(
+    shots: Shots, segment: int, bins: list[int], fast_magnitudes: Iterable[float]
+) -> float:
     """Largest error of |X| in some bins of a shot, over the peak."""
     with mp.workdps(40):
-        exact = magnitudes(shots, 0, segment, bins)
-        errors = [abs(mp.mpf(float(x)) - right) for x, right in zip(found, exact, strict=True)]
-        return float(max(errors)) / peak(shots, 0, segment)
+        exact = exact_magnitudes(shots, 0, segment, bins)
+        errors = [
+            abs(mp.mpf(float(x)) - exact_magnitude)
+            for x, exact_magnitude in zip(fast_magnitudes, exact, strict=True)
+        ]
+        return float(max(errors)) / peak_magnitude(shots, 0, segment)

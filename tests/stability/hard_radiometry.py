@@ -5,8 +5,8 @@ from collections.abc import Iterator
 
 import mpmath as mp
 import numpy as np
-from cases import EPS, Family
-from table_shots import parameters, shots
+from hard_cases import EPS, Family
+from table_4_1_shots import prepare_shot, table_4_1_parameters
 
 from sweep.model.effects.catalogue import CORE, EFFECTS
 from sweep.model.effects.line_width import (
@@ -26,12 +26,12 @@ FAMILY = Family(
     "noise are products of ten factors or so; probabilities magnify what is wrong with a "
     "threshold over noise b by b^2.",
 )
-EVERY = tuple(effect.name for effect in EFFECTS if not effect.is_random)
+CERTAIN_EFFECTS = tuple(effect.name for effect in EFFECTS if not effect.is_random)
 BETA_SQUARED = (4 - math.pi) / 2
 """(threshold / sigma)^2 for a TNR of 1."""
 
 
-def rayleigh(tnr: float) -> mp.mpf:
+def rayleigh_false_alarm(tnr: float) -> mp.mpf:
     """Chance that a bin of noise alone crosses: exp(-(4 - pi) / 4 TNR^2)."""
     return mp.exp(-(4 - mp.pi) / 4 * mp.mpf(tnr) ** 2)
 
@@ -48,19 +48,23 @@ def no_reflectance() -> float:
     worst = 0.0
     with mp.workdps(30):
         for architecture in ("homodyne", "heterodyne", "direct"):
-            for effects in ((), CORE, EVERY):
+            for effects in ((), CORE, CERTAIN_EFFECTS):
                 for tnr in (1e-3, 1.0, 10.0, 37.0):
-                    found = dark(architecture, tnr, effects)
+                    statistics = statistics_without_reflectance(architecture, tnr, effects)
                     for name in ("pd_up", "pd_down"):
-                        worst = max(worst, float(abs(found[name][0] / rayleigh(tnr) - 1)))
-                    assert found["snr_up"][0] == 0.0
-                    assert found["p_leakage_up"][0] < 1e-48  # light that leaks, at 300 dB
+                        worst = max(
+                            worst, float(abs(statistics[name][0] / rayleigh_false_alarm(tnr) - 1))
+                        )
+                    assert statistics["snr_up"][0] == 0.0
+                    assert statistics["p_leakage_up"][0] < 1e-48  # light that leaks, at 300 dB
     return worst
 
 
-def dark(architecture: str, tnr: float, effects: tuple[str, ...]) -> dict[str, np.ndarray]:
+def statistics_without_reflectance(
+    architecture: str, tnr: float, effects: tuple[str, ...]
+) -> dict[str, np.ndarray]:
     """Statistics of a shot at a target that reflects nothing."""
-    scene = parameters(
+    scene = table_4_1_parameters(
         reflectance=0.0, architecture=architecture, tnr=tnr, fft_size=1024, beamlets=7,
         full_scale=1.0, bits=12.0, line_width=1e4, extinction=1e-4, transverse_velocity=30.0,
         acquisition_delay=14e-6,  # when an echo from 2 km would be there
@@ -80,8 +84,8 @@ def next_to_no_signal() -> float:
     worst = 0.0
     with mp.workdps(30):
         for power in (1e-300, 1e-150, 1e-30):
-            found = evaluate(parameters(power=power, fft_size=1024))
-            worst = max(worst, float(abs(found["pd_up"][0] / rayleigh(10.0) - 1)))
+            statistics = evaluate(table_4_1_parameters(power=power, fft_size=1024))
+            worst = max(worst, float(abs(statistics["pd_up"][0] / rayleigh_false_alarm(10.0) - 1)))
     return worst
 
 
@@ -93,27 +97,33 @@ def next_to_no_signal() -> float:
     limit=20 * EPS,
     because="powers and roots of twenty factors, rounded",
 )
-def shot_limited() -> float:
+def shot_noise_limit() -> float:
     """On a bin, without poles in the receiver, at normal incidence of a single line."""
     worst = 0.0
-    for light in (1e-200, 1e-30, 1e-3, 1.0, 1e100):
-        one = parameters(
-            local_oscillator_power=light, noise_equivalent_power=0.0, amplifier_noise_current=0.0,
-            detector_bandwidth=3e8, amplifier_bandwidth=3e8, fft_size=1024, window="hann",
-            radial_velocity=0.0, range=1e-3,
-        )  # fmt: skip
-        found = evaluate(one, ())
-        worst = max(worst, abs(found["snr_doppler"][0] / shot_limit(1e-3) - 1))
+    for local_oscillator_power in (1e-200, 1e-30, 1e-3, 1.0, 1e100):
+        shot_parameters = table_4_1_parameters(
+            local_oscillator_power=local_oscillator_power,
+            noise_equivalent_power=0.0,
+            amplifier_noise_current=0.0,
+            detector_bandwidth=3e8,
+            amplifier_bandwidth=3e8,
+            fft_size=1024,
+            window="hann",
+            radial_velocity=0.0,
+            range=1e-3,
+        )
+        statistics = evaluate(shot_parameters, ())
+        worst = max(worst, abs(statistics["snr_doppler"][0] / shot_limited_snr(1e-3) - 1))
     return worst
 
 
-def shot_limit(metres: float) -> float:
+def shot_limited_snr(range_m: float) -> float:
     """SNR of a line at DC, on its image: (a sum w)^2 / (2 E_w sigma^2).
 
     With a^2 = 4 Re^2 P P_lo and sigma^2 = 2 q Re P_lo B.
     """
     with mp.workdps(30):
-        echo = mp.mpf(0.1) * mp.pi * mp.mpf(0.0125) ** 2 / (2 * mp.pi * mp.mpf(metres) ** 2)
+        echo = mp.mpf(0.1) * mp.pi * mp.mpf(0.0125) ** 2 / (2 * mp.pi * mp.mpf(range_m) ** 2)
         charge = mp.mpf("1.602176634e-19")
         enbw = mp.mpf("1.5")
         return float(mp.mpf(1.1) * echo / (2 * charge * mp.mpf(3e8)) * 1024 / enbw)
@@ -128,44 +138,61 @@ def shot_limit(metres: float) -> float:
     because="a threshold over noise, rounded and squared; where few noise bins stay below it, "
     "an exponent of up to 300",
 )
-def thresholds() -> float:
+def false_alarms_by_logarithm() -> float:
     worst = 0.0
     with mp.workdps(700):
         for tnr in (1e-6, 1e-3, 0.5, 5.0, 10.0, 45.0, 1e3, 1e6):
-            found = evaluate(parameters(reflectance=0.0, tnr=tnr, fft_size=1024), ())
+            statistics = evaluate(table_4_1_parameters(reflectance=0.0, tnr=tnr, fft_size=1024), ())
             log = -(4 - mp.pi) / 4 * mp.mpf(tnr) ** 2
-            number = int(shots((), reflectance=0.0, fft_size=1024).counted_bins(np.array([0]))[0])
+            n_bins = int(
+                prepare_shot((), reflectance=0.0, fft_size=1024).counted_bins(np.array([0]))[0]
+            )
             p = mp.exp(log) if log > -600 else None
-            many = [number - exempt for exempt in (2, 3)]
-            segment = [mp.log(1 - (1 - p) ** n) if p is not None else log + mp.log(n) for n in many]
-            got = found["log10_pfa_bin"][0], found["log10_pfa_segment"][0]
-            worst = max(worst, float(abs(got[0] * mp.log(10) / log - 1)))
+            bin_counts = [n_bins - n_exempt for n_exempt in (2, 3)]
+            segment = [
+                mp.log(1 - (1 - p) ** n) if p is not None else log + mp.log(n) for n in bin_counts
+            ]
+            log_pfas = statistics["log10_pfa_bin"][0], statistics["log10_pfa_segment"][0]
+            worst = max(worst, float(abs(log_pfas[0] * mp.log(10) / log - 1)))
             if abs(segment[1]) > 1e-300:
-                worst = max(worst, min(float(abs(got[1] * mp.log(10) / s - 1)) for s in segment))
+                worst = max(
+                    worst,
+                    min(
+                        float(abs(log_pfas[1] * mp.log(10) / exact_log - 1))
+                        for exact_log in segment
+                    ),
+                )
     return worst
 
 
 # Saturation
 
 
-def clipped_exactly(a: float, s: float, v: float) -> tuple[mp.mpf, mp.mpf]:
+def clipping_gains_exactly(
+    amplitude: float, deviation: float, full_scale: float
+) -> tuple[mp.mpf, mp.mpf]:
     """Gains of line and noise: the mean and variance of clipped noise over the sine's phase."""
-    a, s, v = mp.mpf(a), mp.mpf(s), mp.mpf(v)
+    amplitude, deviation, full_scale = mp.mpf(amplitude), mp.mpf(deviation), mp.mpf(full_scale)
 
-    def moments(x: mp.mpf) -> tuple[mp.mpf, mp.mpf]:
-        high, low = (v - x) / s, (-v - x) / s
+    def moments(beat: mp.mpf) -> tuple[mp.mpf, mp.mpf]:
+        high, low = (full_scale - beat) / deviation, (-full_scale - beat) / deviation
         above, below = mp.erfc(high / mp.sqrt(2)) / 2, mp.erfc(-low / mp.sqrt(2)) / 2
-        bell = [mp.exp(-z * z / 2) / mp.sqrt(2 * mp.pi) for z in (high, low)]
+        densities = [mp.exp(-z * z / 2) / mp.sqrt(2 * mp.pi) for z in (high, low)]
         inside = mp.erf(high / mp.sqrt(2)) / 2 - mp.erf(low / mp.sqrt(2)) / 2
-        mean = high * above + low * below + bell[1] - bell[0]
-        square = high**2 * above + low**2 * below + inside + low * bell[1] - high * bell[0]
-        return x + s * mean, s * s * (square - mean**2)
+        mean = high * above + low * below + densities[1] - densities[0]
+        second_moment = (
+            high**2 * above + low**2 * below + inside + low * densities[1] - high * densities[0]
+        )
+        return beat + deviation * mean, deviation * deviation * (second_moment - mean**2)
 
-    knee = [mp.asin(min(max((v + c * s) / a, 0), 1)) for c in (-12, -6, -3, -1, 0, 1, 3, 6, 12)]
-    edges = sorted({mp.mpf(0), *knee, mp.pi / 2})
-    line = mp.quad(lambda t: moments(a * mp.sin(t))[0] * mp.sin(t), edges)
-    noise = mp.quad(lambda t: moments(a * mp.sin(t))[1], edges)
-    return 4 / mp.pi * line / a, 2 / mp.pi * noise / s**2
+    clipping_phases = [
+        mp.asin(min(max((full_scale + c * deviation) / amplitude, 0), 1))
+        for c in (-12, -6, -3, -1, 0, 1, 3, 6, 12)
+    ]
+    edges = sorted({mp.mpf(0), *clipping_phases, mp.pi / 2})
+    line = mp.quad(lambda t: moments(amplitude * mp.sin(t))[0] * mp.sin(t), edges)
+    noise = mp.quad(lambda t: moments(amplitude * mp.sin(t))[1], edges)
+    return 4 / mp.pi * line / amplitude, 2 / mp.pi * noise / deviation**2
 
 
 def clipping_error(*scenes: tuple[float, float, float]) -> float:
@@ -173,15 +200,15 @@ def clipping_error(*scenes: tuple[float, float, float]) -> float:
     worst = 0.0
     with mp.workdps(30):
         for scene in scenes:
-            a, s, v = scene
-            found = clipping(amplitude=a, deviation=s, full_scale=v)
-            line, noise = clipped_exactly(a, s, v)
-            worst = max(worst, float(abs(float(found.signal_gain) / line - 1)))
-            worst = max(worst, float(abs(float(found.noise_gain) / noise - 1)))
+            amplitude, deviation, full_scale = scene
+            gains = clipping(amplitude=amplitude, deviation=deviation, full_scale=full_scale)
+            line, noise = clipping_gains_exactly(amplitude, deviation, full_scale)
+            worst = max(worst, float(abs(float(gains.signal_gain) / line - 1)))
+            worst = max(worst, float(abs(float(gains.noise_gain) / noise - 1)))
     return worst
 
 
-CLIPPING = {
+CLIPPING_CASE = {
     "reference": "clipped moments integrated, 30 digits",
     "measure": "gain of line, of noise",
 }
@@ -189,8 +216,11 @@ CLIPPING = {
 
 @FAMILY.case(
     "clipping from none to hard, noise of 0.01 to 1 of the beat",
-    allowed=1e-14, limit=10 * EPS, because="differences of normal integrals near 1", **CLIPPING,
-)  # fmt: skip
+    allowed=1e-14,
+    limit=10 * EPS,
+    because="differences of normal integrals near 1",
+    **CLIPPING_CASE,
+)
 def clipping_moderate() -> float:
     return clipping_error((1, 0.1, 2), (1, 0.1, 0.9), (1, 1, 0.7), (1, 0.01, 0.5), (0.01, 1, 3))
 
@@ -198,7 +228,7 @@ def clipping_moderate() -> float:
 @FAMILY.case(
     "a beat far below the noise, which clips",
     allowed=1e-11, limit=EPS / 1e-5,
-    because="a loss of 1e-5 of the noise off a beat that small", **CLIPPING,
+    because="a loss of 1e-5 of the noise off a beat that small", **CLIPPING_CASE,
 )  # fmt: skip
 def clipping_faint() -> float:
     return clipping_error((1e-3, 1, 1), (1e-5, 1, 0.3))
@@ -207,7 +237,7 @@ def clipping_faint() -> float:
 @FAMILY.case(
     "a beat of 100 to 1e4 times full scale",
     allowed=1e-11, limit=1e4 * EPS,
-    because="one less what is lost, which is all but 1e-4", slow=True, **CLIPPING,
+    because="one less what is lost, which is all but 1e-4", is_slow=True, **CLIPPING_CASE,
 )  # fmt: skip
 def clipping_hard() -> float:
     return clipping_error((100, 0.1, 1), (1e4, 1, 1))
@@ -226,13 +256,15 @@ def clipping_hard() -> float:
 )
 def no_width() -> float:
     scene = {"fft_size": 1024, "window": "hann"}
-    plain = segment_spectrum(shots(**scene), 0, 0)[1]
+    spectrum_without_width = segment_spectrum(prepare_shot(**scene), 0, 0)[1]
     worst = 0.0
     for shape in ("gaussian", "lorentzian"):
         for width in (0.0, 5e-324):
-            one = shots((*CORE, "line_width"), **scene, line_width=width, line_shape=shape)
-            found = segment_spectrum(one, 0, 0)[1]
-            worst = max(worst, float(np.abs(found / plain - 1).max()))
+            single_shot = prepare_shot(
+                (*CORE, "line_width"), **scene, line_width=width, line_shape=shape
+            )
+            magnitude = segment_spectrum(single_shot, 0, 0)[1]
+            worst = max(worst, float(np.abs(magnitude / spectrum_without_width - 1).max()))
     return worst
 
 
@@ -245,17 +277,17 @@ def no_width() -> float:
     because="the trapezium rule is meant to 1e-12 of the peak's power, 1e-3 of which is here",
 )
 def wider_than_the_band() -> float:
-    one = shots((*CORE, "line_width"), fft_size=256, window="hann", line_width=2.4e9,
+    single_shot = prepare_shot((*CORE, "line_width"), fft_size=256, window="hann", line_width=2.4e9,
                 detector_bandwidth=1e30, amplifier_bandwidth=1e30)  # fmt: skip
-    _, found = segment_spectrum(one, 0, 1)
-    half = float(one.beat_scale * one.amplitude[0, 0]) / 2
-    even = half * math.sqrt(2 * float((samples("hann", 256) ** 2).sum()))
-    return float(np.abs(found[3:-3] / even - 1).max())
+    _, magnitude = segment_spectrum(single_shot, 0, 1)
+    half_amplitude = float(single_shot.beat_scale * single_shot.amplitude[0, 0]) / 2
+    even_magnitude = half_amplitude * math.sqrt(2 * float((samples("hann", 256) ** 2).sum()))
+    return float(np.abs(magnitude[3:-3] / even_magnitude - 1).max())
 
 
-def widths() -> Iterator[tuple[float, float]]:
+def widths_and_delays() -> Iterator[tuple[float, float]]:
     """Widths [Hz] and delays [s] from hardly any phase noise to nothing else."""
-    yield from ((w, 1e-5) for w in (1e-9, 1.0, 1e3, 1e5, 1e7, 1e10))
+    yield from ((line_width, 1e-5) for line_width in (1e-9, 1.0, 1e3, 1e5, 1e7, 1e10))
 
 
 @FAMILY.case(
@@ -266,14 +298,14 @@ def widths() -> Iterator[tuple[float, float]]:
     limit=4 * EPS,
     because="a difference of second order, by its series where it is below 1e-4 of its terms",
 )
-def pedestal() -> float:
+def pedestal_density() -> float:
     worst = 0.0
     with mp.workdps(60):
-        for width, delay in widths():
+        for width, delay in widths_and_delays():
             gamma = 2 * mp.pi * mp.mpf(width)
-            right = 2 / gamma * (1 - mp.exp(-gamma * delay) * (1 + gamma * delay))
-            found = density_under_line(line_width=np.array(width), delay=np.array(delay))
-            worst = max(worst, float(abs(float(found) / right - 1)))
+            exact_density = 2 / gamma * (1 - mp.exp(-gamma * delay) * (1 + gamma * delay))
+            density = density_under_line(line_width=np.array(width), delay=np.array(delay))
+            worst = max(worst, float(abs(float(density) / exact_density - 1)))
     return worst
 
 
@@ -285,21 +317,23 @@ def pedestal() -> float:
     limit=1e-12,
     because="sums over lags; the integral over the lag is meant to 2e-5",
 )
-def under_the_line() -> float:
+def noise_under_line() -> float:
     length, rate = 2048, 600e6
     w = samples("hann", length)
-    r = np.correlate(w, w, "full")[length - 1 :]
+    window_correlation = np.correlate(w, w, "full")[length - 1 :]
     lags, worst = np.arange(length), 0.0
     for width in (1e-6, 1e3, 1e5, 1e6, 9.5e6, 9.6e6, 1e8, 1e10, 1e14):
         delay, duration = 1.5e-6, length / rate
-        gamma, further = 2 * math.pi * width, np.maximum(delay - lags / rate, 0.0)
-        left = np.exp(-gamma * lags / rate) * -np.expm1(-gamma * further) * r
-        exact = 2 * math.fsum(left) - left[0]
-        found = power_under_line(
+        gamma, delay_beyond_lag = 2 * math.pi * width, np.maximum(delay - lags / rate, 0.0)
+        lag_terms = (
+            np.exp(-gamma * lags / rate) * -np.expm1(-gamma * delay_beyond_lag) * window_correlation
+        )
+        exact = 2 * math.fsum(lag_terms) - lag_terms[0]
+        power = power_under_line(
             line_width=np.array([width]), delay=np.array([delay]),
             duration=np.array([duration]), window=window("hann", length),
         )  # fmt: skip
-        worst = max(worst, abs(float(found[0]) / exact - 1))
+        worst = max(worst, abs(float(power[0]) / exact - 1))
     return worst
 
 
@@ -315,11 +349,11 @@ def share_of_the_line() -> float:
     worst = 0.0
     with mp.workdps(30):
         for width, delay in ((1e-9, 1e-5), (1e4, 1e-5), (1e7, 1e-5), (1e11, 1e-9)):
-            found = coherent_share(
+            share = coherent_share(
                 line_width=np.array(width), delay=np.array(delay), duration=np.array(1.0)
             )
-            right = mp.exp(-2 * mp.pi * mp.mpf(width) * mp.mpf(delay))
-            worst = max(worst, float(abs(float(found) / right - 1)))
+            exact_share = mp.exp(-2 * mp.pi * mp.mpf(width) * mp.mpf(delay))
+            worst = max(worst, float(abs(float(share) / exact_share - 1)))
     return worst
 
 
@@ -331,13 +365,15 @@ def share_of_the_line() -> float:
     limit=1e-9,
     because="tails cut where they hold 1e-12, and 1e-9 of the fourth moment",
 )
-def shifts() -> float:
+def gaussian_line_shifts() -> float:
     worst = 0.0
     for width in (1e-6, 1e-3, 1.0, 30.0, 500.0):
-        found = gaussian_shifts(fwhm=np.array([width * 2.3548200450309493]), duration=np.ones(1))
+        line_shifts = gaussian_shifts(
+            fwhm=np.array([width * 2.3548200450309493]), duration=np.ones(1)
+        )
         for order, moment in ((0, 1.0), (2, width**2), (4, 3 * width**4)):
-            got = math.fsum((found.weight * found.offset**order)[0])
-            worst = max(worst, abs(got / moment - 1))
+            weighted_moment = math.fsum((line_shifts.weight * line_shifts.offset**order)[0])
+            worst = max(worst, abs(weighted_moment / moment - 1))
     return worst
 
 
@@ -352,20 +388,23 @@ def shifts() -> float:
     limit=2 * 345 * EPS,
     because="an exponent of up to 690, rounded",
 )
-def thick_air() -> float:
+def extinction_of_air() -> float:
     worst = 0.0
-    clear = float(shots(()).echo_power[0])
+    clear_power = float(prepare_shot(()).echo_power[0])
     with mp.workdps(30):
         for extinction in (1e-12, 1e-4, 0.01, 0.17, 10.0):
-            one = shots(
+            single_shot = prepare_shot(
                 ("extinction",), profile="layer", extinction=extinction, depth=1e5,
             )  # fmt: skip
-            right = clear * mp.exp(-2 * mp.mpf(extinction) * 2000)
-            if right > mp.mpf("1e-300"):
-                worst = max(worst, float(abs(float(one.echo_power[0]) / right - 1)))
-            found = evaluate(
-                parameters(profile="layer", extinction=extinction, depth=1e5), (*CORE, "extinction")
+            exact_power = clear_power * mp.exp(-2 * mp.mpf(extinction) * 2000)
+            if exact_power > mp.mpf("1e-300"):
+                worst = max(worst, float(abs(float(single_shot.echo_power[0]) / exact_power - 1)))
+            statistics = evaluate(
+                table_4_1_parameters(profile="layer", extinction=extinction, depth=1e5),
+                (*CORE, "extinction"),
             )
             if extinction > 1:
-                worst = max(worst, float(abs(found["pd_up"][0] / rayleigh(10.0) - 1)))
+                worst = max(
+                    worst, float(abs(statistics["pd_up"][0] / rayleigh_false_alarm(10.0) - 1))
+                )
     return worst

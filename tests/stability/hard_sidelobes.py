@@ -7,11 +7,11 @@ from typing import Any
 
 import mpmath as mp
 import numpy as np
-from cases import EPS, Family
-from engine import run_of_bins, shape_of
-from exact_spectrum import magnitudes, transform
-from hard_marcum import mixture
-from table_shots import shots
+from exact_spectrum import exact_magnitudes, window_transform
+from hard_cases import EPS, Family
+from hard_marcum import excess_by_poisson_mixture
+from shot_helpers import detected_window, line_shape_of_window
+from table_4_1_shots import prepare_shot
 
 from sweep.model.line_shape import SHARED
 from sweep.model.lines import IM, LEAST_WIDTH, PLACE, RE
@@ -28,40 +28,46 @@ FAMILY = Family(
     "relative to themselves, however small. Windows that are no sum of cosines, and short "
     "records, have a table of all bins.",
 )
-SIZES = (2**12, 2**14, 2**17, 2**20, 2**24)
-OFFSETS = (0.4061, -0.49999, 0.5)
-PEAK = {"measure": "abs(X), of the peak", "reference": "sum over all samples, exactly rounded"}
+FFT_SIZES = (2**12, 2**14, 2**17, 2**20, 2**24)
+LINE_OFFSETS_BINS = (0.4061, -0.49999, 0.5)
+PEAK_CASE = {"measure": "abs(X), of the peak", "reference": "sum over all samples, exactly rounded"}
 
 
-def kernel(name: str, size: int, delta: float, bins: Iterable[int]) -> Iterator[float]:
+def window_magnitudes(
+    window_name: str, size: int, line_offset: float, bins: Iterable[int]
+) -> Iterator[float]:
     """|W| of single bins, unpadded, for a line `delta` bins off bin 0."""
-    table, form, sizes, _, _ = shape_of(window(name, size), size)
-    room = np.empty((ROOM, max(LEAST_WIDTH, MOST_CELLS) + 16))
-    room[PLACE, 0], room[RE, 0], room[IM, 0] = delta, 1.0, 0.0
+    table, outline, sizes, _, _ = line_shape_of_window(window(window_name, size), size)
+    scratch = np.empty((ROOM, max(LEAST_WIDTH, MOST_CELLS) + 16))
+    scratch[PLACE, 0], scratch[RE, 0], scratch[IM, 0] = line_offset, 1.0, 0.0
     for k in bins:
-        field(k, 1, (1, delta, delta, 0.0), table, form, sizes, tangents(size), room)
-        yield float(np.hypot(room[F_RE, 0], room[F_IM, 0]))
+        field(
+            k, 1, (1, line_offset, line_offset, 0.0), table, outline, sizes, tangents(size), scratch
+        )
+        yield float(np.hypot(scratch[F_RE, 0], scratch[F_IM, 0]))
 
 
-def far(size: int) -> list[int]:
+def far_bins(size: int) -> list[int]:
     """Bins from beyond the table to well before Nyquist."""
     return [SHARED + 9, SHARED + 123, size // 8, size // 4, size // 3]
 
 
-def relative_error(name: str) -> float:
+def far_sidelobe_error(window_name: str) -> float:
     """Worst error of far sidelobes, relative to themselves."""
     worst = 0.0
     with mp.workdps(100):
-        for size in SIZES:
-            for delta in OFFSETS:
-                bins = far(size)
-                for k, found in zip(bins, kernel(name, size, delta, bins), strict=True):
-                    exact = abs(transform(name, size, k - mp.mpf(delta)))
-                    worst = max(worst, float(abs(found / exact - 1)))
+        for size in FFT_SIZES:
+            for delta in LINE_OFFSETS_BINS:
+                bins = far_bins(size)
+                for k, magnitude in zip(
+                    bins, window_magnitudes(window_name, size, delta, bins), strict=True
+                ):
+                    exact = abs(window_transform(window_name, size, k - mp.mpf(delta)))
+                    worst = max(worst, float(abs(magnitude / exact - 1)))
     return worst
 
 
-def closed_forms() -> None:
+def add_closed_form_cases() -> None:
     """A case for each sum of cosines."""
     for name in COSINE_SUMS:
         FAMILY.case(
@@ -71,10 +77,10 @@ def closed_forms() -> None:
             allowed=1e-12,
             limit=4 * EPS,
             because="the record's ends have twelve derivatives",
-        )(lambda name=name: relative_error(name))
+        )(lambda name=name: far_sidelobe_error(name))
 
 
-closed_forms()
+add_closed_form_cases()
 
 
 @FAMILY.case(
@@ -91,9 +97,11 @@ def last_bins() -> float:
         for name in COSINE_SUMS:
             for size in (2**12, 2**17, 2**24):
                 bins = [size // 2 - 3, size // 2 - 1]
-                for k, found in zip(bins, kernel(name, size, 0.4061, bins), strict=True):
-                    exact = abs(transform(name, size, k - mp.mpf(0.4061)))
-                    worst = max(worst, float(abs(found / exact - 1)) / size)
+                for k, magnitude in zip(
+                    bins, window_magnitudes(name, size, 0.4061, bins), strict=True
+                ):
+                    exact = abs(window_transform(name, size, k - mp.mpf(0.4061)))
+                    worst = max(worst, float(abs(magnitude / exact - 1)) / size)
     return worst
 
 
@@ -110,18 +118,20 @@ def main_lobes() -> float:
     with mp.workdps(100):
         for name, size in product(COSINE_SUMS, (1024, 4096)):
             for delta in (0.0, 1e-300, 1e-9, 0.25, 0.5):
-                unit = window(name, size).sum
-                for k, found in zip(bins, kernel(name, size, delta, bins), strict=True):
-                    exact = abs(transform(name, size, k - mp.mpf(delta)))
-                    worst = max(worst, float(abs(found - exact)) / unit)
+                peak = window(name, size).sum
+                for k, magnitude in zip(
+                    bins, window_magnitudes(name, size, delta, bins), strict=True
+                ):
+                    exact = abs(window_transform(name, size, k - mp.mpf(delta)))
+                    worst = max(worst, float(abs(magnitude - exact)) / peak)
     return worst
 
 
-def by_samples(name: str, size: int, delta: float, k: int) -> float:
+def window_magnitude_by_samples(name: str, size: int, delta: float, k: int) -> float:
     """|W| by the plain sum: phases of whole cycles taken off exactly, sums rounded once."""
-    w, n = samples(name, size), np.arange(size)
-    turns = (n * k % size) / size - n * (delta / size)
-    real, imaginary = w * np.cos(2 * np.pi * turns), w * np.sin(2 * np.pi * turns)
+    weights, sample_numbers = samples(name, size), np.arange(size)
+    turns = (sample_numbers * k % size) / size - sample_numbers * (delta / size)
+    real, imaginary = weights * np.cos(2 * np.pi * turns), weights * np.sin(2 * np.pi * turns)
     return math.hypot(math.fsum(real), math.fsum(imaginary))
 
 
@@ -131,44 +141,46 @@ def tabulated_error(names: Iterable[str], sizes: Iterable[int], bins: Iterable[i
     for name in names:
         for size in sizes:
             for delta in (0.4061, 0.5, 1e-9):
-                chosen = [*bins, size // 3, size // 2]
-                for k, found in zip(chosen, kernel(name, size, delta, chosen), strict=True):
-                    exact = by_samples(name, size, delta, k)
-                    worst = max(worst, abs(found - exact) / window(name, size).sum)
+                all_bins = [*bins, size // 3, size // 2]
+                for k, magnitude in zip(
+                    all_bins, window_magnitudes(name, size, delta, all_bins), strict=True
+                ):
+                    exact = window_magnitude_by_samples(name, size, delta, k)
+                    worst = max(worst, abs(magnitude - exact) / window(name, size).sum)
     return worst
 
 
-TAPERED = ("kaiser(14)", "chebwin(100)", "dpss(3)", "bohman", "parzen", "barthann")
+TAPERED_WINDOWS = ("kaiser(14)", "chebwin(100)", "dpss(3)", "bohman", "parzen", "barthann")
 
 
 @FAMILY.case(
     "tabulated windows that end near zero, 2^8 to 2^14 points",
-    allowed=1e-13, limit=EPS, because="one rounding of the peak", **PEAK,
+    allowed=1e-13, limit=EPS, because="one rounding of the peak", **PEAK_CASE,
 )  # fmt: skip
-def tapered() -> float:
-    return tabulated_error(TAPERED, (2**8, 2**11, 2**14), (0, 1, 2, 7, 33))
+def tapered_windows() -> float:
+    return tabulated_error(TAPERED_WINDOWS, (2**8, 2**11, 2**14), (0, 1, 2, 7, 33))
 
 
 @FAMILY.case(
     "tabulated windows that end near zero, 2^18 to 2^20 points",
-    allowed=3e-13, limit=EPS, because="one rounding of the peak", slow=True, **PEAK,
+    allowed=3e-13, limit=EPS, because="one rounding of the peak", is_slow=True, **PEAK_CASE,
 )  # fmt: skip
-def tapered_long() -> float:
-    return tabulated_error(TAPERED[:2], (2**18, 2**20), (1, 33))
+def long_tapered_windows() -> float:
+    return tabulated_error(TAPERED_WINDOWS[:2], (2**18, 2**20), (1, 33))
 
 
 @FAMILY.case(
     "tabulated windows with a step at their ends",
-    allowed=2e-13, limit=EPS, because="one rounding; a kernel that is right to 1e-13", **PEAK,
+    allowed=2e-13, limit=EPS, because="one rounding; a kernel that is right to 1e-13", **PEAK_CASE,
 )  # fmt: skip
-def stepped() -> float:
+def stepped_windows() -> float:
     return tabulated_error(
         ("gaussian(300)", "kaiser(1)", "tukey(0.05)"), (2**10,), (0, 1, 2, 7, 33)
     )
 
 
-LEAKING = ("footprint", "footprint_phase", "doppler", "leakage")
-STRONG = {
+LEAKAGE_EFFECTS = ("footprint", "footprint_phase", "doppler", "leakage")
+STRONG_SCENE = {
     "fft_size": 4096, "range": 3000.0, "power": 1e3, "tnr": 5.0, "beamlets": 19,
     "phases": "incoherent", "grazing_angle": 0.05, "beam_divergence": 1e-3,
 }  # fmt: skip
@@ -182,25 +194,39 @@ STRONG = {
     allowed=1e-9,
     limit=EPS**0.5,
     because="a rounding of the peak's power, in a null",
-    slow=True,
+    is_slow=True,
 )
 def sidelobes_of_many() -> float:
     worst = 0.0
     for name in ("hann", "hamming", "blackman", "rectangular"):
-        one = shots(LEAKING, **STRONG, window=name)
-        low, found = run_of_bins(one, 0)
-        count = found.size
-        top = int(np.argmax(found))
-        near = {0, top - 30, top - 9, top - 3, top - 1, top, top + 2, top + 17, count - 1}
-        chosen = sorted({k for k in near if 0 <= k < count})
+        single_shot = prepare_shot(LEAKAGE_EFFECTS, **STRONG_SCENE, window=name)
+        first_bin, magnitude = detected_window(single_shot, 0)
+        count = magnitude.size
+        peak_bin = int(np.argmax(magnitude))
+        near_bins = {
+            0,
+            peak_bin - 30,
+            peak_bin - 9,
+            peak_bin - 3,
+            peak_bin - 1,
+            peak_bin,
+            peak_bin + 2,
+            peak_bin + 17,
+            count - 1,
+        }
+        checked_bins = sorted({k for k in near_bins if 0 <= k < count})
         with mp.workdps(40):
-            exact = magnitudes(one, 0, 0, [low + int(k) for k in chosen], image=False)
-            errors = [abs(float(found[k]) - x) for k, x in zip(chosen, exact, strict=True)]
-        worst = max(worst, float(max(errors) / found.max()))
+            exact = exact_magnitudes(
+                single_shot, 0, 0, [first_bin + int(k) for k in checked_bins], image=False
+            )
+            errors = [
+                abs(float(magnitude[k]) - x) for k, x in zip(checked_bins, exact, strict=True)
+            ]
+        worst = max(worst, float(max(errors) / magnitude.max()))
     return worst
 
 
-LEAKAGE = {
+LEAKAGE_CASE = {
     "reference": "every bin in 30 digits, chances as mixtures of chi-square tails",
     "measure": "leakage",
     "allowed": 1e-6,
@@ -209,35 +235,39 @@ LEAKAGE = {
 }
 
 
-@FAMILY.case("leakage of 600 bins, from 1e-12 to 1, many of each far below it", **LEAKAGE)
-def leakage() -> float:
+@FAMILY.case("leakage of 600 bins, from 1e-12 to 1, many of each far below it", **LEAKAGE_CASE)
+def leakage_of_600_bins() -> float:
     return max(leakage_error("hann", 1280, 100.0), leakage_error("hamming", 1280, 1500.0))
 
 
-@FAMILY.case("leakage of 2000 bins, most of them summed as an integral", slow=True, **LEAKAGE)
-def leakage_far_off() -> float:
+@FAMILY.case(
+    "leakage of 2000 bins, most of them summed as an integral", is_slow=True, **LEAKAGE_CASE
+)
+def leakage_of_2000_bins() -> float:
     return leakage_error("hamming", 2**12, 1000.0)
 
 
-def leakage_error(name: str, size: int, metres: float) -> float:
+def leakage_error(window_name: str, size: int, range_m: float) -> float:
     """Relative error of the leakage of a shot's up segment."""
-    one = shots(LEAKING, window=name, fft_size=size, range=metres)
-    found = find(one)[0]
-    return abs(found[5, 0] / exact_leakage(one, int(found[4, 0])) - 1)
+    single_shot = prepare_shot(LEAKAGE_EFFECTS, window=window_name, fft_size=size, range=range_m)
+    results = find(single_shot)[0]
+    return abs(results[5, 0] / exact_leakage(single_shot, int(results[4, 0])) - 1)
 
 
-def exact_leakage(one: Any, exempted: int) -> float:
+def exact_leakage(single_shot: Any, n_exempted: int) -> float:
     """Chance that a bin of the up segment but those about the peak crosses, over noise alone."""
-    sigma, level = float(one.bin_deviation[0]), float(one.threshold[0])
+    sigma, threshold = float(single_shot.bin_deviation[0]), float(single_shot.threshold[0])
     with mp.workdps(30):
-        bins = magnitudes(one, 0, 0, range(one.fft_size // 2 + 1), image=False)
-        crossing = [k for k, x in enumerate(bins) if x >= min(level, max(bins))]
-        exempt = {k + j for k in crossing for j in (-1, 0, 1)}
-        assert len(exempt) == exempted
-        beta = mp.mpf(level) / sigma
+        bins = exact_magnitudes(
+            single_shot, 0, 0, range(single_shot.fft_size // 2 + 1), image=False
+        )
+        crossing = [k for k, x in enumerate(bins) if x >= min(threshold, max(bins))]
+        exempt = {k + offset for k in crossing for offset in (-1, 0, 1)}
+        assert len(exempt) == n_exempted
+        beta = mp.mpf(threshold) / sigma
         below = -mp.expm1(-(beta**2) / 2)
         logs = [
-            mp.log1p(-mixture(x / sigma, beta) / below)
+            mp.log1p(-excess_by_poisson_mixture(x / sigma, beta) / below)
             for k, x in enumerate(bins)
             if k not in exempt
         ]

@@ -5,10 +5,10 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
-from cases import EPS, Family
-from exact_spectrum import departure_of, peak
-from hard_beats import departure
-from table_shots import shots, velocity_for
+from exact_spectrum import error_over_peak, peak_magnitude
+from hard_beats import error_of_all_segments
+from hard_cases import EPS, Family
+from table_4_1_shots import prepare_shot, velocity_for
 
 from sweep.model import segments, truth
 from sweep.model.preparation import Shots
@@ -19,74 +19,85 @@ FAMILY = Family(
     "beats, a line at bin nu is known to nu eps / 2 bins, which is what long FFTs cost; short ones "
     "cost nothing.",
 )
-EXACT = {"reference": "exact delay and transform, 40 digits", "measure": "abs(X), of the peak"}
-RATE = 600e6
+EXACT_REFERENCE = {
+    "reference": "exact delay and transform, 40 digits",
+    "measure": "abs(X), of the peak",
+}
+SAMPLE_RATE = 600e6
 
 
-def place(frequency: float, size: int, rate: float = RATE) -> float:
+def position_rounding(frequency: float, size: int, rate: float = SAMPLE_RATE) -> float:
     """Cost of a beat's rounding over the peak."""
     return (frequency / rate * size * math.pi / 2 + 4) * EPS / 2
 
 
-def few_bins(one: Shots, segment: int, level: float) -> float:
+def error_next_to_line(single_shot: Shots, segment: int, relative_level: float) -> float:
     """Worst error over the peak of the bins next to a line."""
-    height = peak(one, 0, segment)
-    bins, found = segments.spectrum(one, 0, segment, level=level * height)
-    top = int(np.argmax(found))
-    chosen = sorted({0, len(bins) - 1, *range(max(top - 4, 0), min(top + 5, len(bins)))})
-    return departure_of(one, segment, bins[chosen].tolist(), found[chosen])
+    peak_height = peak_magnitude(single_shot, 0, segment)
+    bins, magnitude = segments.spectrum(single_shot, 0, segment, level=relative_level * peak_height)
+    peak_index = int(np.argmax(magnitude))
+    checked = sorted(
+        {0, len(bins) - 1, *range(max(peak_index - 4, 0), min(peak_index + 5, len(bins)))}
+    )
+    return error_over_peak(single_shot, segment, bins[checked].tolist(), magnitude[checked])
 
 
-def long_fft(size: int, **changes: Any) -> float:
+def error_of_long_fft(size: int, **changes: Any) -> float:
     """The same of three segments of an FFT whose record is as long."""
-    one = shots(fft_size=size, duration=2 * size / RATE, window="hann", **changes)
-    return max(few_bins(one, segment, 1e-3) for segment in range(3))
+    single_shot = prepare_shot(
+        fft_size=size, duration=2 * size / SAMPLE_RATE, window="hann", **changes
+    )
+    return max(error_next_to_line(single_shot, segment, 1e-3) for segment in range(3))
 
 
-@FAMILY.case("FFTs of 2 to 9 points", allowed=1e-12, limit=place(2e8, 9),
+@FAMILY.case("FFTs of 2 to 9 points", allowed=1e-12, limit=position_rounding(2e8, 9),
              because="beats of 2e8 Hz, rounded; windows below 64 samples come from the table",
-             **EXACT)  # fmt: skip
-def shortest() -> float:
+             **EXACT_REFERENCE)  # fmt: skip
+def shortest_ffts() -> float:
     return max(
-        departure(shots(fft_size=size, window=window, range=r))
+        error_of_all_segments(prepare_shot(fft_size=size, window=window, range=r))
         for size in (2, 3, 4, 5, 7, 9)
         for window in ("rectangular", "hann", "flattop")
         for r in (1.0, 77.7)
     )
 
 
-@FAMILY.case("FFTs of 63, 64, 1009, 2187 and 4095 points", allowed=1e-12, limit=place(2e8, 4095),
-             because="beats of 2e8 Hz, rounded; 63 samples come from the table",
-             **EXACT)  # fmt: skip
-def odd_sizes() -> float:
+@FAMILY.case(
+    "FFTs of 63, 64, 1009, 2187 and 4095 points",
+    allowed=1e-12,
+    limit=position_rounding(2e8, 4095),
+    because="beats of 2e8 Hz, rounded; 63 samples come from the table",
+    **EXACT_REFERENCE,
+)
+def odd_fft_sizes() -> float:
     return max(
-        departure(shots(fft_size=size, window=window))
+        error_of_all_segments(prepare_shot(fft_size=size, window=window))
         for size in (63, 64, 1009, 2187, 4095)
         for window in ("rectangular", "blackman")
     )
 
 
-@FAMILY.case("an FFT of 2^24 points", allowed=3e-9, limit=place(2e8, 2**24),
-             because="beats of 2e8 Hz, rounded", **EXACT)  # fmt: skip
-def sixteen_million() -> float:
-    return long_fft(2**24)
+@FAMILY.case("an FFT of 2^24 points", allowed=3e-9, limit=position_rounding(2e8, 2**24),
+             because="beats of 2e8 Hz, rounded", **EXACT_REFERENCE)  # fmt: skip
+def largest_fft() -> float:
+    return error_of_long_fft(2**24)
 
 
-def padded(length: int, size: int, **changes: Any) -> Shots:
+def shot_of_padded_record(length: int, size: int, **changes: Any) -> Shots:
     """A shot whose record ends after some samples, where the chirp does."""
-    delay = (300e-6 * RATE - length) / RATE
-    one = shots(fft_size=size, duration=300e-6, acquisition_delay=delay, **changes)
-    assert one.window.length == length
-    return one
+    delay = (300e-6 * SAMPLE_RATE - length) / SAMPLE_RATE
+    single_shot = prepare_shot(fft_size=size, duration=300e-6, acquisition_delay=delay, **changes)
+    assert single_shot.window.length == length
+    return single_shot
 
 
 @FAMILY.case("records that end with the chirp: 2 to 997 samples of an FFT of 1024 or 1000",
-             allowed=2e-10, limit=place(2e8, 1024) + 2 * math.pi * 2e8 * 300e-6 * EPS,
+             allowed=2e-10, limit=position_rounding(2e8, 1024) + 2 * math.pi * 2e8 * 300e-6 * EPS,
              because="beats, and 6e4 cycles of them until the record begins, rounded",
-             slow=True, **EXACT)  # fmt: skip
+             is_slow=True, **EXACT_REFERENCE)  # fmt: skip
 def short_records() -> float:
     return max(
-        departure(padded(length, size, window=window, range=500.0))
+        error_of_all_segments(shot_of_padded_record(length, size, window=window, range=500.0))
         for length in (2, 3, 65, 700, 997)
         for size in (1000, 1024)
         for window in ("rectangular", "hann", "nuttall")
@@ -94,39 +105,49 @@ def short_records() -> float:
 
 
 @FAMILY.case("a record of a single sample", allowed=2e-10, limit=2 * math.pi * 2e8 * 300e-6 * EPS,
-             because="6e4 cycles until the record begins, rounded", **EXACT)  # fmt: skip
-def one_sample() -> float:
+             because="6e4 cycles until the record begins, rounded", **EXACT_REFERENCE)  # fmt: skip
+def single_sample_record() -> float:
     return max(
-        departure(padded(1, size, window="rectangular", range=500.0)) for size in (2, 64, 1000)
+        error_of_all_segments(shot_of_padded_record(1, size, window="rectangular", range=500.0))
+        for size in (2, 64, 1000)
     )
 
 
 @FAMILY.case("the time-domain record itself, 2^20 samples", allowed=1e-11,
-             limit=2 * math.pi * 2e8 / RATE * 2**20 * EPS / 2,
-             because="phases f t of up to 3e5 cycles, each sample's rounded", **EXACT)  # fmt: skip
-def floor_of_a_long_record() -> float:
+             limit=2 * math.pi * 2e8 / SAMPLE_RATE * 2**20 * EPS / 2,
+             because="phases f t of up to 3e5 cycles, each sample's "
+             "rounded", **EXACT_REFERENCE)  # fmt: skip
+def error_of_long_time_record() -> float:
     """Of bins next to the lines and far off."""
     size, worst = 2**20, 0.0
-    one = shots(fft_size=size, window="hann", duration=2 * size / RATE)
+    single_shot = prepare_shot(fft_size=size, window="hann", duration=2 * size / SAMPLE_RATE)
     for segment in range(3):
-        found = truth.spectrum(one, 0, segment, range_walk=False)
-        top = int(np.argmax(found))
-        chosen = [1, size // 5, *range(top - 4, top + 5)]
-        worst = max(worst, departure_of(one, segment, chosen, found[chosen]))
+        magnitude = truth.spectrum(single_shot, 0, segment, range_walk=False)
+        peak_bin = int(np.argmax(magnitude))
+        checked_bins = [1, size // 5, *range(peak_bin - 4, peak_bin + 5)]
+        worst = max(
+            worst, error_over_peak(single_shot, segment, checked_bins, magnitude[checked_bins])
+        )
     return worst
 
 
-def of_one(phases: str, number: int) -> float:
+def error_of_coincident_beamlets(phases: str, n_beamlets: int) -> float:
     """A footprint so small that all of it is one line, over that line and its amplitudes' sum."""
     scene = {"fft_size": 4096, "beam_divergence": 1e-9, "window": "hann", "phases": phases}
-    many, one = shots(**scene, beamlets=number), shots(**scene)
-    weights = many.amplitude[0] / one.amplitude[0, 0]
-    whole = math.fsum(weights) if phases == "coherent" else math.sqrt(math.fsum(weights**2))
+    shots_of_many, shots_of_one = prepare_shot(**scene, beamlets=n_beamlets), prepare_shot(**scene)
+    weights = shots_of_many.amplitude[0] / shots_of_one.amplitude[0, 0]
+    amplitude_sum = math.fsum(weights) if phases == "coherent" else math.sqrt(math.fsum(weights**2))
     worst = 0.0
     for segment in range(3):
-        _, single = segments.spectrum(one, 0, segment)
-        _, found = segments.spectrum(many, 0, segment)
-        worst = max(worst, float(np.abs(found / whole - single).max() / single.max()))
+        _, magnitude_of_one = segments.spectrum(shots_of_one, 0, segment)
+        _, magnitude_of_many = segments.spectrum(shots_of_many, 0, segment)
+        worst = max(
+            worst,
+            float(
+                np.abs(magnitude_of_many / amplitude_sum - magnitude_of_one).max()
+                / magnitude_of_one.max()
+            ),
+        )
     return worst
 
 
@@ -138,8 +159,10 @@ def of_one(phases: str, number: int) -> float:
     limit=1e5**0.5 * EPS,
     because="1e5 additions, rounded",
 )
-def many_powers() -> float:
-    return max(of_one("incoherent", number) for number in (1, 2, 3, 109, 100_000))
+def many_beamlet_powers() -> float:
+    return max(
+        error_of_coincident_beamlets("incoherent", number) for number in (1, 2, 3, 109, 100_000)
+    )
 
 
 @FAMILY.case(
@@ -150,63 +173,65 @@ def many_powers() -> float:
     limit=1e5**0.5 * EPS,
     because="1e5 additions, rounded; many lines as few are meant to 1e-13",
 )
-def many_amplitudes() -> float:
-    return max(of_one("coherent", number) for number in (1, 2, 3, 109, 100_000))
+def many_beamlet_amplitudes() -> float:
+    return max(
+        error_of_coincident_beamlets("coherent", number) for number in (1, 2, 3, 109, 100_000)
+    )
 
 
-def against_the_record(
-    numbers: Iterable[int], those: Iterable[int] = (0, 1, 2), **changes: Any
+def error_against_time_domain(
+    beamlet_numbers: Iterable[int], segments_checked: Iterable[int] = (0, 1, 2), **changes: Any
 ) -> float:
     """Fast path against the time domain, over the peak."""
     worst = 0.0
-    for number in numbers:
-        one = shots(beamlets=number, fft_size=512, window="hann", **changes)
-        for segment in those:
-            _, found = segments.spectrum(one, 0, segment)
-            exact = truth.spectrum(one, 0, segment, range_walk=False)
-            worst = max(worst, float(np.abs(found - exact).max() / exact.max()))
+    for n_beamlets in beamlet_numbers:
+        single_shot = prepare_shot(beamlets=n_beamlets, fft_size=512, window="hann", **changes)
+        for segment in segments_checked:
+            _, magnitude = segments.spectrum(single_shot, 0, segment)
+            exact = truth.spectrum(single_shot, 0, segment, range_walk=False)
+            worst = max(worst, float(np.abs(magnitude - exact).max() / exact.max()))
     return worst
 
 
-SPREAD = {
+TIME_DOMAIN_CASE = {
     "reference": "time-domain records of every beamlet",
     "measure": "abs(X), of the largest",
     "allowed": 1e-11,
     "limit": 2 * math.pi * 512 * EPS / 2,
     "because": "phases f t of the record of up to 512 cycles, rounded",
 }
-SLANT = {"grazing_angle": 0.01, "beam_divergence": 3e-3, "range": 3000.0}
+SLANT_SCENE = {"grazing_angle": 0.01, "beam_divergence": 3e-3, "range": 3000.0}
 
 
-@FAMILY.case("2 to 1000 beamlets over tens of bins, as amplitudes", **SPREAD)
+@FAMILY.case("2 to 1000 beamlets over tens of bins, as amplitudes", **TIME_DOMAIN_CASE)
 def wide_footprints() -> float:
-    return against_the_record((2, 19, 1000), phases="coherent", **SLANT)
+    return error_against_time_domain((2, 19, 1000), phases="coherent", **SLANT_SCENE)
 
 
 @FAMILY.case(
     "2 to 1000 beamlets over tens of bins, as powers",
-    **SPREAD | {
+    **TIME_DOMAIN_CASE | {
         "allowed": 1e-9, "limit": EPS**0.5, "because": "a rounding of the peak's power, in a null"
     },
 )  # fmt: skip
 def wide_powers() -> float:
-    return against_the_record((2, 19, 1000), phases="incoherent", **SLANT)
+    return error_against_time_domain((2, 19, 1000), phases="incoherent", **SLANT_SCENE)
 
 
-@FAMILY.case("100,000 beamlets over tens of bins", slow=True, **SPREAD)
+@FAMILY.case("100,000 beamlets over tens of bins", is_slow=True, **TIME_DOMAIN_CASE)
 def widest_footprint() -> float:
-    return against_the_record((100_000,), (2,), phases="coherent", **SLANT)
+    return error_against_time_domain((100_000,), (2,), phases="coherent", **SLANT_SCENE)
 
 
 @FAMILY.case(
     "a line at the last bin of 2^17, its image beside it",
-    allowed=2e-10, limit=place(9e8, 2**17) + 4 * math.pi * 178 * EPS,
-    because="beats to 9e8 Hz and a chirp phase of 178 cycles, rounded", **EXACT,
+    allowed=2e-10, limit=position_rounding(9e8, 2**17) + 4 * math.pi * 178 * EPS,
+    because="beats to 9e8 Hz and a chirp phase of 178 cycles, rounded", **EXACT_REFERENCE,
 )  # fmt: skip
-def last_bin() -> float:
+def line_at_last_bin() -> float:
     worst = 0.0
     for bins in (2**16 - 0.25, 2**16, 2**16 + 0.25, 2**17 + 0.25):
-        v = velocity_for(bins * RATE / 2**17, 2)
-        one = shots(radial_velocity=v, window="hann")
-        worst = max(worst, few_bins(one, 2, 1e-3))
+        radial_velocity = velocity_for(bins * SAMPLE_RATE / 2**17, 2)
+        single_shot = prepare_shot(radial_velocity=radial_velocity, window="hann")
+        worst = max(worst, error_next_to_line(single_shot, 2, 1e-3))
     return worst

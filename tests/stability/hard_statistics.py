@@ -7,10 +7,10 @@ from typing import Any
 
 import mpmath as mp
 import numpy as np
-from cases import EPS, Family
-from table_shots import parameters
+from hard_cases import EPS, Family
+from table_4_1_shots import table_4_1_parameters
 
-from sweep.analysis.scenes.navigation import Tally, merge
+from sweep.analysis.scene_results.navigation_errors import ErrorTally, merge_tallies
 from sweep.model.effects.catalogue import CORE
 from sweep.model.outputs import OUTPUTS
 from sweep.model.realisations import Means
@@ -23,7 +23,7 @@ FAMILY = Family(
     "is a float. Deviations are squared: where they are below 1e-154 their standard error is 0. "
     "Tallies are merged as sums of parts.",
 )
-SETS = {
+SAMPLE_SETS = {
     "one": [0.3],
     "two": [0.25, 0.75],
     "never": [0.0] * 1000,
@@ -35,35 +35,40 @@ SETS = {
 }
 
 
-def summed(values: Sequence[float], pieces: int = 7) -> dict[str, float]:
+def means_in_pieces(values: Sequence[float], pieces: int = 7) -> dict[str, float]:
     """Results of :class:`Means` for draws of every output, added in pieces."""
     means = Means(1)
-    for part in np.array_split(np.asarray(values, float), pieces):
-        outputs = dict.fromkeys(OUTPUTS, part)
-        means.add(np.zeros(part.size, np.int64), outputs)
+    for piece in np.array_split(np.asarray(values, float), pieces):
+        outputs = dict.fromkeys(OUTPUTS, piece)
+        means.add(np.zeros(piece.size, np.int64), outputs)
     return {name: float(value[0]) for name, value in means.results().items()}
 
 
-def exactly(values: Sequence[float]) -> tuple[Fraction, Fraction]:
+def exact_mean_and_variance(values: Sequence[float]) -> tuple[Fraction, Fraction]:
     """Mean and squared standard error of it, in fractions."""
     exact = [Fraction(float(x)) for x in values]
     mean = sum(exact) / len(exact)
-    square = sum((x - mean) ** 2 for x in exact)
-    return mean, square / (len(exact) * max(len(exact) - 1, 1))
+    squared_standard_error = sum((x - mean) ** 2 for x in exact)
+    return mean, squared_standard_error / (len(exact) * max(len(exact) - 1, 1))
 
 
 def moment_errors(values: Sequence[float]) -> tuple[float, float]:
     """Relative error of the mean, over the mean magnitude, and of the standard error."""
-    found, (mean, square) = summed(values), exactly(values)
-    size = float(sum(map(abs, map(Fraction, map(float, values)))) / len(values)) or 1.0
-    of_mean = abs(float(Fraction(found["pd_up"]) - mean)) / size
+    computed, (mean, squared_standard_error) = (
+        means_in_pieces(values),
+        exact_mean_and_variance(values),
+    )
+    mean_magnitude = float(sum(map(abs, map(Fraction, map(float, values)))) / len(values)) or 1.0
+    mean_error = abs(float(Fraction(computed["pd_up"]) - mean)) / mean_magnitude
     with mp.workdps(40):
-        error = mp.sqrt(mp.mpf(square.numerator) / square.denominator)
+        exact_standard_error = mp.sqrt(
+            mp.mpf(squared_standard_error.numerator) / squared_standard_error.denominator
+        )
         if len(values) == 1:
-            return of_mean, 0.0 if math.isnan(found["pd_up_error"]) else math.inf
-        if not error:
-            return of_mean, abs(found["pd_up_error"])
-        return of_mean, float(abs(found["pd_up_error"] / error - 1))
+            return mean_error, 0.0 if math.isnan(computed["pd_up_error"]) else math.inf
+        if not exact_standard_error:
+            return mean_error, abs(computed["pd_up_error"])
+        return mean_error, float(abs(computed["pd_up_error"] / exact_standard_error - 1))
 
 
 @FAMILY.case(
@@ -74,11 +79,11 @@ def moment_errors(values: Sequence[float]) -> tuple[float, float]:
     limit=1000**0.5 * EPS,
     because="a thousand steps, rounded",
 )
-def means() -> float:
-    return max(max(moment_errors(values)) for values in SETS.values())
+def means_of_sample_sets() -> float:
+    return max(max(moment_errors(values)) for values in SAMPLE_SETS.values())
 
 
-def near(kappa: float, number: int = 1000) -> list[float]:
+def nearly_equal_numbers(kappa: float, number: int = 1000) -> list[float]:
     """Numbers about 1 with a deviation of 1 / kappa."""
     return list(1.0 + np.random.default_rng(4).normal(size=number) / kappa)
 
@@ -91,9 +96,9 @@ def near(kappa: float, number: int = 1000) -> list[float]:
     limit=1.0,
     because="the mean, rounded, against the deviation",
 )
-def near_equal() -> float:
+def variances_of_nearly_equal() -> float:
     return max(
-        moment_errors(near(10.0**digits))[1] / ((10.0**digits + 1000) * EPS)
+        moment_errors(nearly_equal_numbers(10.0**digits))[1] / ((10.0**digits + 1000) * EPS)
         for digits in (3, 8, 12, 14)
     )
 
@@ -105,13 +110,13 @@ def near_equal() -> float:
     allowed=0.0,
     limit=0.0,
     because="nothing is rounded",
-    slow=True,
+    is_slow=True,
 )
 def equal_numbers() -> float:
     worst = 0.0
     for value in (1 / 3, 0.1, 1e-300):
-        found = summed(np.full(10**6, value), 3)
-        worst = max(worst, abs(found["pd_up"] / value - 1), found["pd_up_error"] / value)
+        computed = means_in_pieces(np.full(10**6, value), 3)
+        worst = max(worst, abs(computed["pd_up"] / value - 1), computed["pd_up_error"] / value)
     return worst
 
 
@@ -126,11 +131,11 @@ def equal_numbers() -> float:
 def denormal_means() -> float:
     step = 5e-324
     values = step * np.random.default_rng(5).integers(1, 1000, 100)
-    found, (mean, _) = summed(values), exactly(values)
-    return float(abs(Fraction(found["pd_up"]) - mean) / Fraction(step))
+    computed, (mean, _) = means_in_pieces(values), exact_mean_and_variance(values)
+    return float(abs(Fraction(computed["pd_up"]) - mean) / Fraction(step))
 
 
-LOGARITHMS = {
+LOG_SETS = {
     "far below": [-1e5, -1e5 + 1, -2e5],
     "wide": [-3000.0, -0.1, -400.0, -20.0],
     "none": [-math.inf] * 5,
@@ -148,24 +153,24 @@ LOGARITHMS = {
     limit=1000**0.5 * EPS,
     because="a thousand additions, rounded",
 )
-def logarithms() -> float:
+def means_of_logarithms() -> float:
     worst = 0.0
     with mp.workdps(60):
-        for values in LOGARITHMS.values():
-            found = summed(values)["log10_pfa_bin"]
+        for values in LOG_SETS.values():
+            computed = means_in_pieces(values)["log10_pfa_bin"]
             powers = [mp.mpf(10) ** mp.mpf(float(x)) for x in values if x > -math.inf]
             if not powers:
-                worst = max(worst, 0.0 if found == -math.inf else math.inf)
+                worst = max(worst, 0.0 if computed == -math.inf else math.inf)
                 continue
             exact = mp.log10(mp.fsum(powers) / len(values))
-            worst = max(worst, float(abs(found - exact) / max(1, abs(exact))))
+            worst = max(worst, float(abs(computed - exact) / max(1, abs(exact))))
     return worst
 
 
-def counts(method: str, number: int, **changes: Any) -> dict[str, np.ndarray]:
+def simulated_counts(method: str, number: int, **changes: Any) -> dict[str, np.ndarray]:
     """Detections and false alarms of so many draws."""
     return simulate(
-        parameters(fft_size=1024, **changes), CORE, keys=np.array([[7, 11]], np.uint64),
+        table_4_1_parameters(fft_size=1024, **changes), CORE, keys=np.array([[7, 11]], np.uint64),
         batch_sizes=[number], method=method,
     )  # fmt: skip
 
@@ -182,21 +187,21 @@ def all_or_none() -> float:
     wrong = 0
     for method in ("probabilities", "noise"):
         for number in (1, 1000):
-            bright = counts(method, number, power=1e3, range=100.0, tnr=20.0)
-            dark = counts(method, number, reflectance=0.0, tnr=40.0)
+            bright = simulated_counts(method, number, power=1e3, range=100.0, tnr=20.0)
+            dark = simulated_counts(method, number, reflectance=0.0, tnr=40.0)
             wrong += int(number - bright["n_detected_shot"].sum() + dark["n_detected_shot"].sum())
             wrong += int(sum(x["n_false_alarm_both_chirps"].sum() for x in (bright, dark)))
     return float(wrong)
 
 
-def tally_of(errors: np.ndarray) -> Tally:
+def merged_tally(errors: np.ndarray) -> ErrorTally:
     """Tally of errors (n, m), one by one."""
-    return merge([one_error(error) for error in errors])
+    return merge_tallies([tally_of_one_error(error_vector) for error_vector in errors])
 
 
-def one_error(error: np.ndarray) -> Tally:
-    one, nothing = np.array(1), np.zeros(error.size)
-    return Tally(one, one, error, nothing, nothing)
+def tally_of_one_error(error: np.ndarray) -> ErrorTally:
+    count_one, zeros = np.array(1), np.zeros(error.size)
+    return ErrorTally(count_one, count_one, error, zeros, zeros)
 
 
 @FAMILY.case(
@@ -207,17 +212,17 @@ def one_error(error: np.ndarray) -> Tally:
     limit=1.0,
     because="the mean, rounded, against the deviation",
 )
-def tallies() -> float:
+def merged_tallies() -> float:
     worst = 0.0
     for kappa in (1.0, 1e3, 1e6):
         errors = 1.0 + np.random.default_rng(8).normal(size=(500, 2)) / kappa
-        found = tally_of(errors).variance
+        computed_variance = merged_tally(errors).variance
         exact = [[Fraction(float(x)) for x in column] for column in errors.T]
         mean = [sum(column) / 500 for column in exact]
         for i in range(2):
             square = sum((x - mean[i]) ** 2 for x in exact[i]) / 499
-            apart = abs(float(Fraction(float(found[i])) / square - 1))
-            worst = max(worst, apart / ((kappa + 1000) * EPS))
+            relative_difference = abs(float(Fraction(float(computed_variance[i])) / square - 1))
+            worst = max(worst, relative_difference / ((kappa + 1000) * EPS))
     return worst
 
 
@@ -231,14 +236,14 @@ def tallies() -> float:
 )
 def empty_tallies() -> float:
     zero = np.zeros(2)
-    nothing = Tally(np.array(3), np.array(0), zero, zero, zero)
-    alone = one_error(np.array([0.1, -3.0]))
-    both = nothing + alone
-    same: Callable[..., bool] = np.array_equal
+    empty = ErrorTally(np.array(3), np.array(0), zero, zero, zero)
+    single = tally_of_one_error(np.array([0.1, -3.0]))
+    both = empty + single
+    is_equal: Callable[..., bool] = np.array_equal
     return float(
-        (not np.isnan(nothing.bias).all())
-        + (not np.isnan(alone.variance).all())
-        + (not same(both.bias, alone.bias))
+        (not np.isnan(empty.bias).all())
+        + (not np.isnan(single.variance).all())
+        + (not is_equal(both.bias, single.bias))
         + (float(both.availability) != 0.25)
-        + (not same(alone.rmse, np.abs(alone.bias)))
+        + (not is_equal(single.rmse, np.abs(single.bias)))
     )

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from table_shots import ROOT, study
+from table_4_1_shots import ROOT, study_mapping
 
-from sweep.spec import Spec, SpecError
-from sweep.spec.rules import Numeric
+from sweep.spec import GridSpec, SpecError
+from sweep.spec.rules import NumericRule
 from sweep.spec.sections import parameter_rules
 
 MEANINGLESS = {
@@ -72,7 +72,7 @@ RULES = parameter_rules()
 
 def mistake_of(changes):
     with pytest.raises(SpecError) as caught:
-        Spec.from_mapping(study(changes), base=ROOT)
+        GridSpec.from_mapping(study_mapping(changes), base=ROOT)
     (mistake,) = caught.value.mistakes
     return mistake
 
@@ -83,10 +83,10 @@ def test_what_is_meaningless_is_refused_with_field_rule_value_and_remedy(path, n
     value = number if " " in number or not unit else f"{number} {unit}"
     mistake = mistake_of({path: value if unit else float(number)})
     assert mistake.path == path
-    assert f"must be {rule}" in mistake.rule
+    assert f"must be {rule}" in mistake.problem
     assert number in mistake.value
     assert mistake.suggestion.startswith("write e.g. '")
-    assert all(part in str(mistake) for part in (path, mistake.rule, mistake.value))
+    assert all(part in str(mistake) for part in (path, mistake.problem, mistake.value))
 
 
 @pytest.mark.parametrize("meant", TOGETHER)
@@ -94,11 +94,13 @@ def test_what_is_meaningless_together_is_refused_with_field_rule_value_and_remed
     changes, path, rule, value, remedy = TOGETHER[meant]
     mistake = mistake_of(changes)
     assert mistake.path == path
-    assert rule in mistake.rule and value in mistake.rule
+    assert rule in mistake.problem and value in mistake.problem
     assert remedy in mistake.suggestion
 
 
 def test_a_remedy_is_a_value_that_would_be_taken():
     for path, rule in RULES.items():
-        if isinstance(rule, Numeric):
-            assert rule.first_outside(np.array([float(rule.read(rule.example))])) is None, path
+        if isinstance(rule, NumericRule):
+            assert rule.first_out_of_bounds(np.array([float(rule.read(rule.example))])) is None, (
+                path
+            )

@@ -7,14 +7,14 @@ import urllib.request
 from datetime import timedelta
 
 import pytest
-from faulty import Faulty
-from six_blocks import six
-from small import quiet
+from faulty_server import FaultyServer
+from six_block_study import six_block_spec
+from small_studies import run_serially
 
 from sweep.storage import locations
 
 BUCKET = "bucket"
-SOON = {
+SHORT_BACKOFF = {
     "init_backoff": timedelta(milliseconds=5),
     "max_backoff": timedelta(milliseconds=50),
     "base": 2,
@@ -24,7 +24,7 @@ SOON = {
 @pytest.fixture(scope="session")
 def undisturbed(tmp_path_factory):
     """The store of the small study on disk, run as a plain loop."""
-    outcome = quiet(six(), tmp_path_factory.mktemp("undisturbed") / "small.zarr")
+    outcome = run_serially(six_block_spec(), tmp_path_factory.mktemp("undisturbed") / "small.zarr")
     assert outcome.complete
     return outcome.store
 
@@ -57,7 +57,7 @@ def server():
 @pytest.fixture
 def faults(server, monkeypatch):
     """A server in front of it that can fail, which the environment names as the endpoint."""
-    with Faulty(server) as faulty:
+    with FaultyServer(server) as faulty:
         for name in [name for name in os.environ if name.startswith("AWS_")]:
             monkeypatch.delenv(name)
         monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{faulty.port}")
@@ -65,7 +65,9 @@ def faults(server, monkeypatch):
         monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "secret")
         monkeypatch.setenv("AWS_REGION", "us-east-1")
         for name in ("RETRIES", "FIRST_RETRIES"):  # as often as ever, without the long waits
-            monkeypatch.setattr(locations, name, {**getattr(locations, name), "backoff": SOON})
+            monkeypatch.setattr(
+                locations, name, {**getattr(locations, name), "backoff": SHORT_BACKOFF}
+            )
         locations._clients.clear()
         yield faulty
         locations._clients.clear()

@@ -8,17 +8,22 @@ import sys
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from small import quiet, small
-from small_flights import small_scene
+from small_flights import small_scene_spec
+from small_studies import run_serially, small_spec
 
 import sweep
 from sweep.cli import main
-from sweep.report import writing
-from sweep.storage.locations import eyepoints_path, located
-from sweep.storage.sound import ChunkOwners, DamagedChunkError, open_arrays, readable
-from sweep.tasks import studies
-from sweep.tasks.store import block_objects
-from sweep.tasks.verify import pack
+from sweep.report import study_report
+from sweep.storage.locations import eyepoints_path, parse_location
+from sweep.storage.verified_store import (
+    ChunkBlockMap,
+    DamagedChunkError,
+    open_array_group,
+    open_verified_store,
+)
+from sweep.tasks.engine.study_store import chunk_names_of_block
+from sweep.tasks.studies import study_loading
+from sweep.tasks.studies.store_verification import pack_store
 
 
 def flip(path):
@@ -46,20 +51,20 @@ DAMAGES = {
 
 @pytest.fixture(scope="module")
 def grid(tmp_path_factory):
-    return quiet(small(), tmp_path_factory.mktemp("grid") / "grid.zarr").store
+    return run_serially(small_spec(), tmp_path_factory.mktemp("grid") / "grid.zarr").store
 
 
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory):
     store = tmp_path_factory.mktemp("flight") / "flight.zarr"
-    return quiet(small_scene(), store).store
+    return run_serially(small_scene_spec(), store).store
 
 
 @pytest.fixture(scope="module")
 def drawn(tmp_path_factory):
     """A grid with blocks along all axes, and counts of draws by batch."""
-    spec = small(draws={"number": 20}, storage={"block_points": 2})
-    return quiet(spec, tmp_path_factory.mktemp("drawn") / "drawn.zarr").store
+    spec = small_spec(draws={"number": 20}, storage={"block_points": 2})
+    return run_serially(spec, tmp_path_factory.mktemp("drawn") / "drawn.zarr").store
 
 
 @pytest.fixture
@@ -115,7 +120,7 @@ def test_a_chunk_that_is_not_computed_yet_is_none_that_is_missing(tmp_path):
         return study.evaluate(block)
 
     store = tmp_path / "grid.zarr"
-    assert not quiet(small(), store, evaluate=evaluate).complete
+    assert not run_serially(small_spec(), store, evaluate=evaluate).complete
     assert int(sweep.open(store).pd_shot.isnull().sum()) > 0
     (store / "pd_shot/c/0/0/0").unlink()
     with pytest.raises(DamagedChunkError, match="block 0: pd_shot/c/0/0/0 is missing"):
@@ -139,12 +144,14 @@ def test_each_chunk_has_the_block_that_writes_it(request, kind):
     path = request.getfixturevalue("flight" if kind == "eyepoints" else kind)
     if kind == "eyepoints":
         path = next(path.parent.glob("eyepoints/*.zarr"))
-    _, study = studies.read(path)
-    owners = ChunkOwners(located(path))
+    _, study = study_loading.read_study(path)
+    owners = ChunkBlockMap(parse_location(path))
     assert owners.n_blocks == study.n_blocks
     for block in range(study.n_blocks):
-        assert {owners.block(name) for name in block_objects(study, block)} == {block}
-    assert all(owners.block(name) == -1 for name in owners.template)
+        assert {owners.block_of_chunk(name) for name in chunk_names_of_block(study, block)} == {
+            block
+        }
+    assert all(owners.block_of_chunk(name) == -1 for name in owners.template_objects)
 
 
 def test_eyepoints_are_told_with_the_study_that_has_them(flight, tmp_path):
@@ -153,11 +160,11 @@ def test_eyepoints_are_told_with_the_study_that_has_them(flight, tmp_path):
     path = eyepoints_path(place / flight.name, attributes["geometry_id"])
     flip(path / "time/c/0")
     with pytest.raises(DamagedChunkError, match=r"block 0: time/c/0 .*study that uses them"):
-        open_arrays(path)["time"][...]
+        open_array_group(path)["time"][...]
 
 
 def test_a_packed_copy_tells_of_a_chunk_in_a_file_of_several(grid, tmp_path):
-    copy = pack(grid, tmp_path / "packed.zarr", progress=False)
+    copy = pack_store(grid, tmp_path / "packed.zarr", progress=False)
     whole = sweep.open(copy).pd_shot.compute()
     assert np.array_equal(whole, sweep.open(grid).pd_shot)
     (file,) = (path for path in (copy / "pd_shot/c").rglob("*") if path.is_file())
@@ -179,15 +186,19 @@ def test_a_packed_copy_tells_of_a_chunk_in_a_file_of_several(grid, tmp_path):
 
 
 def test_a_store_that_is_opened_goes_to_other_processes(grid):
-    store = pickle.loads(pickle.dumps(readable(located(grid), studies.read(grid)[1].id)))
+    store = pickle.loads(
+        pickle.dumps(
+            open_verified_store(parse_location(grid), study_loading.read_study(grid)[1].id)
+        )
+    )
     assert store.read_only
 
 
 READER = """
 import sys
 import sweep
-from sweep.storage.opening import ReplacedError
-from sweep.storage.sound import DamagedChunkError
+from sweep.storage.store_format import StoreReplacedError
+from sweep.storage.verified_store import DamagedChunkError
 
 dataset = sweep.open(sys.argv[1])
 if len(sys.argv) > 2:
@@ -196,7 +207,7 @@ if len(sys.argv) > 2:
     shutil.copytree(sys.argv[2], sys.argv[1])
 try:
     dataset.pd_shot.compute()
-except (DamagedChunkError, ReplacedError) as error:
+except (DamagedChunkError, StoreReplacedError) as error:
     print(type(error).__name__)
 """
 
@@ -225,7 +236,7 @@ def test_a_report_that_can_not_be_written_is_told_in_words(
     def fail(store, file):
         raise error
 
-    monkeypatch.setattr(writing, "write", fail)
+    monkeypatch.setattr(study_report, "write_report", fail)
     asked = ["report", str(grid), "-o", str(tmp_path / "page.html")]
     done = CliRunner().invoke(main, asked)
     assert done.exit_code == 2 and words in done.output and "Traceback" not in done.output

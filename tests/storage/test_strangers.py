@@ -10,15 +10,15 @@ import shutil
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from small import small
+from small_studies import small_spec
 
 import sweep
 from sweep.cli import main
-from sweep.storage.opening import NotAStoreError, closed
-from sweep.tasks import store
-from sweep.tasks.grid_study import GridStudy
-from sweep.tasks.progress import StoreError
-from sweep.tasks.summary import status
+from sweep.storage.store_format import NotAStoreError, append_line_digest
+from sweep.tasks.engine import study_store
+from sweep.tasks.engine.progress import StoreError
+from sweep.tasks.studies.grid_study import GridStudy
+from sweep.tasks.studies.store_summary import status
 
 
 class Payload:
@@ -34,10 +34,10 @@ class Payload:
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """A store without results, with a text coordinate."""
-    study = small(
+    study = small_spec(
         axes={"instrument.processing.window": ["hann", "hamming"], "target.range": ["9 m", "8 m"]}
     )
-    return store.create(tmp_path_factory.mktemp("made") / "made.zarr", GridStudy(study))
+    return study_store.create_store(tmp_path_factory.mktemp("made") / "made.zarr", GridStudy(study))
 
 
 @pytest.fixture
@@ -241,6 +241,6 @@ def test_resuming_writes_through_no_link_out_of_a_store(theirs, tmp_path, place)
 @pytest.mark.parametrize("body", [b"[1", b'{"block":', b'{"a":' + b"[" * 10**5, b'"x'])
 def test_a_log_whose_lines_have_digests_but_no_records_is_read_as_damaged(theirs, body):
     for name in ("receipts.jsonl", "sessions.jsonl"):
-        (theirs / ".sweep" / name).write_bytes(closed(body))
+        (theirs / ".sweep" / name).write_bytes(append_line_digest(body))
     assert sweep.open(theirs).attrs["blocks_committed"] == 0
     assert status(theirs).blocks_done == 0

@@ -17,18 +17,18 @@ import pytest
 import yaml
 from click.testing import CliRunner
 from numcodecs.zstd import Zstd
-from small import STUDY, quiet, small, small_file, tree
+from small_studies import STUDY_MAPPING, file_digests, run_serially, small_mapping, small_spec
 
 import sweep
 from sweep.cli import main
-from sweep.documents import parse_json
-from sweep.plain_files import UnfitFileError, open_plain, read_below
-from sweep.storage.chunks import ArrayFiles, declared_bytes
-from sweep.storage.locations import located
-from sweep.storage.opening import NotAStoreError, closed, sealed
-from sweep.tasks import journal
+from sweep.regular_files import RefusedFileError, open_regular, read_below
+from sweep.safe_json import parse_json
+from sweep.storage.locations import parse_location
+from sweep.storage.size_checks import ArrayFileLayout, zstd_content_bytes
+from sweep.storage.store_format import NotAStoreError, append_line_digest, encode_record
 from sweep.tasks.driver import extend, resume
-from sweep.tasks.verify import pack, verify
+from sweep.tasks.engine import journal
+from sweep.tasks.studies.store_verification import pack_store, verify
 
 CHUNK, COORDINATE = "pd_up/c/0/0/0", "range/c/0"
 
@@ -51,7 +51,7 @@ def patience():
 def made(tmp_path_factory):
     """A complete store of two blocks, not to be changed."""
     path = tmp_path_factory.mktemp("made") / "made.zarr"
-    outcome = quiet(small(storage={"block_points": 36}), path)
+    outcome = run_serially(small_spec(storage={"block_points": 36}), path)
     assert outcome.complete and outcome.blocks == 2
     return path
 
@@ -126,7 +126,7 @@ def test_verify_tells_what_stands_in_a_files_place(theirs, spoil, name):
 def test_the_readers_of_a_chunk_raise_at_once_and_name_it(theirs, spoil):
     spoil(theirs / CHUNK)
     dataset = sweep.open(theirs)
-    with pytest.raises(UnfitFileError, match=f"{CHUNK} {KINDS[spoil]}.*`sweep verify {theirs}`"):
+    with pytest.raises(RefusedFileError, match=f"{CHUNK} {KINDS[spoil]}.*`sweep verify {theirs}`"):
         dataset.pd_up.compute()
     result = CliRunner().invoke(main, ["compare", str(theirs), str(theirs)], catch_exceptions=False)
     assert result.exit_code == 2 and f"{CHUNK} {KINDS[spoil]}" in result.output
@@ -152,7 +152,7 @@ def test_a_block_with_something_else_for_a_chunk_is_computed_again(theirs, made,
     if spoil is sparse:
         verify(theirs, progress=False)  # there is a file: only a look into it tells
     assert resume(theirs, progress=False, scheduler="none").blocks_computed == 1
-    assert tree(theirs) == tree(made)
+    assert file_digests(theirs) == file_digests(made)
     assert all(file.read_bytes() == content for file, content in before.items())
 
 
@@ -161,7 +161,7 @@ def test_a_block_with_something_else_for_a_chunk_is_computed_again(theirs, made,
 def test_what_a_store_was_made_of_is_put_back_over_something_else(theirs, made, spoil, name):
     spoil(theirs / name)
     verify(theirs, repair=True, progress=False)
-    assert tree(theirs) == tree(made)
+    assert file_digests(theirs) == file_digests(made)
 
 
 @pytest.mark.parametrize("folder", ["pd_up", "pd_up/c", "pd_up/c/0", "range/c"])
@@ -171,7 +171,7 @@ def test_a_folder_behind_a_link_is_no_part_of_a_store(theirs, tmp_path, folder):
     reports = verify(theirs, progress=False)
     named = {damage.object for report in reports for damage in report.damages}
     assert {f"{folder.partition('/')[0]}/c/0/0/0", COORDINATE} & named
-    with pytest.raises((UnfitFileError, NotAStoreError)):
+    with pytest.raises((RefusedFileError, NotAStoreError)):
         sweep.open(theirs).pd_up.compute()
 
 
@@ -232,19 +232,19 @@ BOMBS = {
 
 
 def test_frames_declare_what_zstd_says():
-    assert declared_bytes(frame(None)) is None and bytes(Zstd().decode(frame(None))) == bytes(
+    assert zstd_content_bytes(frame(None)) is None and bytes(Zstd().decode(frame(None))) == bytes(
         1 << 19
     )
-    assert declared_bytes(frame(1 << 40)) == 1 << 40
+    assert zstd_content_bytes(frame(1 << 40)) == 1 << 40
     for size in (0, 1, 255, 256, 257, 65535, 65536, 65791, 65792, 1 << 20):
         for content in (bytes(size), np.random.default_rng(1).bytes(size)):
-            assert declared_bytes(bytes(Zstd().encode(content))) == size
+            assert zstd_content_bytes(bytes(Zstd().encode(content))) == size
 
 
 @pytest.mark.parametrize(("bomb", "why"), BOMBS.values(), ids=BOMBS)
 def test_a_chunk_that_would_not_decode_to_its_size_is_not_decoded(theirs, bomb, why):
     (theirs / CHUNK).write_bytes(bomb)
-    with pytest.raises(UnfitFileError, match=f"{CHUNK} has a chunk that {why}"):
+    with pytest.raises(RefusedFileError, match=f"{CHUNK} has a chunk that {why}"):
         sweep.open(theirs).pd_up.compute()
     result = CliRunner().invoke(main, ["compare", str(theirs), str(theirs)], catch_exceptions=False)
     assert result.exit_code == 2 and why in result.output
@@ -254,28 +254,28 @@ def test_a_chunk_that_would_not_decode_to_its_size_is_not_decoded(theirs, bomb, 
 @pytest.mark.parametrize(("bomb", "why"), BOMBS.values(), ids=BOMBS)
 @pytest.mark.parametrize("reading", ["a shard", "a chunk of it"])
 def test_a_shard_with_such_a_chunk_is_not_decoded(made, tmp_path, bomb, why, reading):
-    copy = pack(made, tmp_path / "packed.zarr", progress=False)
+    copy = pack_store(made, tmp_path / "packed.zarr", progress=False)
     (shard,) = (file for file in (copy / "pd_up" / "c").rglob("*") if file.is_file())
     content = shard.read_bytes()
     index = np.frombuffer(content[-36:-4], "<u8").reshape(2, 2).copy()
     index[1] = len(content) - 36, len(bomb)
-    room = ArrayFiles(36, 8, 2).file_bytes_max - len(content)
+    room = ArrayFileLayout(36, 8, 2).file_bytes_max - len(content)
     assert room > len(bomb) or len(bomb) < 400
     shard.write_bytes(content[:-36] + bomb + packed(index.tobytes()))
     dataset = sweep.open(copy)
     part = dataset.pd_up if reading == "a shard" else dataset.pd_up[:, 6:]
-    with pytest.raises(UnfitFileError, match=f"has a chunk that {why}"):
+    with pytest.raises(RefusedFileError, match=f"has a chunk that {why}"):
         part.compute()
 
 
 def test_words_of_an_axis_are_counted_before_room_is_made(tmp_path):
     path = tmp_path / "text.zarr"
     axes = {"instrument.processing.window": ["hann", "hamming"]}
-    assert quiet(small(axes=axes), path).complete
+    assert run_serially(small_spec(axes=axes), path).complete
     text = (2**31).to_bytes(4, "little") + b"\4\0\0\0hann"
     (path / "window" / "c" / "0").write_bytes(packed(bytes(Zstd().encode(text))))
     (path / ".sweep" / "template.jsonl").unlink()  # has a digest of it, which they can forge
-    with pytest.raises(UnfitFileError, match="another number of words"):
+    with pytest.raises(RefusedFileError, match="another number of words"):
         sweep.open(path)
 
 
@@ -283,17 +283,17 @@ def test_a_dataset_is_checked_on_other_processes_too(theirs):
     dataset = pickle.loads(pickle.dumps(sweep.open(theirs)))
     assert dataset.pd_up.notnull().all()
     (theirs / CHUNK).write_bytes(BOMBS["a declared TB"][0])
-    with pytest.raises(UnfitFileError):
+    with pytest.raises(RefusedFileError):
         dataset.pd_up.compute()
 
 
 def test_objects_are_looked_at_as_files_are(made):
-    store = located(f"memory://bucket/{time.time_ns()}/small.zarr")
-    assert quiet(small(storage={"block_points": 36}), store).complete
+    store = parse_location(f"memory://bucket/{time.time_ns()}/small.zarr")
+    assert run_serially(small_spec(storage={"block_points": 36}), store).complete
     assert sweep.open(store).pd_up.notnull().all()
     for content, why in (*BOMBS.values(), (bytes(1 << 20), "has 1,048,576 bytes")):
         (store / CHUNK).write_bytes(content)
-        with pytest.raises(UnfitFileError, match=why):
+        with pytest.raises(RefusedFileError, match=why):
             sweep.open(store).pd_up.compute()
     (store / "zarr.json").write_bytes(bytes(65 << 20))
     with pytest.raises(NotAStoreError, match="damaged"):
@@ -313,11 +313,11 @@ def test_deep_nesting_ends_in_words(theirs, where, depth):
     document = json.loads((theirs / "zarr.json").read_text())
     if where == "log":
         (theirs / ".sweep" / "sessions.jsonl").write_bytes(
-            closed(b'{"event":"begun","time":' + nested(depth).encode())
+            append_line_digest(b'{"event":"begun","time":' + nested(depth).encode())
         )
     elif where == "listed":
         body = json.dumps({"objects": 0})[:-1].encode() + b',"attributes":' + nested(depth).encode()
-        (theirs / ".sweep" / "template.jsonl").write_bytes(closed(body))
+        (theirs / ".sweep" / "template.jsonl").write_bytes(append_line_digest(body))
         (theirs / "zarr.json").write_text("")
     else:
         if where == "attributes":
@@ -346,14 +346,14 @@ def test_half_a_surrogate_pair_in_a_title_is_refused(theirs, tmp_path):
 
 def test_half_a_surrogate_pair_in_a_spec_is_refused_with_its_line(tmp_path):
     file = tmp_path / "spec.yaml"
-    file.write_text(yaml.safe_dump(STUDY).replace("title: Small", 'title: "Small \\ud800"'))
+    file.write_text(yaml.safe_dump(STUDY_MAPPING).replace("title: Small", 'title: "Small \\ud800"'))
     result = CliRunner().invoke(main, ["plan", str(file)], catch_exceptions=False)
     line = file.read_text().splitlines().index('title: "Small \\ud800"') + 1
     assert (
         result.exit_code == 2 and f"spec.yaml:{line}: is no valid YAML: an escape" in result.output
     )
     with pytest.raises(sweep.spec.SpecError, match="title: "):
-        small(title="Small \ud800")
+        small_spec(title="Small \ud800")
 
 
 # What is saved of a block
@@ -376,10 +376,10 @@ def test_saved_parts_of_others_make_no_room_for_what_they_declare(tmp_path):
         content = archive.getvalue()
         facts = {
             "study": "one", "block": 7, "points": 1.0, "seconds": 1.0,
-            "digest": journal._digest(content),
+            "digest": journal._content_digest(content),
         }  # fmt: skip
-        (tmp_path / ".sweep" / "begun-7").write_bytes(sealed(facts) + content)
-        assert journal.read_begun(tmp_path, "one", 7) == journal.Begun()
+        (tmp_path / ".sweep" / "begun-7").write_bytes(encode_record(facts) + content)
+        assert journal.read_checkpoint(tmp_path, "one", 7) == journal.Checkpoint()
 
 
 # Specs, and files that they name
@@ -389,14 +389,14 @@ def test_saved_parts_of_others_make_no_room_for_what_they_declare(tmp_path):
 def test_a_pipe_for_a_spec_or_what_it_names_is_refused(tmp_path, monkeypatch, how):
     monkeypatch.chdir(tmp_path)
     os.mkfifo("pipe.yaml")
-    study = small_file()
+    study = small_mapping()
     if how == "instrument":
         study["instrument"] = "./pipe.yaml"
     elif how == "instrument file":
         study["instrument"] = {"file": "pipe.yaml"}
     elif how == "table":
-        chirp = {**STUDY["instrument"]["chirp"], "error_table": "pipe.yaml"}
-        study["instrument"] = {**STUDY["instrument"], "chirp": chirp}
+        chirp = {**STUDY_MAPPING["instrument"]["chirp"], "error_table": "pipe.yaml"}
+        study["instrument"] = {**STUDY_MAPPING["instrument"], "chirp": chirp}
     Path("study.yaml").write_text(yaml.safe_dump(study))
     command = {
         "spec": ["plan", "pipe.yaml"],
@@ -411,7 +411,7 @@ def test_a_pipe_for_a_spec_or_what_it_names_is_refused(tmp_path, monkeypatch, ho
 def test_a_loop_of_links_ends_in_words(made, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("loop.zarr").symlink_to("loop.zarr")
-    Path("study.yaml").write_text(yaml.safe_dump(small_file()))
+    Path("study.yaml").write_text(yaml.safe_dump(small_mapping()))
     for command in (
         "status loop.zarr", "verify loop.zarr", "resume loop.zarr", "report loop.zarr",
         "compare loop.zarr loop.zarr", "run study.yaml --store loop.zarr --scheduler none",
@@ -429,14 +429,14 @@ def test_plain_files_are_opened_as_they_are(tmp_path):
     assert read_below(tmp_path, "file", 10, slice(2, 4)) == b"23"
     assert read_below(tmp_path, "file", 10, slice(8, 99)) == b"89"
     for name in ("../file", "a/../file", "./file", "a//file"):
-        with pytest.raises(UnfitFileError, match="leads out"):
+        with pytest.raises(RefusedFileError, match="leads out"):
             read_below(tmp_path, name, 10)
-    with pytest.raises(UnfitFileError, match="no more than 9"):
+    with pytest.raises(RefusedFileError, match="no more than 9"):
         read_below(tmp_path, "file", 9)
     with pytest.raises(IsADirectoryError):
-        open_plain(tmp_path)
-    with pytest.raises(UnfitFileError) as refusal:
-        open_plain("/dev/null")
+        open_regular(tmp_path)
+    with pytest.raises(RefusedFileError) as refusal:
+        open_regular("/dev/null")
     assert refusal.value.errno == errno.EINVAL and "is a device" in str(refusal.value)
 
 
@@ -444,8 +444,10 @@ def test_a_folder_whose_name_is_no_text_holds_stores_as_any(tmp_path, monkeypatc
     folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xff"))
     folder.mkdir()
     store = folder / "a.zarr"
-    assert quiet(small(storage={"block_points": 36}), store).complete
-    axes = {**STUDY["axes"], "instrument.laser.power": ["1 W", "2 W", "3 W"]}
-    grown = extend(store, small(axes=axes), to=folder / "b.zarr", progress=False, scheduler="none")
+    assert run_serially(small_spec(storage={"block_points": 36}), store).complete
+    axes = {**STUDY_MAPPING["axes"], "instrument.laser.power": ["1 W", "2 W", "3 W"]}
+    grown = extend(
+        store, small_spec(axes=axes), to=folder / "b.zarr", progress=False, scheduler="none"
+    )
     assert grown.complete and resume(folder / "b.zarr", progress=False, scheduler="none").complete
     assert verify(folder / "b.zarr", progress=False)[0].sound

@@ -2,15 +2,15 @@
 
 from pathlib import Path
 
-from small import STUDY
+from small_studies import STUDY_MAPPING
 
 from sweep.spec import SceneSpec
-from sweep.spec.axes import without_fields_on_axes
+from sweep.spec.axes import remove_fields_on_axes
 
-SCENE = {
+SCENE_MAPPING = {
     "title": "Small scene",
     "question": "Does it fly?",
-    "instrument": STUDY["instrument"]
+    "instrument": STUDY_MAPPING["instrument"]
     | {"telescope": {"aperture": "50 mm", "coupling": "aperture"}},
     "scene": {
         "origin": "ground",
@@ -46,6 +46,8 @@ SCENE = {
 }
 
 
-def small_scene(**changes) -> SceneSpec:
+def small_scene_spec(**changes) -> SceneSpec:
     """The small study of a scene with some of its sections replaced."""
-    return SceneSpec.from_mapping(without_fields_on_axes({**SCENE, **changes}), base=Path("."))
+    return SceneSpec.from_mapping(
+        remove_fields_on_axes({**SCENE_MAPPING, **changes}), base=Path(".")
+    )

@@ -13,14 +13,28 @@ from concurrent.futures import CancelledError, ThreadPoolExecutor
 import dask
 import pytest
 from distributed import Client
-from small import copied, receipts, small, threads, tree
+from small_studies import (
+    copy_store,
+    file_digests,
+    receipt_blocks,
+    small_spec,
+    thread_cluster_client,
+)
 
-from sweep.storage.opening import NotAStoreError
-from sweep.tasks import cluster, memory, progress, scheduler, session, store, worker
+from sweep.storage.store_format import NotAStoreError
 from sweep.tasks.driver import resume, run
-from sweep.tasks.grid_study import GridStudy
-from sweep.tasks.progress import ClusterError, Progress, StoreError
-from sweep.tasks.worker import worker_address
+from sweep.tasks.engine import (
+    cluster_connection,
+    dispatcher,
+    progress,
+    session,
+    study_store,
+    worker,
+)
+from sweep.tasks.engine.progress import ClusterError, Progress, StoreError
+from sweep.tasks.engine.worker import worker_address
+from sweep.tasks.studies import memory_limits
+from sweep.tasks.studies.grid_study import GridStudy
 
 
 class Told(Progress):
@@ -45,10 +59,10 @@ class Told(Progress):
 @pytest.fixture
 def without_workers(monkeypatch):
     """A cluster that has none, looked at often."""
-    monkeypatch.setattr(session, "ABSENT", 0.2)
-    monkeypatch.setattr(scheduler, "SLOTS_AGE", 0.1)
-    monkeypatch.setattr(scheduler, "TICK", 0.1)
-    with threads(0) as client:
+    monkeypatch.setattr(session, "NO_WORKER_WARNING_AFTER", 0.2)
+    monkeypatch.setattr(dispatcher, "SLOT_COUNT_AGE_MAX", 0.1)
+    monkeypatch.setattr(dispatcher, "IDLE_POLL_SECONDS", 0.1)
+    with thread_cluster_client(0) as client:
         yield client
 
 
@@ -63,9 +77,13 @@ def test_that_workers_do_not_come_or_went_away_is_said_and_the_run_goes_on_with_
 
     told = Told(lambda: cluster.scale(1), lambda: cluster.scale(0))
     outcome = run(
-        small(), store=tmp_path / "s.zarr", client=without_workers, progress=told, evaluate=slowly
+        small_spec(),
+        store=tmp_path / "s.zarr",
+        client=without_workers,
+        progress=told,
+        evaluate=slowly,
     )
-    assert outcome.complete and tree(outcome.store) == tree(undisturbed)
+    assert outcome.complete and file_digests(outcome.store) == file_digests(undisturbed)
     assert told.lines[0].startswith("no worker yet (")
     assert "Ctrl-C stops, nothing is lost" in told.lines[0]
     assert any(line.startswith("no worker is left (") for line in told.lines)
@@ -75,7 +93,7 @@ def test_that_workers_do_not_come_or_went_away_is_said_and_the_run_goes_on_with_
 
 def test_one_ctrl_c_stops_a_run_that_no_worker_will_end(tmp_path, without_workers):
     told = Told(lambda: os.kill(os.getpid(), signal.SIGINT) if len(told.lines) == 1 else None)
-    outcome = run(small(), store=tmp_path / "s.zarr", client=without_workers, progress=told)
+    outcome = run(small_spec(), store=tmp_path / "s.zarr", client=without_workers, progress=told)
     assert outcome.stopped == "interrupted" and outcome.blocks_done == 0
     assert told.lines[0].startswith("no worker yet (")
 
@@ -83,10 +101,10 @@ def test_one_ctrl_c_stops_a_run_that_no_worker_will_end(tmp_path, without_worker
 def test_word_of_absent_workers_comes_ever_less_often(monkeypatch):
     clock = [0.0]
     monkeypatch.setattr(session.time, "monotonic", lambda: clock[0])
-    absence, said = session.Absence(), []
+    absence, said = session.NoWorkerMonitor(), []
     for clock[0] in range(1000):
         workers = 1 if 300 <= clock[0] < 310 else 0
-        if absence.told(workers):
+        if absence.message(workers):
             said.append(clock[0])
     assert said == [20, 40, 80, 160, 329, 349, 389, 469, 629, 949]
 
@@ -94,21 +112,21 @@ def test_word_of_absent_workers_comes_ever_less_often(monkeypatch):
 def test_a_worker_that_went_before_it_was_counted_had_been_there_if_it_answered(monkeypatch):
     clock = [0.0]
     monkeypatch.setattr(session.time, "monotonic", lambda: clock[0])
-    absence = session.Absence()
-    assert absence.told(0) == absence.told(0, worked=True) == ""
-    clock[0] = session.ABSENT + 1
-    assert absence.told(0).startswith("no worker is left (")
+    absence = session.NoWorkerMonitor()
+    assert absence.message(0) == absence.message(0, has_receipts=True) == ""
+    clock[0] = session.NO_WORKER_WARNING_AFTER + 1
+    assert absence.message(0).startswith("no worker is left (")
 
 
 @pytest.fixture
 def two_workers(monkeypatch):
     """A client of a cluster with two workers, whose silence is soon noticed."""
-    monkeypatch.setattr(scheduler, "SLOTS_AGE", 0.1)
-    monkeypatch.setattr(scheduler, "TICK", 0.1)
-    monkeypatch.setattr(scheduler, "LEASE", 1.0)
+    monkeypatch.setattr(dispatcher, "SLOT_COUNT_AGE_MAX", 0.1)
+    monkeypatch.setattr(dispatcher, "IDLE_POLL_SECONDS", 0.1)
+    monkeypatch.setattr(dispatcher, "LEASE_SECONDS", 1.0)
     with (
         dask.config.set({"distributed.comm.timeouts.connect": "1s"}),  # of a scheduler that is gone
-        threads(2) as client,
+        thread_cluster_client(2) as client,
     ):
         yield client
 
@@ -137,30 +155,30 @@ def test_blocks_of_a_silent_worker_are_computed_by_others_and_committed_once(
         told = Told(lambda: None, lambda: FROZEN.wait(60) and os.kill(os.getpid(), signal.SIGINT))
     try:
         outcome = run(
-            small(), store=tmp_path / "s.zarr", client=two_workers, progress=told,
+            small_spec(), store=tmp_path / "s.zarr", client=two_workers, progress=told,
             evaluate=silent_from_block_3,
         )  # fmt: skip
     finally:
         THAWED.set()
     assert any(line.startswith(f"worker {SILENT[0]} is silent (") for line in told.lines)
-    assert len(receipts(outcome.store)) == len(set(receipts(outcome.store)))
-    assert 3 in receipts(outcome.store)  # it ran as the run was interrupted
+    assert len(receipt_blocks(outcome.store)) == len(set(receipt_blocks(outcome.store)))
+    assert 3 in receipt_blocks(outcome.store)  # it ran as the run was interrupted
     if interrupted:
         assert outcome.stopped == "interrupted"
         assert resume(outcome.store, scheduler="none", progress=False).complete
     else:
         assert outcome.complete and outcome.blocks_computed == 12
-    assert tree(outcome.store) == tree(undisturbed)
+    assert file_digests(outcome.store) == file_digests(undisturbed)
 
 
 @pytest.mark.parametrize("lost", ["client", "cluster"])
 def test_a_client_closed_before_is_told_in_words_where_blocks_are_left(undisturbed, tmp_path, lost):
-    with threads(1) as client:
+    with thread_cluster_client(1) as client:
         (client if lost == "client" else client.cluster).close()
-        outcome = run(small(), store=tmp_path / "s.zarr", client=client, progress=False)
+        outcome = run(small_spec(), store=tmp_path / "s.zarr", client=client, progress=False)
         assert outcome.stopped == "the scheduler is gone (the client is closed)"
         assert outcome.blocks_done == 0
-        whole = resume(copied(undisturbed, tmp_path), client=client, progress=False)
+        whole = resume(copy_store(undisturbed, tmp_path), client=client, progress=False)
     assert whole.complete and not whole.blocks_computed
 
 
@@ -180,7 +198,7 @@ class Leaving:
     "error", [OSError("gone"), TimeoutError(), RuntimeError("IOLoop is closed"), CancelledError()]
 )
 def test_nothing_is_known_of_the_memory_of_workers_that_go(error):
-    assert memory.worker_memory(Leaving(error), None).limit == float("inf")
+    assert memory_limits.worker_memory(Leaving(error), None).bytes_max == float("inf")
 
 
 def test_a_scheduler_that_goes_away_ends_the_run_in_words(undisturbed, tmp_path, two_workers):
@@ -191,10 +209,10 @@ def test_a_scheduler_that_goes_away_ends_the_run_in_words(undisturbed, tmp_path,
     cluster = two_workers.cluster
     told = Told(lambda: None, lambda: cluster.sync(cluster.scheduler.close))
     path = tmp_path / "s.zarr"
-    outcome = run(small(), store=path, client=two_workers, progress=told, evaluate=slowly)
+    outcome = run(small_spec(), store=path, client=two_workers, progress=told, evaluate=slowly)
     assert outcome.stopped.startswith("the scheduler is gone") and outcome.blocks_done < 12
     assert resume(path, scheduler="none", progress=False).complete
-    assert tree(path) == tree(undisturbed)
+    assert file_digests(path) == file_digests(undisturbed)
 
 
 def versions_differ(path, opened):
@@ -210,7 +228,7 @@ def disk_is_read_only(path, opened):
 
 
 def another_store(path, opened):
-    return store.Arrays(f"{path}-copy", opened.study)
+    return study_store.BlockWriter(f"{path}-copy", opened.study)
 
 
 UNFIT = [
@@ -231,25 +249,27 @@ UNFIT = [
 def test_an_unfit_worker_is_left_out_by_name_and_host_and_the_run_ends_where_none_is_left(
     undisturbed, tmp_path, two_workers, monkeypatch, fault, said, all_unfit
 ):
-    monkeypatch.setattr(scheduler, "LATENCY", 0.5)
-    path = copied(undisturbed, tmp_path)
+    monkeypatch.setattr(dispatcher, "FILE_VISIBILITY_DELAY_MAX", 0.5)
+    path = copy_store(undisturbed, tmp_path)
     (path / ".sweep" / "receipts.jsonl").unlink()
-    held = GridStudy(small())
+    held = GridStudy(small_spec())
     for block in range(12):
-        for name in store.block_objects(held, block):  # of the right size, and of another study
+        for name in study_store.chunk_names_of_block(
+            held, block
+        ):  # of the right size, and of another study
             (path / name).write_bytes(bytes((path / name).stat().st_size))
     shutil.copytree(undisturbed, f"{path}-copy")
     unfit = sorted(two_workers.nthreads())[: 1 + all_unfit]
 
     def study(path, study_id):
-        opened = worker._open(path, study_id)
+        opened = worker._open_block_writer(path, study_id)
         return fault(path, opened) if worker_address() in unfit else opened
 
     def evaluate(study, block):
         time.sleep(0.02)  # so that both get some
         return study.evaluate(block)
 
-    monkeypatch.setattr(worker, "study", study)
+    monkeypatch.setattr(worker, "block_writer_of_store", study)
     told, outcome = Told(lambda: None), None
     options = {"client": two_workers, "progress": told, "evaluate": evaluate}
     try:
@@ -265,13 +285,13 @@ def test_an_unfit_worker_is_left_out_by_name_and_host_and_the_run_ends_where_non
         assert outcome is None or (not outcome.blocks_done and said in outcome.stopped)
     else:
         assert outcome.complete and not outcome.failures
-        assert tree(path) == tree(undisturbed)
+        assert file_digests(path) == file_digests(undisturbed)
 
 
 def test_an_asynchronous_client_is_refused_in_words(tmp_path):
     async def ask():
         async with Client(processes=False, asynchronous=True, dashboard_address=None) as client:
-            run(small(), store=tmp_path / "s.zarr", client=client, progress=False)
+            run(small_spec(), store=tmp_path / "s.zarr", client=client, progress=False)
 
     # In a thread of its own: a browser that other tests drive leaves a loop running in this one.
     with ThreadPoolExecutor(1) as pool:
@@ -284,12 +304,12 @@ def test_an_asynchronous_client_is_refused_in_words(tmp_path):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_is_heard_while_kernels_compile(tmp_path, monkeypatch, number):
     compiled = threading.Event()
-    monkeypatch.setattr(progress, "LATE", 0.1)
-    monkeypatch.setattr(GridStudy, "compile", lambda self: compiled.wait(60))
+    monkeypatch.setattr(progress, "ACTIVITY_SILENT_SECONDS", 0.1)
+    monkeypatch.setattr(GridStudy, "compile_kernels", lambda self: compiled.wait(60))
     told = Told(lambda: os.kill(os.getpid(), number) if len(told.lines) == 1 else None)
     begun = time.monotonic()
     try:
-        outcome = run(small(), store=tmp_path / "s.zarr", scheduler="none", progress=told)
+        outcome = run(small_spec(), store=tmp_path / "s.zarr", scheduler="none", progress=told)
     finally:
         compiled.set()
     assert told.lines[0].startswith("loading the model") and time.monotonic() - begun < 50
@@ -297,10 +317,10 @@ def test_a_signal_is_heard_while_kernels_compile(tmp_path, monkeypatch, number):
 
 
 def test_an_address_at_which_no_scheduler_answers_is_told_in_time(tmp_path, monkeypatch):
-    monkeypatch.setattr(cluster, "CONNECT_TIMEOUT", 1.0)
+    monkeypatch.setattr(cluster_connection, "CONNECT_TIMEOUT", 1.0)
     begun = time.monotonic()
     with pytest.raises(ClusterError, match=r"answers at tcp://127\.0\.0\.1:1: Timed out trying"):
-        run(small(), store=tmp_path / "s.zarr", scheduler="tcp://127.0.0.1:1", progress=False)
+        run(small_spec(), store=tmp_path / "s.zarr", scheduler="tcp://127.0.0.1:1", progress=False)
     assert time.monotonic() - begun < 20 and not (tmp_path / "s.zarr").exists()
 
 
@@ -315,7 +335,7 @@ def test_what_is_no_scheduler_is_told_as_that(tmp_path):
         threading.Thread(target=answer, args=(server,), daemon=True).start()
         address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
         with pytest.raises(ClusterError, match=r"what answers at .* is no Dask scheduler"):
-            run(small(), store=tmp_path / "s.zarr", scheduler=address, progress=False)
+            run(small_spec(), store=tmp_path / "s.zarr", scheduler=address, progress=False)
     assert not (tmp_path / "s.zarr").exists()
 
 
@@ -323,8 +343,8 @@ def test_an_only_worker_that_does_not_see_the_folder_is_named(tmp_path, monkeypa
     def unseen(path, study_id):
         raise NotAStoreError(f"there is no store at {path}")
 
-    monkeypatch.setattr(worker, "study", unseen)
+    monkeypatch.setattr(worker, "block_writer_of_store", unseen)
     with Client(processes=False, n_workers=1, dashboard_address=None) as client:
         words = r"no worker is left: inproc://.* on .*: there is no store at .*same path"
         with pytest.raises(StoreError, match=words):
-            run(small(), store=tmp_path / "s.zarr", client=client, progress=False)
+            run(small_spec(), store=tmp_path / "s.zarr", client=client, progress=False)

@@ -4,13 +4,13 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from small import STUDY, small
+from small_studies import STUDY_MAPPING, small_spec
 
 from sweep.model import footprint, line_shape
 from sweep.model.effects import atmosphere, scintillation
 from sweep.model.effects.catalogue import EFFECTS, NAMES, names_of
 from sweep.model.shot import nodes, prepare
-from sweep.tasks.grid_study import GridStudy
+from sweep.tasks.studies.grid_study import GridStudy
 
 AIR = {"extinction", "backscatter", "scintillation"}
 MOON = {"instrument.laser.power": ["1 W", "3 W"], "target.range": {"linear": ["1 km", "5 km"],
@@ -53,29 +53,32 @@ def evaluated(spec):
 
 
 def test_over_the_moon_there_is_no_air(calls):
-    called = evaluated(small(axes=MOON))
+    called = evaluated(small_spec(axes=MOON))
     assert "doppler" in called and not AIR & called
     assert calls["doppler"] > 0 and not any(calls[name] for name in AIR)
     assert calls["optical_depth"] == calls["rytov_variance"] == 0
 
 
 def test_over_mars_there_is(calls):
-    called = evaluated(small(axes=MOON, atmosphere={"profile": "mars_storm"}))
+    called = evaluated(small_spec(axes=MOON, atmosphere={"profile": "mars_storm"}))
     assert "extinction" in called and "scintillation" not in called
     assert calls["extinction"] > 0 and calls["optical_depth"] > 0 and calls["rytov_variance"] == 0
 
 
 def test_a_hovering_lidar_sees_no_doppler_shift(calls):
     still = {"range": "2 km", "grazing_angle": "60 deg", "reflectance": 0.02}
-    called = evaluated(small(axes=MOON, target=still, effects={"overlap": "off"}))
+    called = evaluated(small_spec(axes=MOON, target=still, effects={"overlap": "off"}))
     assert not {"doppler", "doppler_spread", "range_walk", "acceleration"} & called
     assert calls["doppler"] == calls["range_walk"] == calls["find_modes"] == 0
 
 
 def test_straight_down_from_near_a_footprint_is_one_line_and_not_109(calls):
     near = {"range": "20 m", "grazing_angle": "90 deg", "reflectance": 0.02}
-    spec = small(axes={"target.range": {"linear": ["15 m", "25 m"], "number": 40}}, target=near,
-                 footprint={"beamlets": 109, "speckle": "none"})  # fmt: skip
+    spec = small_spec(
+        axes={"target.range": {"linear": ["15 m", "25 m"], "number": 40}},
+        target=near,
+        footprint={"beamlets": 109, "speckle": "none"},
+    )
     called = evaluated(spec)
     assert "footprint" not in called and calls["plane_footprint"] == 0
     ((_, one),) = prepare(spec.parameters(), called)
@@ -92,8 +95,15 @@ def test_nodes_of_a_chain_are_its_effects_and_no_more():
 
 
 def test_what_spreads_beamlets_does_nothing_where_there_are_none():
-    spec = small(axes={}, target={"range": "2 km", "grazing_angle": "60 deg", "reflectance": 0.1,
-                                  "transverse_velocity": "100 m/s"})  # fmt: skip
+    spec = small_spec(
+        axes={},
+        target={
+            "range": "2 km",
+            "grazing_angle": "60 deg",
+            "reflectance": 0.1,
+            "transverse_velocity": "100 m/s",
+        },
+    )
     ((_, alone),) = prepare(spec.parameters(), {"doppler_spread", "several_returns"})
     ((_, both),) = prepare(spec.parameters(), {"footprint", "doppler_spread"})
     assert alone.doppler.shape == (1, 1) and not alone.doppler.any()
@@ -101,7 +111,7 @@ def test_what_spreads_beamlets_does_nothing_where_there_are_none():
 
 
 def test_bare_shots_hold_nothing_of_any_effect():
-    spec = small(axes={})
+    spec = small_spec(axes={})
     ((_, bare),) = prepare(spec.parameters(), ())
     assert bare.offset.shape == (1, 1) and bare.phase.size == 0 and bare.beta == 0.0
     assert bare.phase_errors == () and bare.gaussian_width is None
@@ -112,23 +122,23 @@ def test_bare_shots_hold_nothing_of_any_effect():
 def test_forced_effects_without_their_parameters_are_not_in_the_graph(calls):
     """Line widths, accelerations and chirp errors of 0: alone, and beside points that have some."""
     names = ("line_width", "acceleration", "chirp_nonlinearity", "quantisation")
-    forced = small(axes=MOON, effects=dict.fromkeys(names, "on"))
+    forced = small_spec(axes=MOON, effects=dict.fromkeys(names, "on"))
     assert not evaluated(forced) & set(names)
     assert calls["line_width"] == calls["acceleration"] == calls["chirp_nonlinearity"] == 0
     axes = {"target.acceleration": ["0 m/s^2", "1 m/s^2"]}
-    flags = GridStudy(small(axes=axes, effects={"acceleration": "on"})).evaluate(0)["effects"]
+    flags = GridStudy(small_spec(axes=axes, effects={"acceleration": "on"})).evaluate(0)["effects"]
     assert [bool(flag >> NAMES.index("acceleration") & 1) for flag in flags] == [False, True]
 
 
 @pytest.mark.parametrize("tolerance", [0.0, 1e-3])
 def test_noise_that_is_there_is_in_the_snr_whatever_pd_is(tolerance):
-    laser = STUDY["instrument"]["laser"] | {"relative_intensity_noise": "1e-12 1/Hz"}
-    receiver = STUDY["instrument"]["receiver"] | {"common_mode_rejection": "20 dB"}
-    instrument = STUDY["instrument"] | {"laser": laser, "receiver": receiver}
-    near = {"axes": {}, "target": STUDY["target"] | {"range": "100 m"}}
+    laser = STUDY_MAPPING["instrument"]["laser"] | {"relative_intensity_noise": "1e-12 1/Hz"}
+    receiver = STUDY_MAPPING["instrument"]["receiver"] | {"common_mode_rejection": "20 dB"}
+    instrument = STUDY_MAPPING["instrument"] | {"laser": laser, "receiver": receiver}
+    near = {"axes": {}, "target": STUDY_MAPPING["target"] | {"range": "100 m"}}
     near["accuracy"] = {"tolerance": tolerance}
-    noisy = GridStudy(small(instrument=instrument, **near)).evaluate(0)
-    quiet = GridStudy(small(**near)).evaluate(0)
+    noisy = GridStudy(small_spec(instrument=instrument, **near)).evaluate(0)
+    quiet = GridStudy(small_spec(**near)).evaluate(0)
     assert quiet["pd_up"] == noisy["pd_up"] == 1
     # (Re P_lo)^2 RIN B_e / 100 of current, through the transimpedance
     added = (1.1e-3) ** 2 * 1e-12 / 100 * 7e3**2

@@ -6,16 +6,23 @@ import json
 import numpy as np
 import pytest
 import xarray as xr
-from small import STUDY, small
-from small_flights import SCENE, small_scene
+from small_flights import SCENE_MAPPING, small_scene_spec
+from small_studies import STUDY_MAPPING, small_spec
 
 from sweep.model.effects.catalogue import NAMES
-from sweep.tasks import eyepoint_study, flight_study, progress, store
-from sweep.tasks.accuracy import bench as benches
-from sweep.tasks.accuracy import measure, rungs
-from sweep.tasks.accuracy.bench import FlightBench, GridBench, Seen, spread, whole_tiles
-from sweep.tasks.accuracy.measure import measure as measured
-from sweep.tasks.studies import study_of
+from sweep.tasks.accuracy import measurement, settings
+from sweep.tasks.accuracy import study_sample as benches
+from sweep.tasks.accuracy.measurement import measure_accuracy as measured
+from sweep.tasks.accuracy.study_sample import (
+    FlightSample,
+    GridSample,
+    SampleResults,
+    halton_sample,
+    rows_of_whole_tiles,
+)
+from sweep.tasks.engine import progress, study_store
+from sweep.tasks.studies import eyepoint_study, flight_study
+from sweep.tasks.studies.study_loading import make_study
 
 COHERENT = {"beamlets": 9, "phases": "coherent"}
 
@@ -24,9 +31,9 @@ COHERENT = {"beamlets": 9, "phases": "coherent"}
 def hasty():
     """Few rounds, and none of the patience that times in earnest take."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(measure, "MOST_ROUNDS", 2)
-        patch.setattr(measure, "LONG_ENOUGH", 1e-3)
-        patch.setattr(measure, "UNTIL_TRUTH", 0.0)
+        patch.setattr(measurement, "ROUNDS_MAX", 2)
+        patch.setattr(measurement, "TRIAL_TIME_FRACTION", 1e-3)
+        patch.setattr(measurement, "TIME_DOMAIN_TIME_FRACTION", 0.0)
         yield
 
 
@@ -37,14 +44,14 @@ def hasty():
 @pytest.mark.parametrize("number", [1, 12, 60, 200])
 def test_a_sample_has_no_point_twice_and_all_where_there_are_few(shape, number):
     total = int(np.prod(shape, dtype=object))
-    found = spread(shape, number)
+    found = halton_sample(shape, number)
     assert len(found) == len(set(found.tolist())) == min(number, total)
     assert (found >= 0).all() and (found < total).all()
-    assert np.array_equal(found, spread(shape, number))
+    assert np.array_equal(found, halton_sample(shape, number))
 
 
 def test_any_stretch_of_a_sample_reaches_along_every_axis():
-    index = np.unravel_index(spread((1000, 90), 200), (1000, 90))
+    index = np.unravel_index(halton_sample((1000, 90), 200), (1000, 90))
     for first, size in itertools.product((0, 50, 150), (50,)):
         for along, length in zip(index, (1000, 90), strict=True):
             counts = np.histogram(along[first : first + size], bins=5, range=(0, length))[0]
@@ -53,35 +60,41 @@ def test_any_stretch_of_a_sample_reaches_along_every_axis():
 
 
 def test_a_longer_sample_begins_with_the_shorter():
-    assert np.array_equal(spread((500, 60, 7), 300)[:100], spread((500, 60, 7), 100))
+    assert np.array_equal(halton_sample((500, 60, 7), 300)[:100], halton_sample((500, 60, 7), 100))
 
 
 # Ladder
 
 
 def test_overrides_are_put_onto_the_spec_and_leave_it_alone():
-    spec = small()
-    rung = rungs.Rung(name="x", kind=rungs.ADAPTIVE, overrides={"accuracy.tolerance": 0.25})
-    other = rung.of(spec)
+    spec = small_spec()
+    rung = settings.AccuracySetting(
+        name="x", kind=settings.ADAPTIVE_KIND, overrides={"accuracy.tolerance": 0.25}
+    )
+    other = rung.apply_to(spec)
     assert other.accuracy.tolerance == 0.25 and spec.accuracy.tolerance == 1e-3
     assert other.identity()["axes"] == spec.identity()["axes"] and other.target == spec.target
 
 
 def test_a_ladder_has_tolerances_numbers_of_beamlets_and_the_finest_last():
-    ladder = rungs.ladder(small())
-    kinds = [rung.kind for rung in ladder.rungs]
-    assert kinds[0] == rungs.WRITTEN and kinds[-1] == rungs.REFERENCE
-    adaptive = [rung for rung in ladder.rungs if rung.kind == rungs.ADAPTIVE]
+    ladder = settings.build_ladder(small_spec())
+    kinds = [rung.kind for rung in ladder.settings]
+    assert kinds[0] == settings.AS_WRITTEN_KIND and kinds[-1] == settings.REFERENCE_KIND
+    adaptive = [rung for rung in ladder.settings if rung.kind == settings.ADAPTIVE_KIND]
     tolerances = [rung.overrides["accuracy.tolerance"] for rung in adaptive]
     assert tolerances == [1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6]
-    fixed = [rung for rung in ladder.rungs if rung.kind in (rungs.BEAMLETS, rungs.IN_A_LINE)]
+    fixed = [
+        rung
+        for rung in ladder.settings
+        if rung.kind in (settings.BEAMLETS_KIND, settings.LINE_PATTERN_KIND)
+    ]
     numbers = [rung.overrides["footprint.beamlets"] for rung in fixed]
-    assert numbers == [*rungs.NUMBERS, *rungs.NODES]
+    assert numbers == [*settings.TRIED_BEAMLETS, *settings.TRIED_LINE_BEAMLETS]
     assert all(r.overrides["footprint.beamlets"] == "auto" for r in adaptive)
-    finest = ladder.reference.of(small())
-    modes = finest.modes()
+    finest = ladder.reference.apply_to(small_spec())
+    modes = finest.effect_modes()
     assert modes["range_walk"] == modes["leakage"] == "on" and modes["speckle"] == "auto"
-    assert len({rung.name for rung in ladder.rungs}) == len(ladder.rungs)
+    assert len({rung.name for rung in ladder.settings}) == len(ladder.settings)
 
 
 def test_beamlets_that_are_part_of_the_scene_are_left_alone_and_it_is_said():
@@ -89,38 +102,43 @@ def test_beamlets_that_are_part_of_the_scene_are_left_alone_and_it_is_said():
         ({"footprint": COHERENT}, "coherent"),
         ({"axes": {"footprint.beamlets": [7, 19]}}, "axis"),
     ):
-        ladder = rungs.ladder(small(**changes))
-        assert not any("footprint.beamlets" in rung.overrides for rung in ladder.rungs)
+        ladder = settings.build_ladder(small_spec(**changes))
+        assert not any("footprint.beamlets" in rung.overrides for rung in ladder.settings)
         (note,) = ladder.notes
         assert why in note
-    assert "axis" in rungs.ladder(small(axes={"accuracy.tolerance": [0.1, 0.01]})).notes[0]
+    assert (
+        "axis"
+        in settings.build_ladder(small_spec(axes={"accuracy.tolerance": [0.1, 0.01]})).notes[0]
+    )
 
 
 def test_fixed_effects_are_those_called_for_and_the_same_set_is_tried_once():
     sets = {0.1: frozenset({"doppler"}), 1e-3: frozenset({"doppler"}), 1e-6: frozenset(NAMES[:2])}
-    ladder = rungs.with_fixed(rungs.ladder(small()), small(), sets)
-    fixed = [rung for rung in ladder.rungs if rung.kind == rungs.FIXED]
+    ladder = settings.add_fixed_effect_settings(
+        settings.build_ladder(small_spec()), small_spec(), sets
+    )
+    fixed = [rung for rung in ladder.settings if rung.kind == settings.FIXED_EFFECTS_KIND]
     assert [rung.name for rung in fixed] == [
         f"{what}, to {tolerance:g}"
         for what in ("1 effects as at 0.1", "2 effects as at 1e-06")
         for tolerance in sets
     ]
     assert [rung.overrides["accuracy.tolerance"] for rung in fixed] == [*sets, *sets]
-    modes = fixed[0].of(small()).modes()
+    modes = fixed[0].apply_to(small_spec()).effect_modes()
     assert modes["doppler"] == "on" and set(modes.values()) == {"on", "off"}
-    assert ladder.rungs[-1].kind == rungs.REFERENCE
+    assert ladder.settings[-1].kind == settings.REFERENCE_KIND
 
 
 def test_a_study_with_draws_has_rungs_of_draws_and_other_draws_for_reference():
-    spec = small(draws={"number": 20}, target=STUDY["target"] | {"roughness": "10 um"})
-    ladder = rungs.ladder(spec)
-    names = [rung.name for rung in ladder.rungs]
+    spec = small_spec(draws={"number": 20}, target=STUDY_MAPPING["target"] | {"roughness": "10 um"})
+    ladder = settings.build_ladder(spec)
+    names = [rung.name for rung in ladder.settings]
     assert {"10 draws, mean", "100 draws, counts", "1000 draws, noise"} <= set(names)
-    reference = ladder.reference.of(spec)
+    reference = ladder.reference.apply_to(spec)
     assert reference.seed != spec.seed and reference.draws.number == 10000
-    assert reference.modes()["speckle"] == "on"
-    many = rungs.ladder(small(draws={"number": 10**9}))
-    assert many.rungs[0].of(spec).draws.number == 10000
+    assert reference.effect_modes()["speckle"] == "on"
+    many = settings.build_ladder(small_spec(draws={"number": 10**9}))
+    assert many.settings[0].apply_to(spec).draws.number == 10000
     assert "10000 of the 1000000000 draws" in many.notes[1]
 
 
@@ -131,10 +149,10 @@ def test_a_study_with_draws_has_rungs_of_draws_and_other_draws_for_reference():
 def coherent(tmp_path_factory):
     """A small coherent study, measured in a moment."""
     store = tmp_path_factory.mktemp("accuracy") / "small.zarr"
-    instrument = STUDY["instrument"]
+    instrument = STUDY_MAPPING["instrument"]
     processing = instrument["processing"] | {"acquisition_delay": "34 us"}  # echoes fill records
-    spec = small(footprint=COHERENT, instrument=instrument | {"processing": processing})
-    assert measured(spec, store_path=store, points=10, progress=False)
+    spec = small_spec(footprint=COHERENT, instrument=instrument | {"processing": processing})
+    assert measured(spec, store_path=store, n_points=10, progress=False)
     return spec, store, xr.open_zarr(store).load()
 
 
@@ -172,28 +190,30 @@ def test_errors_are_those_of_the_settings(coherent):
 
 def test_a_rung_is_what_a_run_of_its_spec_gives(coherent):
     """The machinery of a run: the same numbers, bit for bit."""
-    from sweep.tasks.grid_study import GridStudy
+    from sweep.tasks.studies.grid_study import GridStudy
 
     spec, _, _ = coherent
-    bench = GridBench(spec, 72)
-    rung = rungs.Rung(name="coarse", kind=rungs.ADAPTIVE, overrides={"accuracy.tolerance": 0.1})
-    seen = bench.try_on(rung, np.arange(72), 3).seen
-    study = GridStudy(rung.of(spec))
+    bench = GridSample(spec, 72)
+    rung = settings.AccuracySetting(
+        name="coarse", kind=settings.ADAPTIVE_KIND, overrides={"accuracy.tolerance": 0.1}
+    )
+    seen = bench.try_setting(rung, np.arange(72), 3).results
+    study = GridStudy(rung.apply_to(spec))
     blocks = [study.evaluate(b) for b in range(study.n_blocks)]
     whole = np.full(study.grid.shape, np.nan)
     for b, results in enumerate(blocks):
-        whole[study.grid.block(b)] = results["pd_shot"]
-    numbers, _ = bench.coordinates()["number"]
+        whole[study.grid.block_slices(b)] = results["pd_shot"]
+    numbers, _ = bench.point_coordinates()["number"]
     assert np.array_equal(whole.ravel()[numbers], seen.pd[:, 3])
 
 
 def test_what_is_timed_is_what_the_points_own_block_computes_after_it():
-    bench = GridBench(small(footprint=COHERENT, storage={"block_points": 24}), 8)
-    rung = rungs.Rung(name="as written", kind=rungs.WRITTEN)
-    grid = bench.study(rung).grid
+    bench = GridSample(small_spec(footprint=COHERENT, storage={"block_points": 24}), 8)
+    rung = settings.AccuracySetting(name="as written", kind=settings.AS_WRITTEN_KIND)
+    grid = bench.study_with(rung).grid
     assert grid.block_shape == (2, 4, 3) and grid.dims == ("power", "range", "grazing_angle")
-    for number in bench.numbers:
-        beside = bench._beside(rung, number, 30)
+    for number in bench.point_indices:
+        beside = bench._points_computed_next(rung, number, 30)
         places = np.array(np.unravel_index(beside, grid.shape))
         blocks = places // np.array(grid.block_shape)[:, None]
         assert beside[0] == number and len(set(beside)) == 24 and (blocks == blocks[:, :1]).all()
@@ -204,29 +224,29 @@ def test_what_is_timed_is_what_the_points_own_block_computes_after_it():
 
 def test_points_are_timed_as_many_together_as_a_block_has(monkeypatch):
     """A study of one point has the cost of a call for it alone."""
-    rung, together = rungs.Rung(name="as written", kind=rungs.WRITTEN), []
-    ran = GridBench._run
+    rung, together = settings.AccuracySetting(name="as written", kind=settings.AS_WRITTEN_KIND), []
+    ran = GridSample._run_setting
 
     def noted(self, rung, numbers):
         together.append(len(numbers))
         return ran(self, rung, numbers)
 
-    monkeypatch.setattr(GridBench, "_run", noted)
+    monkeypatch.setattr(GridSample, "_run_setting", noted)
     for spec, points, block in (
-        (small(footprint=COHERENT, axes={}), 1, 1),
-        (small(footprint=COHERENT, storage={"block_points": 24}), 8, 24),
+        (small_spec(footprint=COHERENT, axes={}), 1, 1),
+        (small_spec(footprint=COHERENT, storage={"block_points": 24}), 8, 24),
     ):
-        bench = GridBench(spec, points)
-        assert bench.most_times == block
+        bench = GridSample(spec, points)
+        assert bench.timed_points_max == block
         together.clear()
-        bench.try_on(rung, np.arange(points), block)
+        bench.try_setting(rung, np.arange(points), block)
         assert together[0] == points and set(together[1:]) <= {block}
         assert len(together) == 1 + points * (block > 1)
 
 
 def test_a_tolerance_on_an_axis_stands_beside_that_of_the_settings(tmp_path):
-    spec = small(footprint=COHERENT, axes={"accuracy.tolerance": [0.1, 0.01]})
-    assert measured(spec, store_path=tmp_path / "a.zarr", points=2, progress=False)
+    spec = small_spec(footprint=COHERENT, axes={"accuracy.tolerance": [0.1, 0.01]})
+    assert measured(spec, store_path=tmp_path / "a.zarr", n_points=2, progress=False)
     dataset = xr.open_zarr(tmp_path / "a.zarr")
     assert dataset.tolerance.dims == ("rung",) and np.isnan(dataset.tolerance).all()
     assert set(dataset.accuracy_tolerance.values) == {0.1, 0.01}
@@ -236,11 +256,11 @@ def test_a_tolerance_on_an_axis_stands_beside_that_of_the_settings(tmp_path):
 
 @pytest.mark.slow
 def test_beamlets_are_tried_against_the_finest(tmp_path, monkeypatch):
-    monkeypatch.setattr(rungs, "NUMBERS", (1, 37))
-    monkeypatch.setattr(rungs, "NODES", (33,))
-    monkeypatch.setattr(measure, "TRUTH_BEAMLETS", 7)
-    spec = small(footprint={"beamlets": 7, "speckle": "none"}, accuracy={"line_error": 1e-9})
-    measured(spec, store_path=tmp_path / "a.zarr", points=6, progress=False)
+    monkeypatch.setattr(settings, "TRIED_BEAMLETS", (1, 37))
+    monkeypatch.setattr(settings, "TRIED_LINE_BEAMLETS", (33,))
+    monkeypatch.setattr(measurement, "TIME_DOMAIN_BEAMLETS", 7)
+    spec = small_spec(footprint={"beamlets": 7, "speckle": "none"}, accuracy={"line_error": 1e-9})
+    measured(spec, store_path=tmp_path / "a.zarr", n_points=6, progress=False)
     dataset = xr.open_zarr(tmp_path / "a.zarr").load()
     error = dict(zip(dataset.rung.values, dataset.pd_error.max("point").values, strict=True))
     assert error["33 in a line"] < 1e-6 < error["37 beamlets"] < error["1 beamlets"]
@@ -249,15 +269,15 @@ def test_beamlets_are_tried_against_the_finest(tmp_path, monkeypatch):
 
 
 def test_draws_err_as_much_as_they_say(tmp_path, monkeypatch):
-    monkeypatch.setattr(rungs, "DRAW_NUMBERS", (20, 80))
-    monkeypatch.setattr(rungs, "LONG_RUN", 5)
-    spec = small(
+    monkeypatch.setattr(settings, "TRIED_DRAWS", (20, 80))
+    monkeypatch.setattr(settings, "REFERENCE_DRAWS_FACTOR", 5)
+    spec = small_spec(
         draws={"number": 20},
-        target=STUDY["target"] | {"roughness": "10 um", "range": "2 km"},
+        target=STUDY_MAPPING["target"] | {"roughness": "10 um", "range": "2 km"},
         axes={"target.range": ["2 km", "3 km", "4 km", "5 km"]},
         footprint={"beamlets": 7, "speckle": "none"},
     )
-    measured(spec, store_path=tmp_path / "a.zarr", points=4, progress=False)
+    measured(spec, store_path=tmp_path / "a.zarr", n_points=4, progress=False)
     dataset = xr.open_zarr(tmp_path / "a.zarr").load().set_index(rung="rung")
     for name in ("20 draws, mean", "80 draws, counts", "80 draws, noise"):
         rung = dataset.sel(rung=name)
@@ -268,85 +288,90 @@ def test_draws_err_as_much_as_they_say(tmp_path, monkeypatch):
 
 
 def test_shots_of_a_flight_are_tried_with_their_rays(tmp_path, monkeypatch):
-    monkeypatch.setattr(rungs, "NUMBERS", (1, 19))
-    monkeypatch.setattr(rungs, "FINEST_RAYS", 61)
-    monkeypatch.setattr(measure, "TRUTH_BEAMLETS", 7)
+    monkeypatch.setattr(settings, "TRIED_BEAMLETS", (1, 19))
+    monkeypatch.setattr(settings, "REFERENCE_RAYS", 61)
+    monkeypatch.setattr(measurement, "TIME_DOMAIN_BEAMLETS", 7)
     store = tmp_path / "flight.zarr"
-    assert rungs.ladder(small_scene()).rungs[1].overrides["footprint.beamlets"] == "auto"
-    short = {"path": SCENE["platform"]["path"] | {"to": ["0 m", "0 m", "1300 m"]}}
-    spec = small_scene(platform=SCENE["platform"] | short)
-    measured(spec, store_path=store, points=12, progress=False)
+    assert (
+        settings.build_ladder(small_scene_spec()).settings[1].overrides["footprint.beamlets"]
+        == "auto"
+    )
+    short = {"path": SCENE_MAPPING["platform"]["path"] | {"to": ["0 m", "0 m", "1300 m"]}}
+    spec = small_scene_spec(platform=SCENE_MAPPING["platform"] | short)
+    measured(spec, store_path=store, n_points=12, progress=False)
     dataset = xr.open_zarr(store).load()
     assert set(dataset.scanner.values) == {"three", "line"} and dataset.attrs["unit"] == "shots"
     assert set(dataset.power.values) == {0.01, 1.0}
     error = dict(zip(dataset.rung.values, dataset.pd_error.max("point").values, strict=True))
     assert error["reference"] == 0 and error["19 beamlets"] <= error["1 beamlets"]
     assert dataset.attrs["truth_pd_difference"] < 1e-4
-    cycles = spec.cycles("three") * 3 + spec.cycles("line") * spec.shots_a_cycle("line")
+    cycles = spec.number_of_cycles("three") * 3 + spec.number_of_cycles(
+        "line"
+    ) * spec.shots_per_cycle("line")
     assert dataset.attrs["study_points"] == 2 * cycles
 
 
 def test_parts_of_a_flight_are_whole_tiles_from_all_scanners_in_turn(monkeypatch):
     """Shots computed beside a part take part in its time, and change nothing that it sees."""
     for module in (benches, flight_study, eyepoint_study):
-        monkeypatch.setattr(module, "TILE_SHOTS", 32)
-    bench = FlightBench(small_scene(footprint={"beamlets": 7, "speckle": "none"}), 400)
-    parts = bench.parts(64)
+        monkeypatch.setattr(module, "SHOTS_PER_TILE", 32)
+    bench = FlightSample(small_scene_spec(footprint={"beamlets": 7, "speckle": "none"}), 400)
+    parts = bench.split(64)
     assert np.array_equal(np.sort(np.concatenate(parts)), np.arange(bench.size))
-    shots = [bench.shots(part) for part in parts]
-    assert len({place for place, _ in shots[:4]}) == len(bench.parts(bench.size)) == 4
+    shots = [bench.flight_block_and_shots(part) for part in parts]
+    assert len({place for place, _ in shots[:4]}) == len(bench.split(bench.size)) == 4
     assert len(parts) > 4
     tiles = [{(place, tile) for tile in (own // 32).tolist()} for place, own in shots]
     assert sum(map(len, tiles)) == len(set().union(*tiles)) and max(map(len, tiles)) == 2
-    rung = rungs.Rung(name="as written", kind=rungs.WRITTEN)
+    rung = settings.AccuracySetting(name="as written", kind=settings.AS_WRITTEN_KIND)
     for part in (parts[0], parts[-1]):
-        alone, beside = (bench.try_on(rung, part, times).seen for times in (1, 10_000))
-        assert len(alone.sigma) == len(part)
+        alone, beside = (bench.try_setting(rung, part, times).results for times in (1, 10_000))
+        assert len(alone.noise_sigma) == len(part)
         for one, other in zip(alone, beside, strict=True):
             assert np.array_equal(one, other, equal_nan=True)
 
 
 def test_shots_are_timed_with_so_many_that_follow_round_the_end():
     tile = np.arange(256 * 4 + 100) // 256
-    rows = whole_tiles(tile, np.arange(768, 1024), 600)
+    rows = rows_of_whole_tiles(tile, np.arange(768, 1024), 600)
     assert np.array_equal(np.unique(tile[rows]), [0, 3, 4]) and len(rows) == 612
-    assert np.array_equal(whole_tiles(tile, np.arange(300, 400), 1), np.arange(256, 512))
-    assert len(whole_tiles(tile, np.arange(1), 10_000)) == len(tile)
+    assert np.array_equal(rows_of_whole_tiles(tile, np.arange(300, 400), 1), np.arange(256, 512))
+    assert len(rows_of_whole_tiles(tile, np.arange(1), 10_000)) == len(tile)
 
 
 @pytest.mark.parametrize("rays", [7, "auto"])
 def test_what_a_flight_is_measured_with_is_what_its_run_gives(rays):
     """Statistics of a trial against those of the flight's own machinery, more rays and all."""
-    from sweep.tasks.study import TILE_SHOTS
+    from sweep.tasks.engine.blocks import SHOTS_PER_TILE
 
-    spec = small_scene(
+    spec = small_scene_spec(
         footprint={"beamlets": rays, "speckle": "none"}, accuracy={"tolerance": 1e-6}
     )
-    bench = FlightBench(spec, 10_000)
-    rung = rungs.Rung(name="as written", kind=rungs.WRITTEN)
-    part = bench.parts(1)[0]
-    seen = bench.try_on(rung, part, 1).seen
-    place, numbers = bench.shots(bench.around(part, 1))
-    study = bench.study(rung)
+    bench = FlightSample(spec, 10_000)
+    rung = settings.AccuracySetting(name="as written", kind=settings.AS_WRITTEN_KIND)
+    part = bench.split(1)[0]
+    seen = bench.try_setting(rung, part, 1).results
+    place, numbers = bench.flight_block_and_shots(bench.extend_to_whole_tiles(part, 1))
+    study = bench.study_with(rung)
     caster = next(e for e in study.eyepoint_studies() if e.scanner == place.scanner)
-    from sweep.scenes.eyepoint_arrays import from_arrays
+    from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
 
-    shots = caster.see(numbers)
-    eyepoints = from_arrays(shots, caster.weight)
-    called = study.select(place, eyepoints, np.arange(len(numbers)))
-    assert len(numbers) <= TILE_SHOTS
-    found = study.look(place, shots, eyepoints, called, numbers)
+    shots = caster.cast_cycles(numbers)
+    eyepoints = eyepoints_from_arrays(shots, caster.beamlet_weights)
+    called = study.select_effects(place, eyepoints, np.arange(len(numbers)))
+    assert len(numbers) <= SHOTS_PER_TILE
+    found = study.simulate_shots(place, shots, eyepoints, called, numbers)
     assert np.array_equal(found["pd_up"], seen.pd[:, 0], equal_nan=True)
     assert np.array_equal(found["pd_shot"], seen.pd[:, 3], equal_nan=True)
-    there = np.isfinite(seen.beamlets)
-    assert np.array_equal(found["beamlets"][there], seen.beamlets[there])
-    assert (seen.beamlets[there] > caster.beamlets).any() == (rays == "auto")
+    there = np.isfinite(seen.n_beamlets)
+    assert np.array_equal(found["beamlets"][there], seen.n_beamlets[there])
+    assert (seen.n_beamlets[there] > caster.n_beamlets).any() == (rays == "auto")
 
 
 def seen(pd, magnitude=1.0, leakage=(0.0, 0.0)):
     """A point of given probabilities and magnitude, sigma 0.5."""
     alarms = np.array([[-np.inf, -3.0]])
-    return Seen(
+    return SampleResults(
         np.array([pd]),
         alarms,
         np.array([leakage]),
@@ -358,7 +383,7 @@ def seen(pd, magnitude=1.0, leakage=(0.0, 0.0)):
 
 
 def test_what_sees_nothing_detects_nothing():
-    pd, pfa, magnitude, leakage = measure.apart(
+    pd, pfa, magnitude, leakage = measurement.result_differences(
         seen([0.5, np.nan, 0.2, np.nan]), seen([0.4, 0.3, 0.2, np.nan])
     )
     assert (pd, pfa, magnitude, leakage) == (pytest.approx([0.3]), [0.0], [0.0], [0.0])
@@ -366,40 +391,44 @@ def test_what_sees_nothing_detects_nothing():
 
 def test_what_leaks_counts_as_a_probability_does():
     """A setting that leaves leakage out is off by all of it, which changes nothing else."""
-    found = measure.apart(seen([1.0], leakage=(np.nan, 0.1)), seen([1.0], leakage=(0.4, 0.3)))
+    found = measurement.result_differences(
+        seen([1.0], leakage=(np.nan, 0.1)), seen([1.0], leakage=(0.4, 0.3))
+    )
     assert found == (0.0, 0.0, 0.0, pytest.approx([0.4]))
 
 
 @pytest.mark.parametrize(("true", "found", "error"), [(2.0, 2.2, 0.1), (0.1, 0.2, 0.2)])
 def test_magnitudes_are_off_by_so_much_of_themselves_or_of_sigma(true, found, error):
-    assert measure.apart(seen([1.0], found), seen([1.0], true))[2] == pytest.approx([error])
+    assert measurement.result_differences(seen([1.0], found), seen([1.0], true))[
+        2
+    ] == pytest.approx([error])
 
 
 @pytest.mark.parametrize(
     "spec, name",
     [
-        (small(storage={"block_points": 24}), "pd_shot"),
-        (small(draws={"number": 20, "batch": 8}, axes={}), "n_detected_shot"),
-        (small_scene(), "line/pd_shot"),
+        (small_spec(storage={"block_points": 24}), "pd_shot"),
+        (small_spec(draws={"number": 20, "batch": 8}, axes={}), "n_detected_shot"),
+        (small_scene_spec(), "line/pd_shot"),
     ],
     ids=["blocks", "one point", "flight"],
 )
 def test_storing_is_the_making_of_the_store_and_the_writing_of_each_block(
     spec, name, monkeypatch, tmp_path
 ):
-    study, ticks, written = study_of(spec, tmp_path / "a.zarr"), itertools.count(), []
-    write = store.Arrays.write
+    study, ticks, written = make_study(spec, tmp_path / "a.zarr"), itertools.count(), []
+    write = study_store.BlockWriter.write
 
     def noted(self, block, results):
         written.append((block, results))
         return write(self, block, results)
 
-    monkeypatch.setattr(store.Arrays, "write", noted)
-    monkeypatch.setattr(measure, "process_time", lambda: float(next(ticks)))
-    assert measure.storing(study) == 1.0 + study.n_blocks
+    monkeypatch.setattr(study_store.BlockWriter, "write", noted)
+    monkeypatch.setattr(measurement, "process_time", lambda: float(next(ticks)))
+    assert measurement.measure_storing_seconds(study) == 1.0 + study.n_blocks
     assert {block for block, _ in written} == {study.n_blocks // 2}
     # Whole chunks of all the block's arrays: anything else would have been refused.
-    assert written[0][1].keys() == study.chunks(study.n_blocks // 2).keys() >= {name}
+    assert written[0][1].keys() == study.chunk_positions(study.n_blocks // 2).keys() >= {name}
     assert not list(tmp_path.iterdir())
 
 
@@ -421,24 +450,24 @@ class Broken(progress.Progress):
 )
 def test_whole_parts_are_kept_where_it_is_broken_off(trials, kept):
     """A ladder of trials a part, two parts a round."""
-    bench = GridBench(small(footprint=COHERENT), 8)
+    bench = GridSample(small_spec(footprint=COHERENT), 8)
     asked = Broken(0)
-    tried = measure.Measurement(bench, time_limit=60.0, told=asked, interrupts=asked)
-    asked.left = int(trials * len(tried._ladder.rungs)) if kept else 3
+    tried = measurement.Measurement(bench, time_limit=60.0, progress=asked, interrupts=asked)
+    asked.left = int(trials * len(tried._setting_ladder.settings)) if kept else 3
     if not kept:
-        with pytest.raises(measure.Nothing):
+        with pytest.raises(measurement.NothingMeasured):
             tried.run()
         return
     found = tried.run()
-    assert len(found.done) == kept and bool(found.truth) == (kept == 8)
-    assert found.stopped == ("interrupted" if kept < 8 else "")
-    (seconds,) = (array for array in found.arrays() if array.name == "seconds")
-    assert seconds.shape == (len(found.ladder.rungs), 1)
+    assert len(found.sample_rows) == kept and bool(found.time_domain_differences) == (kept == 8)
+    assert found.stop_reason == ("interrupted" if kept < 8 else "")
+    (seconds,) = (array for array in found.array_layouts() if array.name == "seconds")
+    assert seconds.shape == (len(found.setting_ladder.settings), 1)
 
 
 @pytest.mark.parametrize("law", ["off", "auto"])
 def test_segments_that_begin_at_one_range_are_the_reference_s_law_too(law):
     """The thesis's law is no omission that the reference would have to make good."""
-    reference = rungs.ladder(small(effects={"segment_motion": law})).reference
+    reference = settings.build_ladder(small_spec(effects={"segment_motion": law})).reference
     assert ("effects.segment_motion" in reference.overrides) == (law == "auto")
     assert "effects.range_walk" in reference.overrides

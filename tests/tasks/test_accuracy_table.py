@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import xarray as xr
 from click.testing import CliRunner
-from small import STUDY, quiet, small
+from small_studies import STUDY_MAPPING, run_serially, small_spec
 
 from sweep.cli import main
-from sweep.tasks.summary import accuracy_table, rays_table
+from sweep.tasks.studies.store_summary import draw_accuracy_rows, ray_accuracy_rows
 
 ROUGH = {
-    "target": STUDY["target"] | {"roughness": "10 um"},
+    "target": STUDY_MAPPING["target"] | {"roughness": "10 um"},
     "footprint": {"beamlets": 1, "speckle": "none"},
     "draws": {"limit": 400, "batch": 20},
 }
@@ -25,7 +25,9 @@ def store(tmp_path_factory):
         "accuracy.tolerance": [0.1, 0.04, 0.0],
         "accuracy.confidence": [0.8, 0.99],
     }
-    return quiet(small(**ROUGH, axes=axes), tmp_path_factory.mktemp("a") / "a.zarr").store
+    return run_serially(
+        small_spec(**ROUGH, axes=axes), tmp_path_factory.mktemp("a") / "a.zarr"
+    ).store
 
 
 def test_each_point_keeps_the_promise_that_is_made_of_it(store):
@@ -47,11 +49,15 @@ def test_the_worst_point_is_told_with_its_own_tolerance(store):
     dataset = xr.open_zarr(store)
     over = {name: dataset[f"{name}_half_width"] - dataset.tolerance
             for name in ("pd_up", "pd_doppler", "pd_down", "pd_shot")}  # fmt: skip
-    for row in accuracy_table(store):
-        assert row.missed == pytest.approx(float(over[row.name].max()), rel=1e-12)
-        assert row.tolerance == 0 and row.needed == math.inf and row.number == 400
-        assert row.met == int((over[row.name] <= 0).sum()) and row.points == 18
-        assert names_the_place(row.where, dataset, over[row.name])
+    for row in draw_accuracy_rows(store):
+        assert row.excess == pytest.approx(float(over[row.name].max()), rel=1e-12)
+        assert (
+            row.tolerance_at_worst == 0
+            and row.draws_needed == math.inf
+            and row.samples_at_worst == 400
+        )
+        assert row.n_met == int((over[row.name] <= 0).sum()) and row.n_points == 18
+        assert names_the_place(row.worst_label, dataset, over[row.name])
 
 
 def names_the_place(where, dataset, over):
@@ -64,13 +70,15 @@ def names_the_place(where, dataset, over):
 def test_draws_that_are_said_to_do_about_do(tmp_path):
     """A fixed number is told as well, and as many again as are said to be needed meet it."""
     axes, accuracy = {"target.range": ["2 km"]}, {"tolerance": 0.02}
-    few = small(**ROUGH | {"draws": {"number": 300}}, axes=axes, accuracy=accuracy)
-    rows = accuracy_table(quiet(few, tmp_path / "few.zarr").store)
-    assert [row.met for row in rows] == [0, 0, 0, 0] and {row.number for row in rows} == {300}
-    needed = int(max(row.needed for row in rows))
-    enough = small(**ROUGH | {"draws": {"number": needed}}, axes=axes, accuracy=accuracy)
-    for row in accuracy_table(quiet(enough, tmp_path / "enough.zarr").store):
-        assert row.error < 0.022
+    few = small_spec(**ROUGH | {"draws": {"number": 300}}, axes=axes, accuracy=accuracy)
+    rows = draw_accuracy_rows(run_serially(few, tmp_path / "few.zarr").store)
+    assert [row.n_met for row in rows] == [0, 0, 0, 0] and {
+        row.samples_at_worst for row in rows
+    } == {300}
+    needed = int(max(row.draws_needed for row in rows))
+    enough = small_spec(**ROUGH | {"draws": {"number": needed}}, axes=axes, accuracy=accuracy)
+    for row in draw_accuracy_rows(run_serially(enough, tmp_path / "enough.zarr").store):
+        assert row.worst_error < 0.022
 
 
 def test_blocks_that_are_not_computed_are_not_told(tmp_path):
@@ -81,50 +89,54 @@ def test_blocks_that_are_not_computed_are_not_told(tmp_path):
             raise ValueError("not today")
         return study.evaluate(block)
 
-    spec = small(**ROUGH, axes={"target.range": ["1 km", "2 km"]}, storage={"block_points": 1})
+    spec = small_spec(**ROUGH, axes={"target.range": ["1 km", "2 km"]}, storage={"block_points": 1})
     outcome = run(spec, store=tmp_path / "half.zarr", scheduler="none", progress=False,
                   evaluate=broken)  # fmt: skip
     assert outcome.blocks_done == 1
-    assert {row.points for row in accuracy_table(outcome.store)} == {1}
+    assert {row.n_points for row in draw_accuracy_rows(outcome.store)} == {1}
     assert xr.open_zarr(outcome.store).n_draws.values[1] == -1
 
 
 def test_a_study_without_draws_has_none(tmp_path):
-    assert accuracy_table(quiet(small(axes={}), tmp_path / "none.zarr").store) == []
+    assert draw_accuracy_rows(run_serially(small_spec(axes={}), tmp_path / "none.zarr").store) == []
 
 
 def test_the_table_after_a_run_tells_where_the_most_beamlets_are_too_few(tmp_path):
     """Over thousands of bins: a beam of 50 mrad that grazes the ground."""
     laser = {"wavelength": "1550 nm", "power": "1 W", "beam_divergence": "50 mrad"}
-    processing = STUDY["instrument"]["processing"] | {"acquisition_delay": "67 us"}
-    spec = small(
-        instrument=STUDY["instrument"] | {"laser": laser, "processing": processing},
+    processing = STUDY_MAPPING["instrument"]["processing"] | {"acquisition_delay": "67 us"}
+    spec = small_spec(
+        instrument=STUDY_MAPPING["instrument"] | {"laser": laser, "processing": processing},
         footprint={"beamlets": "auto", "phases": "incoherent", "speckle": "none"},
         axes={"target.grazing_angle": ["0.5 deg", "89 deg", "90 deg"]},
-        target=STUDY["target"] | {"range": "10 km"},
+        target=STUDY_MAPPING["target"] | {"range": "10 km"},
     )
-    store = quiet(spec, tmp_path / "wide.zarr").store
-    (row,) = rays_table(store)
-    assert (row.points, row.met, row.most, row.error) == (3, 2, 4096, 1.0)
-    assert row.where == "grazing_angle 0.5 deg"
+    store = run_serially(spec, tmp_path / "wide.zarr").store
+    (row,) = ray_accuracy_rows(store)
+    assert (row.n_points, row.n_met, row.samples_max, row.worst_error) == (3, 2, 4096, 1.0)
+    assert row.worst_label == "grazing_angle 0.5 deg"
     said = CliRunner().invoke(main, ["status", str(store)]).output
     assert "What more beamlets may change" in said and "2 of 3" in said
-    met = small(footprint={"beamlets": "auto", "phases": "incoherent", "speckle": "none"}, axes={})
-    assert rays_table(quiet(met, tmp_path / "met.zarr").store) == []
+    met = small_spec(
+        footprint={"beamlets": "auto", "phases": "incoherent", "speckle": "none"}, axes={}
+    )
+    assert ray_accuracy_rows(run_serially(met, tmp_path / "met.zarr").store) == []
 
 
 def test_a_large_study_is_told_by_some_of_its_blocks(tmp_path, monkeypatch):
     """Each block is a file or two: `sweep status` would wait for all of them."""
-    from sweep.tasks import summary
+    from sweep.tasks.studies import store_summary
 
     axes = {"target.range": [f"{k} km" for k in range(1, 9)]}
     draws = {"draws": {"number": 20}}
-    store = quiet(small(**ROUGH | draws, axes=axes, storage={"block_points": 1}), tmp_path / "l")
-    whole = accuracy_table(store.store)
-    assert {row.looked_at for row in whole} == {1.0} and {row.points for row in whole} == {8}
-    monkeypatch.setattr(summary, "MOST_BLOCKS", 2)
-    rows = accuracy_table(store.store)
-    assert {row.looked_at for row in rows} == {2 / 8} and {row.points for row in rows} == {2}
-    assert all(row.error <= all_.error for row, all_ in zip(rows, whole, strict=True))
+    store = run_serially(
+        small_spec(**ROUGH | draws, axes=axes, storage={"block_points": 1}), tmp_path / "l"
+    )
+    whole = draw_accuracy_rows(store.store)
+    assert {row.block_fraction for row in whole} == {1.0} and {row.n_points for row in whole} == {8}
+    monkeypatch.setattr(store_summary, "SAMPLED_BLOCKS_MAX", 2)
+    rows = draw_accuracy_rows(store.store)
+    assert {row.block_fraction for row in rows} == {2 / 8} and {row.n_points for row in rows} == {2}
+    assert all(row.worst_error <= all_.worst_error for row, all_ in zip(rows, whole, strict=True))
     said = CliRunner().invoke(main, ["status", str(store.store)]).output
     assert "by 25 % of" in " ".join(said.split())

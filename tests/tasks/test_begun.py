@@ -8,20 +8,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small import STUDY, quiet, receipts, small, tree
+from small_studies import STUDY_MAPPING, file_digests, receipt_blocks, run_serially, small_spec
 
 from sweep.model import sampling
 from sweep.storage.locations import ObjectPath
-from sweep.tasks import journal, progress, worker
 from sweep.tasks.driver import extend, resume, run
-from sweep.tasks.grid_study import GridStudy
-from sweep.tasks.journal import Begun
-from sweep.tasks.progress import Progress, StoreError
-from sweep.tasks.study import Found, Known
-from sweep.tasks.summary import status
-from sweep.tasks.verify import pack, verify
+from sweep.tasks.engine import journal, progress, worker
+from sweep.tasks.engine.blocks import PartialResults, ReusedResults
+from sweep.tasks.engine.journal import Checkpoint
+from sweep.tasks.engine.progress import Progress, StoreError
+from sweep.tasks.studies.grid_study import GridStudy
+from sweep.tasks.studies.store_summary import status
+from sweep.tasks.studies.store_verification import pack_store, verify
 
-QUICK = {**STUDY["instrument"], "laser": {**STUDY["instrument"]["laser"], "power": "0.1 W"}}
+QUICK = {
+    **STUDY_MAPPING["instrument"],
+    "laser": {**STUDY_MAPPING["instrument"]["laser"], "power": "0.1 W"},
+}
 QUICK["processing"] = {
     **QUICK["processing"], "fft_size": "2^11", "tnr": 6,
     "acquisition_delay": "41 us",  # 3.4 us are recorded; the echo of 6 km is there from 40.03 us on
@@ -38,9 +41,9 @@ KINDS = {
 
 def drawn(kind="fixed", ranges=("2 km",), **draws):
     """Points that are drawn; their ground is rough but where noise alone is to be random."""
-    rough = {**STUDY["target"], "roughness": "10 um", "reflectance": 0.2}
-    return small(
-        instrument=QUICK, target=STUDY["target"] if kind == "noise alone" else rough,
+    rough = {**STUDY_MAPPING["target"], "roughness": "10 um", "reflectance": 0.2}
+    return small_spec(
+        instrument=QUICK, target=STUDY_MAPPING["target"] if kind == "noise alone" else rough,
         draws=KINDS[kind] | draws, accuracy={"tolerance": 0.03}, storage={},
         axes={"target.range": list(ranges)},
     )  # fmt: skip
@@ -51,19 +54,19 @@ def cut(assign=setattr, *, piece=90, rows=25, samples=1 << 13, seconds=-1.0):
     assign(sampling, "PIECE", piece)
     assign(sampling, "ROWS", rows)
     assign(sampling, "SAMPLES", samples)
-    assign(worker, "PIECE_SECONDS", seconds)
+    assign(worker, "CHECKPOINT_INTERVAL", seconds)
 
 
 @pytest.fixture
 def saved(monkeypatch):
     """Points of a block that were saved, piece by piece."""
-    points, real = [], journal.write_begun
+    points, real = [], journal.write_checkpoint
 
     def write(path, study_id, block, found):
         points.append(found.points)
         real(path, study_id, block, found)
 
-    monkeypatch.setattr(journal, "write_begun", write)
+    monkeypatch.setattr(journal, "write_checkpoint", write)
     cut(monkeypatch.setattr)
     return points
 
@@ -78,9 +81,9 @@ def whole(tmp_path_factory):
             store = tmp_path_factory.mktemp("whole") / "whole.zarr"
             with pytest.MonkeyPatch.context() as context:
                 cut(context.setattr, piece=1 << 16, rows=4096, samples=1 << 18, seconds=600.0)
-                context.setattr(journal, "write_begun", None)  # short blocks are never saved
-                assert quiet(drawn(kind, ranges), store).complete
-            stores[kind, ranges] = tree(store)
+                context.setattr(journal, "write_checkpoint", None)  # short blocks are never saved
+                assert run_serially(drawn(kind, ranges), store).complete
+            stores[kind, ranges] = file_digests(store)
         return stores[kind, ranges]
 
     return made
@@ -128,9 +131,9 @@ def left(store):
 def test_pieces_of_a_block_come_to_the_same_bytes_and_are_told(kind, place, whole, saved, tmp_path):
     told, store = Told(), tmp_path / "pieces.zarr"
     assert run(drawn(kind), store=store, progress=told, **place).complete
-    assert tree(store) == whole(kind)
+    assert file_digests(store) == whole(kind)
     assert len(saved) >= 3 and saved == sorted(set(saved)) and 0 < saved[0] < saved[-1] < 1
-    assert told.points == [0, *saved, 1] and receipts(store) == [0] and left(store) == []
+    assert told.points == [0, *saved, 1] and receipt_blocks(store) == [0] and left(store) == []
 
 
 @pytest.mark.parametrize(
@@ -142,9 +145,9 @@ def test_a_block_of_several_points_is_stopped_at_any_of_them(
 ):
     ranges = ("100 m", "1 km", "2 km", "6 km")
     expected = whole(kind, ranges)
-    monkeypatch.setattr("sweep.tasks.grid_study.SUB_BATCH", 2)
-    assert quiet(drawn(kind, ranges), tmp_path / "pieces.zarr").complete
-    assert tree(tmp_path / "pieces.zarr") == expected
+    monkeypatch.setattr("sweep.tasks.studies.grid_study.POINTS_PER_CALL_MAX", 2)
+    assert run_serially(drawn(kind, ranges), tmp_path / "pieces.zarr").complete
+    assert file_digests(tmp_path / "pieces.zarr") == expected
     assert any(0 < points < 2 for points in saved) and any(2 < points < 4 for points in saved)
 
 
@@ -154,32 +157,32 @@ def test_one_ctrl_c_stops_after_a_piece_and_resume_goes_on_from_there(
 ):
     store = tmp_path / "stopped.zarr"
     interrupted(drawn(), store, place=place)
-    assert len(saved) == 2 and left(store) == ["begun-0"] and receipts(store) == []
+    assert len(saved) == 2 and left(store) == ["begun-0"] and receipt_blocks(store) == []
     assert status(store).points_begun == saved[-1] and status(store).points_done == 0
     assert verify(store)[0].sound and not verify(store)[0].complete
     with pytest.raises(StoreError, match="lacks 1 block"):
-        pack(store, tmp_path / "packed.zarr")
+        pack_store(store, tmp_path / "packed.zarr")
     told = Told()
     assert resume(store, progress=told, **place).complete
     assert told.points[0] == saved[1] < saved[2] and saved == sorted(set(saved))
-    assert tree(store) == whole("fixed") and left(store) == []
+    assert file_digests(store) == whole("fixed") and left(store) == []
     assert status(store).points_begun == 0
 
 
 KILLED = """
 import os, sys
 from pathlib import Path
-from test_begun import cut, drawn, quiet
-from sweep.tasks import journal
+from test_begun import cut, drawn, run_serially
+from sweep.tasks.engine import journal
 
-def write(path, study_id, block, found, real=journal.write_begun):
+def write(path, study_id, block, found, real=journal.write_checkpoint):
     real(path, study_id, block, found)
     if found.points > 0.5:
         os.kill(os.getpid(), 9)
 
-journal.write_begun = write
+journal.write_checkpoint = write
 cut()
-quiet(drawn(sys.argv[2]), Path(sys.argv[1]))
+run_serially(drawn(sys.argv[2]), Path(sys.argv[1]))
 """
 
 
@@ -195,7 +198,7 @@ def test_what_is_saved_outlives_a_kill_and_is_not_drawn_again(
     )
     assert killed.returncode == -signal.SIGKILL and left(store) == ["begun-0"]
     before = status(store).points_begun * drawn(kind).draws.number
-    monkeypatch.setattr(GridStudy, "compile", lambda study: None)  # it draws once
+    monkeypatch.setattr(GridStudy, "compile_kernels", lambda study: None)  # it draws once
     taken, real = [], sampling.Drawn.take
 
     def take(self, points, number):
@@ -206,7 +209,7 @@ def test_what_is_saved_outlives_a_kill_and_is_not_drawn_again(
     assert quiet_resume(store).complete
     assert taken[0][0] == before > 0
     assert sum(number for _, number in taken) == drawn(kind).draws.number - before
-    assert tree(store) == whole(kind) and left(store) == []
+    assert file_digests(store) == whole(kind) and left(store) == []
 
 
 def quiet_resume(store, **changes):
@@ -241,45 +244,51 @@ def test_what_is_saved_and_damaged_or_foreign_is_drawn_anew(damage, whole, saved
     assert status(store).points_begun == 0
     saved.clear()
     assert quiet_resume(store).complete
-    assert saved[0] < 0.5 and tree(store) == whole("fixed") and left(store) == []
+    assert saved[0] < 0.5 and file_digests(store) == whole("fixed") and left(store) == []
 
 
 @pytest.mark.parametrize("place", [Path, lambda path: ObjectPath("memory://bucket", str(path))])
 def test_what_is_saved_is_read_as_it_was_in_a_folder_and_in_an_object_store(place, tmp_path):
     store = place(tmp_path / "store.zarr")
-    part = Found(np.array([4, 2]), {"pd_up": np.array([0.5, np.nan]), "n": np.array([[1], [2]])})
+    part = PartialResults(
+        np.array([4, 2]), {"pd_up": np.array([0.5, np.nan]), "n": np.array([[1], [2]])}
+    )
     assert (
-        journal.read_begun(store, "one", 7) == Begun() and journal.begun_points(store, "one") == {}
+        journal.read_checkpoint(store, "one", 7) == Checkpoint()
+        and journal.checkpoint_points(store, "one") == {}
     )
     for points in (0.5, 0.25):  # less than there is takes no place
-        journal.write_begun(store, "one", 7, Begun(Known(begun=part), points, 1.5))
-    found = journal.read_begun(store, "one", 7)
-    assert (found.points, found.seconds) == (0.5, 1.5) and not found.known.done.points.size
-    np.testing.assert_array_equal(found.known.begun.points, part.points)
+        journal.write_checkpoint(
+            store, "one", 7, Checkpoint(ReusedResults(begun=part), points, 1.5)
+        )
+    found = journal.read_checkpoint(store, "one", 7)
+    assert (found.points, found.seconds) == (0.5, 1.5) and not found.results.done.local_indices.size
+    np.testing.assert_array_equal(found.results.begun.local_indices, part.local_indices)
     for name, values in part.results.items():
-        np.testing.assert_array_equal(found.known.begun.results[name], values)
+        np.testing.assert_array_equal(found.results.begun.results[name], values)
     assert (
-        journal.begun_points(store, "one") == {7: 0.5} and journal.begun_points(store, "two") == {}
+        journal.checkpoint_points(store, "one") == {7: 0.5}
+        and journal.checkpoint_points(store, "two") == {}
     )
-    journal.discard_begun(store, 7)
-    journal.discard_begun(store, 7)
-    assert journal.begun_points(store, "one") == {}
+    journal.delete_checkpoints(store, 7)
+    journal.delete_checkpoints(store, 7)
+    assert journal.checkpoint_points(store, "one") == {}
 
 
 def test_an_extended_study_goes_on_in_pieces_too(whole, saved, tmp_path):
     store = tmp_path / "extended.zarr"
-    assert quiet(drawn(number=170), store).complete
+    assert run_serially(drawn(number=170), store).complete
     saved.clear()
     changes = {"draws.number": 500}
     assert extend(store, changes=changes, scheduler="none", progress=False).complete
-    assert len(saved) >= 2 and saved[0] > 170 / 500 and tree(store) == whole("fixed")
+    assert len(saved) >= 2 and saved[0] > 170 / 500 and file_digests(store) == whole("fixed")
     assert left(store) == []
 
 
 def test_workers_that_do_not_find_what_others_saved_end_the_run(saved, tmp_path, monkeypatch):
-    monkeypatch.setattr(journal, "read_begun", lambda *place: Begun())
+    monkeypatch.setattr(journal, "read_checkpoint", lambda *place: Checkpoint())
     with pytest.raises(StoreError, match="do all of them see the same store"):
-        quiet(drawn(), tmp_path / "lost.zarr")
+        run_serially(drawn(), tmp_path / "lost.zarr")
     assert len(saved) == 2
 
 
@@ -287,9 +296,9 @@ def test_a_block_may_take_no_longer_in_pieces_than_at_once(saved, tmp_path):
     store = tmp_path / "slow.zarr"
     interrupted(drawn(), store)
     place = store, status(store).study_id, 0
-    found = journal.read_begun(*place)
-    journal.discard_begun(store, 0)
-    journal.write_begun(*place, found._replace(seconds=100.0))
+    found = journal.read_checkpoint(*place)
+    journal.delete_checkpoints(store, 0)
+    journal.write_checkpoint(*place, found._replace(seconds=100.0))
     outcome = quiet_resume(store, block_timeout=99.0)
     assert "longer than the 99 s" in outcome.failures[0].error and left(store) == ["begun-0"]
     assert quiet_resume(store, block_timeout=1000.0, retry_failed=True).complete
@@ -299,14 +308,14 @@ def test_a_block_may_take_no_longer_in_pieces_than_at_once(saved, tmp_path):
 def test_the_time_of_a_block_is_that_of_all_its_pieces(saved, tmp_path):
     store = tmp_path / "timed.zarr"
     interrupted(drawn(), store)
-    spent = journal.read_begun(store, status(store).study_id, 0).seconds
+    spent = journal.read_checkpoint(store, status(store).study_id, 0).seconds
     outcome = quiet_resume(store)
     assert outcome.work_seconds > spent > 0
 
 
 def test_lines_tell_the_part_of_a_point(capsys, monkeypatch):
-    monkeypatch.setattr(progress, "LINE_EVERY", -1.0)
-    lines = progress.Lines()
+    monkeypatch.setattr(progress, "LINE_INTERVAL", -1.0)
+    lines = progress.ProgressLines()
     lines.begin(points=2, done=0, unit="points")
     for part in (0.31, 0.69, 1.0):
         lines.advance(points=part, failed=0)

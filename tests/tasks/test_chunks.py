@@ -7,8 +7,8 @@ import pytest
 import zarr
 
 from sweep.storage import locations
-from sweep.tasks.store import CODECS, encoded
-from sweep.tasks.study import ArrayLayout
+from sweep.tasks.engine.blocks import ArrayLayout
+from sweep.tasks.engine.study_store import CODECS, encode_chunk
 
 TYPES = ["float64", "float32", "int64", "uint8", "uint64", "int16", "bool"]
 
@@ -24,7 +24,7 @@ def layout_of(array):
     dims = tuple(map(str, range(array.ndim)))
     return ArrayLayout(
         name="array", shape=array.shape, chunks=array.chunks, dims=dims, dtype=str(array.dtype),
-        fill=array.fill_value,
+        fill_value=array.fill_value,
     )  # fmt: skip
 
 
@@ -43,7 +43,7 @@ def test_every_chunk_is_zarrs_byte_for_byte(tmp_path, dtype, shape, chunk):
     for position in itertools.product(*map(range, counts)):
         at = tuple(slice(p * c, (p + 1) * c) for p, c in zip(position, chunk, strict=True))
         file = tmp_path / "hand" / "/".join(["c", *map(str, position)])
-        locations.put(str(file), encoded(layout_of(by_hand), values[at]))
+        locations.atomic_write_file(str(file), encode_chunk(layout_of(by_hand), values[at]))
         assert (
             file.read_bytes()
             == (tmp_path / "zarr" / file.relative_to(tmp_path / "hand")).read_bytes()
@@ -55,21 +55,21 @@ def test_chunks_equal_to_the_fill_and_values_of_the_other_byte_order(tmp_path):
     by_zarr = array_at(tmp_path / "zarr", (4,), (4,), "float64", np.nan)
     by_zarr[...] = np.full(4, np.nan)
     layout = layout_of(by_zarr)
-    content = encoded(layout, np.full(4, np.nan))
+    content = encode_chunk(layout, np.full(4, np.nan))
     assert content == (tmp_path / "zarr/c/0").read_bytes()
     swapped = np.arange(4.0).astype(">f8")
-    assert encoded(layout, swapped) == encoded(layout, np.arange(4.0))
+    assert encode_chunk(layout, swapped) == encode_chunk(layout, np.arange(4.0))
 
 
 def test_a_write_that_fails_leaves_what_was_there(tmp_path, monkeypatch):
     file = tmp_path / "c" / "0"
-    locations.put(str(file), b"old")
+    locations.atomic_write_file(str(file), b"old")
 
     def full(*_):
         raise OSError(28, "no space left")
 
     monkeypatch.setattr("os.replace", full)
     with pytest.raises(OSError, match="no space"):
-        locations.put(str(file), b"new")
+        locations.atomic_write_file(str(file), b"new")
     assert file.read_bytes() == b"old"
     assert [each.name for each in file.parent.iterdir()] == ["0"]

@@ -2,22 +2,22 @@
 
 import numpy as np
 import pytest
-from small import small
-from small_flights import small_scene
+from small_flights import small_scene_spec
+from small_studies import small_spec
 
 import sweep
-from sweep.tasks import store
-from sweep.tasks.studies import study_of
+from sweep.tasks.engine import study_store
+from sweep.tasks.studies.study_loading import make_study
 
 STUDIES = {
-    "grid": lambda: small(),
-    "draws": lambda: small(draws={"number": 10}),
-    "spectra": lambda: small(draws={"number": 10, "method": "spectra"}),
-    "limit": lambda: small(draws={"limit": 100}),
-    "noise density": lambda: small(
+    "grid": lambda: small_spec(),
+    "draws": lambda: small_spec(draws={"number": 10}),
+    "spectra": lambda: small_spec(draws={"number": 10, "method": "spectra"}),
+    "limit": lambda: small_spec(draws={"limit": 100}),
+    "noise density": lambda: small_spec(
         axes={"instrument.receiver.noise_equivalent_power": ["5 pW/rtHz", "6 pW/rtHz"]}
     ),
-    "flight": small_scene,
+    "flight": small_scene_spec,
 }
 
 
@@ -25,7 +25,7 @@ STUDIES = {
 def datasets(request, tmp_path_factory):
     """Datasets of a store without results; not to be changed."""
     spec, path = STUDIES[request.param](), tmp_path_factory.mktemp("conventions") / "a.zarr"
-    store.create(path, study_of(spec, path))
+    study_store.create_store(path, make_study(spec, path))
     if request.param == "flight":
         return [node.to_dataset() for node in sweep.open_scene(path).subtree]
     return [sweep.open(path)]

@@ -9,37 +9,37 @@ from types import SimpleNamespace
 import pytest
 import yaml
 from click.testing import CliRunner
-from small import STUDY, small, small_file
-from small_flights import SCENE, small_scene
+from small_flights import SCENE_MAPPING, small_scene_spec
+from small_studies import STUDY_MAPPING, small_mapping, small_spec
 
 import sweep
 from sweep.cli import main
-from sweep.tasks.progress import Progress
+from sweep.tasks.engine.progress import Progress
 
 LATE = {"axes": {"target.range": ["1 km", "20 km"]}}
 OFF = {"effects": {"doppler": "off"}, "axes": {"target.range": ["1 km", "2 km"]}}
 NARROW = {
     "axes": {"target.range": ["1 km"]},
-    "instrument": STUDY["instrument"]
+    "instrument": STUDY_MAPPING["instrument"]
     | {"telescope": {"aperture": "10 mm", "coupling": "aperture"}},
 }
 NOISY = {
     "axes": {"target.range": ["1 km"]},
-    "instrument": STUDY["instrument"]
-    | {"processing": STUDY["instrument"]["processing"] | {"tnr": 5}},
+    "instrument": STUDY_MAPPING["instrument"]
+    | {"processing": STUDY_MAPPING["instrument"]["processing"] | {"tnr": 5}},
 }
 BY_PHASE = {
     "axes": {"target.range": ["1 km", "3.5 km"]},
     "draws": {"method": "spectra", "number": 2},
-    "instrument": STUDY["instrument"]
+    "instrument": STUDY_MAPPING["instrument"]
     | {
-        "processing": STUDY["instrument"]["processing"]
+        "processing": STUDY_MAPPING["instrument"]["processing"]
         | {"tnr": 10, "estimator": {"kind": "candan"}}
     },
 }
 WAYWARD = {
     "platform": {
-        "path": SCENE["platform"]["path"] | {"to": ["6 km", "0 m", "300 m"]},
+        "path": SCENE_MAPPING["platform"]["path"] | {"to": ["6 km", "0 m", "300 m"]},
         "attitude": {"kind": "nadir"},
     }
 }
@@ -62,16 +62,16 @@ def warned(spec, path):
 @pytest.mark.parametrize(
     ("spec", "told"),
     [
-        (small(**LATE), "no echo arrives before its record ends"),
-        (small(**OFF), "doppler"),
-        (small(**NARROW), "is narrower than an aperture of 10 mm"),
-        (small(**NOISY), r"raises a false alarm in either chirp .*: raise instrument.*tnr"),
-        (small_scene(instrument=NOISY["instrument"]), "raises a false alarm in either chirp"),
+        (small_spec(**LATE), "no echo arrives before its record ends"),
+        (small_spec(**OFF), "doppler"),
+        (small_spec(**NARROW), "is narrower than an aperture of 10 mm"),
+        (small_spec(**NOISY), r"raises a false alarm in either chirp .*: raise instrument.*tnr"),
+        (small_scene_spec(instrument=NOISY["instrument"]), "raises a false alarm in either chirp"),
         (
-            small(**BY_PHASE),
+            small_spec(**BY_PHASE),
             "estimator.kind candan takes .* at 100 % of the points, at all",
         ),
-        (small_scene(**WAYWARD), "of the shots hit something"),
+        (small_scene_spec(**WAYWARD), "of the shots hit something"),
     ],
 )
 def test_a_doubtful_study_warns_at_the_line_of_the_program(spec, told, tmp_path):
@@ -83,7 +83,7 @@ def test_a_doubtful_study_warns_at_the_line_of_the_program(spec, told, tmp_path)
 @pytest.mark.parametrize("changes", [LATE, NOISY])
 def test_program_and_command_warn_in_the_same_words(changes, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "late.yaml").write_text(yaml.safe_dump(small_file(**changes)))
+    (tmp_path / "late.yaml").write_text(yaml.safe_dump(small_mapping(**changes)))
     texts, _ = warned(sweep.load("late.yaml"), tmp_path / "s.zarr")
     with warnings.catch_warnings():
         warnings.simplefilter("error", sweep.StudyWarning)  # the command prints, once
@@ -95,7 +95,7 @@ def test_program_and_command_warn_in_the_same_words(changes, tmp_path, monkeypat
 
 def test_an_extension_warns_in_a_program_and_in_the_command(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    near = small(axes={"target.range": ["100 m"]})
+    near = small_spec(axes={"target.range": ["100 m"]})
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", sweep.StudyWarning)
         sweep.run(near, store="s.zarr", scheduler="none", progress=False)
@@ -119,8 +119,8 @@ class Heard(Progress):
 
 
 def test_what_a_flight_leaves_unstated_is_noted_in_a_program_too(tmp_path):
-    spec, progress = small_scene(), Heard()
-    sentences = spec.unstated_errors()
+    spec, progress = small_scene_spec(), Heard()
+    sentences = spec.unstated_error_sentences()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", sweep.StudyWarning)
         sweep.run(spec, store=tmp_path / "s.zarr", scheduler="none", progress=progress)
@@ -130,7 +130,7 @@ def test_what_a_flight_leaves_unstated_is_noted_in_a_program_too(tmp_path):
 def test_a_warning_made_an_error_stops_a_run_before_its_store_is_made(tmp_path):
     with warnings.catch_warnings(), pytest.raises(sweep.StudyWarning):
         warnings.simplefilter("error")
-        sweep.run(small(**LATE), store=tmp_path / "s.zarr", scheduler="none", progress=False)
+        sweep.run(small_spec(**LATE), store=tmp_path / "s.zarr", scheduler="none", progress=False)
     assert not (tmp_path / "s.zarr").exists()
 
 
@@ -154,13 +154,15 @@ def test_a_warning_that_nobody_can_read_ends_no_run(stream, tmp_path, monkeypatc
     with warnings.catch_warnings():
         warnings.simplefilter("always")
         warnings.showwarning = show
-        done = sweep.run(small(**LATE), store=tmp_path / "s.zarr", scheduler="none", progress=False)
+        done = sweep.run(
+            small_spec(**LATE), store=tmp_path / "s.zarr", scheduler="none", progress=False
+        )
     assert done.complete
 
 
 def test_a_study_without_doubts_does_not_warn(tmp_path):
-    laser = STUDY["instrument"]["laser"] | {"beam_divergence": "100 urad"}
-    processing = STUDY["instrument"]["processing"] | {"tnr": 10}
-    instrument = STUDY["instrument"] | {"laser": laser, "processing": processing}
-    spec = small(axes={"target.range": ["100 m"]}, effects={}, instrument=instrument)
+    laser = STUDY_MAPPING["instrument"]["laser"] | {"beam_divergence": "100 urad"}
+    processing = STUDY_MAPPING["instrument"]["processing"] | {"tnr": 10}
+    instrument = STUDY_MAPPING["instrument"] | {"laser": laser, "processing": processing}
+    spec = small_spec(axes={"target.range": ["100 m"]}, effects={}, instrument=instrument)
     assert warned(spec, tmp_path / "s.zarr") == ([], set())

@@ -9,23 +9,34 @@ import dask
 import numpy as np
 import pytest
 import xarray as xr
-from small import STUDY, deadly, evaluated, failing, logged, quiet, receipts, small, threads, tree
+from small_studies import (
+    STUDY_MAPPING,
+    file_digests,
+    logged_blocks,
+    make_failing_evaluate,
+    make_killing_evaluate,
+    make_logging_evaluate,
+    receipt_blocks,
+    run_serially,
+    small_spec,
+    thread_cluster_client,
+)
 
 from sweep.model.outputs import ACCURACY_OUTPUTS, DRAW_OUTPUTS
-from sweep.tasks import session, store
 from sweep.tasks.driver import resume, run
-from sweep.tasks.grid_study import GridStudy
-from sweep.tasks.progress import Progress
-from sweep.tasks.store import Arrays, Written
-from sweep.tasks.summary import status
-from sweep.tasks.worker import Job, work
+from sweep.tasks.engine import session, study_store
+from sweep.tasks.engine.progress import Progress
+from sweep.tasks.engine.study_store import BlockWriter, StoredBlock
+from sweep.tasks.engine.worker import TaskSettings, run_blocks
+from sweep.tasks.studies.grid_study import GridStudy
+from sweep.tasks.studies.store_summary import status
 
 
 def test_a_plain_loop_computes_every_point_and_receipts_every_block_once(undisturbed):
     dataset = xr.open_zarr(undisturbed)
     assert bool(dataset.pd_shot.notnull().all())
     assert np.ptp(dataset.pd_shot.values) > 0
-    assert sorted(receipts(undisturbed)) == list(range(12))
+    assert sorted(receipt_blocks(undisturbed)) == list(range(12))
 
 
 @pytest.mark.parametrize(
@@ -36,19 +47,19 @@ def test_a_plain_loop_computes_every_point_and_receipts_every_block_once(undistu
 def test_the_bytes_are_the_plain_loops_wherever_the_blocks_are_computed(
     undisturbed, tmp_path, place
 ):
-    outcome = quiet(small(), tmp_path / "small.zarr", **place)
+    outcome = run_serially(small_spec(), tmp_path / "small.zarr", **place)
     assert outcome.complete and outcome.blocks_computed == 12
-    assert sorted(receipts(outcome.store)) == list(range(12))
-    assert tree(outcome.store) == tree(undisturbed)
+    assert sorted(receipt_blocks(outcome.store)) == list(range(12))
+    assert file_digests(outcome.store) == file_digests(undisturbed)
 
 
-FEW = {**STUDY["axes"], "target.range": {"linear": ["10 m", "5 km"], "number": 6}}
+FEW = {**STUDY_MAPPING["axes"], "target.range": {"linear": ["10 m", "5 km"], "number": 6}}
 FIXED = {"axes": FEW, "draws": {"number": 70, "batch": 30}}
 ADAPTIVE = {
     "axes": FEW,
     "draws": {"limit": 60, "batch": 20},
     "accuracy": {"tolerance": 0.09, "confidence": 0.9},
-    "target": STUDY["target"] | {"roughness": "10 um"},
+    "target": STUDY_MAPPING["target"] | {"roughness": "10 um"},
     "footprint": {"beamlets": 1, "speckle": "none"},
     "effects": {"signal_shot_noise": "on"},  # which tiles of several powers may keep for all
 }
@@ -57,9 +68,9 @@ ADAPTIVE = {
 
 @pytest.mark.parametrize("drawn", [FIXED, ADAPTIVE], ids=["a fixed number", "to an accuracy"])
 def test_what_is_drawn_does_not_depend_on_blocks_workers_or_axes(tmp_path, drawn):
-    plain = quiet(small(**drawn), tmp_path / "plain.zarr")
-    threads = quiet(small(**drawn), tmp_path / "t.zarr", workers=2, processes=False)
-    assert tree(plain.store) == tree(threads.store)
+    plain = run_serially(small_spec(**drawn), tmp_path / "plain.zarr")
+    threads = run_serially(small_spec(**drawn), tmp_path / "t.zarr", workers=2, processes=False)
+    assert file_digests(plain.store) == file_digests(threads.store)
     expected = xr.open_zarr(plain.store)
     if drawn is FIXED:
         assert expected.batch_draws.values.tolist() == [30, 30, 10]
@@ -68,9 +79,11 @@ def test_what_is_drawn_does_not_depend_on_blocks_workers_or_axes(tmp_path, drawn
         numbers = expected.n_draws.values
         assert set(np.unique(numbers)) == {40, 60} and "batch" not in expected.dims
         assert ((expected.accuracy_missed > 0).values <= (numbers == 60)).all()
-    whole = quiet(small(**drawn, storage={"block_points": 1000}), tmp_path / "whole.zarr")
+    whole = run_serially(
+        small_spec(**drawn, storage={"block_points": 1000}), tmp_path / "whole.zarr"
+    )
     axes = {path: values for path, values in FEW.items() if "power" not in path}
-    one_watt = quiet(small(**drawn | {"axes": axes}), tmp_path / "one_watt.zarr")
+    one_watt = run_serially(small_spec(**drawn | {"axes": axes}), tmp_path / "one_watt.zarr")
     again, at_one_watt = xr.open_zarr(whole.store), xr.open_zarr(one_watt.store)
     for name, values in expected.data_vars.items():
         assert again[name].values.tobytes() == values.values.tobytes(), name
@@ -79,11 +92,11 @@ def test_what_is_drawn_does_not_depend_on_blocks_workers_or_axes(tmp_path, drawn
 
 
 def test_a_client_of_the_callers_is_used_and_left_open(undisturbed, tmp_path):
-    with threads(1, each=2) as client:
-        outcome = quiet(small(), tmp_path / "small.zarr", client=client)
-        again = quiet(small(), tmp_path / "again.zarr", client=client)
+    with thread_cluster_client(1, threads_per_worker=2) as client:
+        outcome = run_serially(small_spec(), tmp_path / "small.zarr", client=client)
+        again = run_serially(small_spec(), tmp_path / "again.zarr", client=client)
         assert client.status == "running"
-    assert tree(outcome.store) == tree(again.store) == tree(undisturbed)
+    assert file_digests(outcome.store) == file_digests(again.store) == file_digests(undisturbed)
 
 
 class StopAfter(Progress):
@@ -107,15 +120,17 @@ def test_an_interrupted_run_commits_what_runs_and_resumes_to_the_same_bytes(
 ):
     path, log = tmp_path / "small.zarr", tmp_path / "log"
     progress = StopAfter(18)
-    outcome = run(small(), store=path, progress=progress, evaluate=logged(log), **place)
+    outcome = run(
+        small_spec(), store=path, progress=progress, evaluate=make_logging_evaluate(log), **place
+    )
     assert not outcome.complete and outcome.stopped == "interrupted"
     assert 3 <= outcome.blocks_done < 12
-    assert len(evaluated(log)) == outcome.blocks_done  # what was begun was committed
+    assert len(logged_blocks(log)) == outcome.blocks_done  # what was begun was committed
     assert any("stopping" in text for text in progress.said)
-    resumed = resume(path, progress=False, scheduler="none", evaluate=logged(log))
+    resumed = resume(path, progress=False, scheduler="none", evaluate=make_logging_evaluate(log))
     assert resumed.complete and resumed.blocks_computed == 12 - outcome.blocks_done
-    assert Counter(evaluated(log)) == Counter(range(12))
-    assert tree(path) == tree(undisturbed)
+    assert Counter(logged_blocks(log)) == Counter(range(12))
+    assert file_digests(path) == file_digests(undisturbed)
 
 
 @pytest.mark.parametrize("place", [{"scheduler": "none"}, {"workers": 2, "processes": False}])
@@ -123,11 +138,17 @@ def test_a_block_that_raises_is_tried_twice_recorded_and_does_not_stop_the_rest(
     undisturbed, tmp_path, place
 ):
     path, log = tmp_path / "small.zarr", tmp_path / "log"
-    outcome = run(small(), store=path, progress=False, evaluate=failing({2, 7}, log), **place)
+    outcome = run(
+        small_spec(),
+        store=path,
+        progress=False,
+        evaluate=make_failing_evaluate({2, 7}, log),
+        **place,
+    )
     assert not outcome.complete and outcome.blocks_done == 10
     assert sorted(failure.block for failure in outcome.failures) == [2, 7]
     expected = Counter({**dict.fromkeys(range(12), 1), 2: 2, 7: 2})
-    assert Counter(evaluated(log)) == expected
+    assert Counter(logged_blocks(log)) == expected
     recorded = status(path).failures
     assert recorded[2]["error"] == "ValueError: nothing good comes of block 2"
     assert "Traceback" in recorded[7]["traceback"]
@@ -136,30 +157,32 @@ def test_a_block_that_raises_is_tried_twice_recorded_and_does_not_stop_the_rest(
     assert set(status(path).failures) == {2, 7}
     assert resume(path, progress=False, scheduler="none", retry_failed=True).complete
     assert status(path).failures == {}
-    assert tree(path) == tree(undisturbed)
+    assert file_digests(path) == file_digests(undisturbed)
 
 
 def test_a_block_that_kills_its_worker_is_given_up_and_the_rest_finishes(undisturbed, tmp_path):
     path = tmp_path / "small.zarr"
     with dask.config.set({"distributed.scheduler.allowed-failures": 0}):
-        outcome = run(small(), store=path, progress=False, workers=1, evaluate=deadly({4}))
+        outcome = run(
+            small_spec(), store=path, progress=False, workers=1, evaluate=make_killing_evaluate({4})
+        )
     assert [failure.block for failure in outcome.failures] == [4]
     assert outcome.failures[0].error.startswith("KilledWorker")
     assert outcome.blocks_done == 11
     assert resume(path, progress=False, scheduler="none", retry_failed=True).complete
-    assert tree(path) == tree(undisturbed)
+    assert file_digests(path) == file_digests(undisturbed)
 
 
 def test_a_study_of_which_every_block_fails_is_given_up_early(tmp_path):
-    spec, log = small(storage={"block_points": 1}), tmp_path / "log"
+    spec, log = small_spec(storage={"block_points": 1}), tmp_path / "log"
     outcome = run(
         spec,
         store=tmp_path / "small.zarr",
         progress=False,
         scheduler="none",
-        evaluate=failing(set(range(72)), log),
+        evaluate=make_failing_evaluate(set(range(72)), log),
     )
-    assert len(outcome.failures) == session.HOPELESS
+    assert len(outcome.failures) == session.MAX_INITIAL_FAILURES
     assert "all failed" in outcome.stopped
 
 
@@ -173,24 +196,24 @@ def full_disk(study, block):
 @pytest.mark.parametrize("place", [{"scheduler": "none"}, {"workers": 2, "processes": False}])
 def test_a_full_disk_stops_the_run_and_leaves_what_is_committed(undisturbed, tmp_path, place):
     path = tmp_path / "small.zarr"
-    outcome = run(small(), store=path, progress=False, evaluate=full_disk, **place)
+    outcome = run(small_spec(), store=path, progress=False, evaluate=full_disk, **place)
     assert "No space left" in outcome.stopped and not outcome.complete
-    assert set(receipts(path)) <= {0, 1, 2}
+    assert set(receipt_blocks(path)) <= {0, 1, 2}
     assert resume(path, progress=False, scheduler="none").complete
-    assert tree(path) == tree(undisturbed)
+    assert file_digests(path) == file_digests(undisturbed)
 
 
 def test_a_task_left_over_from_a_dead_driver_writes_nothing_into_another_study(tmp_path):
-    path, old = tmp_path / "small.zarr", small(seed=5)
-    store.create(path, GridStudy(old))
+    path, old = tmp_path / "small.zarr", small_spec(seed=5)
+    study_store.create_store(path, GridStudy(old))
 
     def replaced_meanwhile(study, block):
-        store.remove(path)
-        store.create(path, GridStudy(small(seed=6)))
+        study_store.remove_store(path)
+        study_store.create_store(path, GridStudy(small_spec(seed=6)))
         return study.evaluate(block)
 
-    unfit = work(Job(str(path), old.id, replaced_meanwhile), [0]).unfit
-    assert f"now holds study {small(seed=6).id}, not {old.id}" in str(unfit)
+    unfit = run_blocks(TaskSettings(str(path), old.id, replaced_meanwhile), [0]).worker_error
+    assert f"now holds study {small_spec(seed=6).id}, not {old.id}" in str(unfit)
     assert not list(path.glob("*/c/0/0/0"))
 
 
@@ -199,33 +222,33 @@ def test_a_block_whose_chunks_do_not_reach_the_store_is_not_committed(
     undisturbed, tmp_path, monkeypatch, times
 ):
     path, lost = tmp_path / "small.zarr", []
-    write = Arrays.write
+    write = BlockWriter.write
 
     def forgetful(self, block, results):
         if block == 3 and len(lost) < times:
             lost.append(block)
-            return Written("0" * 32, 1)
+            return StoredBlock("0" * 32, 1)
         return write(self, block, results)
 
-    monkeypatch.setattr(Arrays, "write", forgetful)
-    outcome = quiet(small(), path)
+    monkeypatch.setattr(BlockWriter, "write", forgetful)
+    outcome = run_serially(small_spec(), path)
     assert len(lost) == times
-    assert receipts(path).count(3) == (1 if times == 1 else 0)
+    assert receipt_blocks(path).count(3) == (1 if times == 1 else 0)
     assert outcome.complete == (times == 1)
     assert all("not in the store here" in failure.error for failure in outcome.failures)
     assert resume(path, progress=False, scheduler="none", retry_failed=True).complete
-    assert tree(path) == tree(undisturbed)
+    assert file_digests(path) == file_digests(undisturbed)
 
 
 def test_the_client_never_has_more_tasks_out_than_its_window(tmp_path):
-    spec = small(storage={"block_points": 1})
+    spec = small_spec(storage={"block_points": 1})
     most = []
 
     class Watching(Progress):
         def advance(self, *, points, failed):
             most.append(len(client.futures))
 
-    with threads(2) as client:
+    with thread_cluster_client(2) as client:
         outcome = run(spec, store=tmp_path / "s.zarr", client=client, progress=Watching())
     assert outcome.complete and outcome.blocks == 72
     assert max(most) <= 2 * 2 + 1

@@ -5,31 +5,34 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from small import STUDY, quiet, small
-from small_flights import SCENE, small_scene
+from small_flights import SCENE_MAPPING, small_scene_spec
+from small_studies import STUDY_MAPPING, run_serially, small_spec
 
 import sweep
 from sweep.cli import main
 from sweep.model.pairing import FLAGS
-from sweep.tasks.echoes import warnings_of
-from sweep.tasks.studies import study_of
+from sweep.tasks.studies.echo_warnings import echo_warnings
+from sweep.tasks.studies.study_loading import make_study
 
 WITHIN = {"range": "1 km", "grazing_angle": "90 deg", "radial_velocity": "0 m/s",
           "reflectance": 0.1}  # fmt: skip
 
 
 def told(spec):
-    return list(warnings_of(study_of(spec, Path("nowhere.zarr").absolute())))
+    return list(echo_warnings(make_study(spec, Path("nowhere.zarr").absolute())))
 
 
 def along(*ranges, **sections):
     """The small study, of records of 27.3 us from 0 on, over some ranges."""
-    return small(target=WITHIN, axes={"target.range": list(ranges)}, **sections)
+    return small_spec(target=WITHIN, axes={"target.range": list(ranges)}, **sections)
 
 
 def record(**processing):
     """Instrument of the small study with other records."""
-    return {**STUDY["instrument"], "processing": STUDY["instrument"]["processing"] | processing}
+    return {
+        **STUDY_MAPPING["instrument"],
+        "processing": STUDY_MAPPING["instrument"]["processing"] | processing,
+    }
 
 
 def test_records_that_hold_all_of_their_echoes_are_not_told_of():
@@ -55,7 +58,7 @@ def test_axes_that_change_no_echo_do_not_change_what_is_told():
     ranges, wide = ["1 km", "5 km"], {"linear": ["1 W", "5 W"], "number": 5000}
     one = told(along(*ranges))
     axes = {"target.range": ranges, "instrument.laser.power": wide}
-    assert told(small(target=WITHIN, axes=axes)) == one
+    assert told(small_spec(target=WITHIN, axes=axes)) == one
 
 
 @pytest.mark.parametrize("kind", ["real", "complex"])
@@ -75,9 +78,9 @@ def test_points_that_fold_are_flagged_in_the_store(tmp_path):
         "20 km", "22 km", "23 km", "30 km", instrument=record(fft_size="2^17", tnr=5),
         effects={"overlap": "off"},
     )  # fmt: skip
-    assert quiet(spec, tmp_path / "far.zarr").complete
+    assert run_serially(spec, tmp_path / "far.zarr").complete
     found = sweep.open(tmp_path / "far.zarr")
-    assert found.misread.values.tolist() == [0, 0, 1, 1]
+    assert found.is_misread.values.tolist() == [0, 0, 1, 1]
     assert (np.abs(found.range_error.values[2:]) > 1e3).all()
 
 
@@ -99,12 +102,14 @@ def test_plan_and_run_warn_in_the_same_words(tmp_path, monkeypatch):
 
 def hover(height, **processing):
     """A lidar that hovers above a plain, in dim light so that noise decides nothing."""
-    instrument = SCENE["instrument"] | {
-        "chirp": STUDY["instrument"]["chirp"] | {"duration": "20 us", "bandwidth": "40 MHz"},
-        "processing": STUDY["instrument"]["processing"]
-        | {"fft_size": "2^12", "acquisition_delay": "2 us"} | processing,
-    }  # fmt: skip
-    return small_scene(
+    instrument = SCENE_MAPPING["instrument"] | {
+        "chirp": STUDY_MAPPING["instrument"]["chirp"]
+        | {"duration": "20 us", "bandwidth": "40 MHz"},
+        "processing": STUDY_MAPPING["instrument"]["processing"]
+        | {"fft_size": "2^12", "acquisition_delay": "2 us"}
+        | processing,
+    }
+    return small_scene_spec(
         instrument=instrument,
         scene={"objects": {"ground": {"kind": "plane", "size": "8 km", "reflectance": 0.1}}},
         platform={
@@ -128,7 +133,7 @@ def test_a_flight_sees_nothing_where_echoes_arrive_after_the_record(tmp_path, he
     assert bool(words) != seen
     if not seen:
         assert "100 % of the shots, at all ranges" in words[0]
-    assert quiet(spec, tmp_path / "hover.zarr").complete
+    assert run_serially(spec, tmp_path / "hover.zarr").complete
     found = sweep.open_scene(tmp_path / "hover.zarr")["down"].to_dataset()
     assert bool((found.pd_shot.fillna(0) > 0.5).all()) == seen
     assert bool((found.flags.values & FLAGS["true"] > 0).any()) == seen
@@ -143,7 +148,7 @@ def test_a_flight_in_which_beats_fold_is_told_of_and_flags_its_points(tmp_path):
     spec = hover("400 m", sample_rate="6 MHz", fft_size="2^6", acquisition_delay="3 us", tnr=5)
     words = told(spec)
     assert any("read as another range or velocity at 100 % of the shots" in w for w in words)
-    assert quiet(spec, tmp_path / "fold.zarr").complete
+    assert run_serially(spec, tmp_path / "fold.zarr").complete
     found = sweep.open_scene(tmp_path / "fold.zarr")["down"].to_dataset()
     flags = found.flags.values
     assert (flags & FLAGS["misread"]).any() and not (flags & FLAGS["true"]).any()
@@ -151,7 +156,7 @@ def test_a_flight_in_which_beats_fold_is_told_of_and_flags_its_points(tmp_path):
 
 def test_a_phase_that_walks_far_within_a_delay_is_told_but_of_drawn_spectra():
     laser = {"line_width": "30 kHz", "line_shape": "lorentzian"}
-    noisy = {**STUDY["instrument"], "laser": STUDY["instrument"]["laser"] | laser}
+    noisy = {**STUDY_MAPPING["instrument"], "laser": STUDY_MAPPING["instrument"]["laser"] | laser}
     ranges = [f"{r} m" for r in (100, 400, 700, 1000)]
     (words,) = told(along(*ranges, instrument=noisy))
     assert "the laser's phase walks" in words and "50 % of the points, from 700 m on" in words
@@ -174,7 +179,7 @@ def flown(heights, speeds, record_kind="real", **processing):
     path = {"kind": "straight", "from": start, "to": end, "initial_speed": speeds[0],
             "final_speed": speeds[1]}  # fmt: skip
     ground = {"plane": {"kind": "plane", "size": "9 km", "reflectance": 0.1}}
-    return small_scene(
+    return small_scene_spec(
         instrument=instrument,
         scene={"origin": "plane", "objects": ground},
         platform={"path": path, "attitude": {"kind": "nadir"}}, axes={},
@@ -225,7 +230,7 @@ def test_a_flight_fast_in_part_is_told_the_assumption_that_is_right_more_often(s
 )
 def test_a_grid_is_told_where_two_beats_decide(changes, number):
     fast = WITHIN | {"radial_velocity": "60 m/s"}
-    spec = small(
+    spec = small_spec(
         target=fast, instrument=record(acquisition_delay="7 us", **changes),
         axes={"target.range": ["1 km", "2 km"]},
     )  # fmt: skip
@@ -236,10 +241,12 @@ def test_a_grid_is_told_where_two_beats_decide(changes, number):
 
 
 def test_two_chirps_without_a_doppler_segment_are_told_the_same_remedy():
-    chirp = STUDY["instrument"]["chirp"] | {"segments": "up down"}
+    chirp = STUDY_MAPPING["instrument"]["chirp"] | {"segments": "up down"}
     instrument = record(acquisition_delay="7 us") | {"chirp": chirp}
     fast = WITHIN | {"radial_velocity": "60 m/s"}
-    words = told(small(target=fast, instrument=instrument, axes={"target.range": ["1 km", "9 km"]}))
+    words = told(
+        small_spec(target=fast, instrument=instrument, axes={"target.range": ["1 km", "9 km"]})
+    )
     assert ["two_beats: fast" in text for text in words if "misread" in text] == [True]
 
 
@@ -262,7 +269,7 @@ def test_exchanged_pairs_are_warned_of_in_plan_and_in_python(tmp_path, monkeypat
 
 @pytest.mark.parametrize("name", ["lander_ndl", "chester_2017_table_5_1"])
 def test_instruments_of_landers_read_two_beats_as_of_a_fast_target(name):
-    spec = small_scene(instrument=name, axes={})
+    spec = small_scene_spec(instrument=name, axes={})
     assert spec.parameters()["instrument.processing.two_beats"] == "fast"
     assert not exchanged(spec)
 
@@ -280,7 +287,7 @@ def sliding(target, draws=None, **processing):
     instrument["laser"] = instrument["laser"] | {"beam_divergence": "2 mrad"}
     given = {} if draws is None else {"draws": {"method": draws, "number": 8}}
     footprint = {"speckle": "developed", "phases": "incoherent"}
-    spec = small(
+    spec = small_spec(
         target=SLIDING | target, axes={}, instrument=instrument, footprint=footprint, **given
     )
     return [sentence for sentence in told(spec) if ACROSS in sentence]

@@ -6,8 +6,8 @@ from itertools import count, cycle
 import pytest
 
 from sweep.cli.terminal import _effect_cells
-from sweep.tasks import plan
-from sweep.tasks.plan import EffectRow, reproducible_share
+from sweep.tasks.studies import study_plan
+from sweep.tasks.studies.study_plan import EffectRow, reproducible_share
 
 
 def _clocks(with_it, without):
@@ -42,14 +42,14 @@ def test_times_that_disagree_give_no_share(with_it, without):
 def test_long_work_is_measured_a_few_times_only(monkeypatch):
     """Of the first piece of work, if that takes long enough by itself."""
     readings, time = count(), iter(range(10**6))
-    monkeypatch.setattr(plan.time, "process_time", lambda: float(next(time)))
+    monkeypatch.setattr(study_plan.time, "process_time", lambda: float(next(time)))
 
     def clock(seconds):
         return lambda: next(readings) * 0 + seconds
 
     share = reproducible_share([(clock(2.0), clock(1.0)), (clock(math.nan), clock(math.nan))])
     assert share == 0.5
-    assert next(readings) == 2 + 2 * plan.LEAST_ROUNDS
+    assert next(readings) == 2 + 2 * study_plan.COST_ROUNDS_MIN
 
 
 @pytest.mark.parametrize(
@@ -62,7 +62,13 @@ def test_long_work_is_measured_a_few_times_only(monkeypatch):
 )
 def test_a_plan_says_what_is_known_of_a_cost(share, cost, text):
     row = EffectRow(
-        name="image", mode="auto", share=share, where="", bound=0.1, at="the point", cost=cost
+        name="image",
+        mode="auto",
+        simulated_fraction=share,
+        simulated_at="",
+        change_bound=0.1,
+        largest_change_at="the point",
+        time_fraction=cost,
     )
     assert _effect_cells(row)[2] == text
     assert not any("nan" in cell for cell in _effect_cells(row))

@@ -6,23 +6,23 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import zarr
-from small import STUDY, quiet, small
-from small_flights import small_scene
+from small_flights import small_scene_spec
+from small_studies import STUDY_MAPPING, run_serially, small_spec
 
 from sweep.model.effects.catalogue import EFFECTS, NAMES, flag_attributes, flags_of, names_of
-from sweep.tasks import plan as planned
-from sweep.tasks.flight_study import _stretches
-from sweep.tasks.grid_study import (
-    TILE_POINTS,
-    EffectSelection,
+from sweep.tasks.engine.blocks import ParameterBlockGrid
+from sweep.tasks.studies import study_plan as planned
+from sweep.tasks.studies.flight_study import _tile_runs
+from sweep.tasks.studies.grid_study import (
+    TILE_POINTS_MAX,
+    EffectPlanner,
     GridStudy,
-    Selected,
-    Tiles,
-    tile_shape,
+    SelectedEffects,
+    TileGrid,
+    fit_tile_shape,
 )
-from sweep.tasks.plan import effects_table
-from sweep.tasks.studies import study_of
-from sweep.tasks.study import Grid
+from sweep.tasks.studies.study_loading import make_study
+from sweep.tasks.studies.study_plan import effects_table
 
 PROBABILITIES = ("pd_up", "pd_doppler", "pd_down", "pd_shot")
 WIDE = {
@@ -37,7 +37,7 @@ def whole(spec):
     """Arrays of a study that have one value a point, over its whole grid, by name."""
     study, out = GridStudy(spec), {}
     for block in range(study.n_blocks):
-        here = study.grid.block(block)
+        here = study.grid.block_slices(block)
         for name, values in study.evaluate(block).items():
             if values.ndim == len(study.grid.shape):
                 out.setdefault(name, np.empty(study.grid.shape, values.dtype))[here] = values
@@ -47,75 +47,78 @@ def whole(spec):
 @pytest.mark.parametrize("tiles", [[7], [3, 3, 3], [0, 1, 2], [2, 2, 5, 5, 5, 9], [4, 9, 9]])
 def test_stretches_of_a_tile_lie_between_their_edges(tiles):
     tiles = np.array(tiles)
-    edges, tile = _stretches(tiles)
+    edges, tile = _tile_runs(tiles)
     starts = np.flatnonzero(np.diff(tiles, prepend=tiles[0] - 1))
     assert edges.tolist() == [*starts, tiles.size]
     assert (tiles[edges[:-1]][tile] == tiles).all()
 
 
 def test_tiles_are_alike_on_all_sides_and_hold_no_two_words():
-    assert tile_shape((10000, 90), (False, False)) == (32, 32)
-    assert tile_shape((10000, 7), (False, False)) == (146, 7)
-    assert tile_shape((3, 10000), (True, False)) == (1, TILE_POINTS)
-    assert tile_shape((), ()) == ()
+    assert fit_tile_shape((10000, 90), (False, False)) == (32, 32)
+    assert fit_tile_shape((10000, 7), (False, False)) == (146, 7)
+    assert fit_tile_shape((3, 10000), (True, False)) == (1, TILE_POINTS_MAX)
+    assert fit_tile_shape((), ()) == ()
 
 
 def test_every_point_lies_in_one_tile_that_has_its_parameters():
     axes = {"instrument.processing.window": ["hann", "hamming"], **WIDE}
-    grid = Grid(small(axes=axes, storage={"block_points": 977}))
-    tiles = Tiles(grid)
+    grid = ParameterBlockGrid(small_spec(axes=axes, storage={"block_points": 977}))
+    tiles = TileGrid(grid)
     for block in range(0, grid.n_blocks, 7):
-        numbers, place = tiles.of_block(block)
+        numbers, place = tiles.tiles_of_block(block)
         points = grid.parameters(block)
         assert place.size == grid.block_size(block)
-        for alike in tiles.alike(numbers):
-            within = np.flatnonzero(np.isin(place, alike.tiles))
+        for alike in tiles.group_tiles(numbers):
+            within = np.flatnonzero(np.isin(place, alike.requested_indices))
             window = alike.parameters["instrument.processing.window"]
             assert set(points["instrument.processing.window"][within]) == {window}
-            for tile, own in enumerate(alike.tiles):
+            for tile, own in enumerate(alike.requested_indices):
                 here = within[place[within] == own]
                 for path in ("target.range", "target.grazing_angle", "instrument.laser.power"):
                     values = np.broadcast_to(
-                        alike.parameters[path], (len(alike.tiles), *tiles.block_shape)
+                        alike.parameters[path], (len(alike.requested_indices), *tiles.block_shape)
                     )
                     assert np.isin(points[path][here], values[tile]).all()
 
 
 def test_few_points_tell_what_all_of_a_tile_call_for():
     """They settle only tiles that keep all that there is."""
-    spec = small(
+    spec = small_spec(
         axes=WIDE,
         footprint={"phases": "incoherent", "speckle": "none"},
         accuracy={"tolerance": 1e-2},
     )
-    selection = EffectSelection(spec, Grid(spec))
+    selection = EffectPlanner(spec, ParameterBlockGrid(spec))
     tiles = np.arange(selection.tiles.n_blocks)
     kept = np.zeros((len(NAMES), tiles.size), bool)
-    for chosen, plan in selection.plans(tiles):
+    for chosen, plan in selection.iter_plans(tiles):
         kept[:, chosen] = plan.kept
-    for alike in selection.tiles.alike(tiles):
-        whole = selection._plan(alike)
-        assert (kept[:, alike.tiles] == whole.kept).all()
+    for alike in selection.tiles.group_tiles(tiles):
+        whole = selection._plan_group(alike)
+        assert (kept[:, alike.requested_indices] == whole.kept).all()
     assert not kept.all(axis=1)[kept.any(axis=1)].all()
 
 
 def test_few_points_of_a_tile_hold_the_largest_of_each_parameter():
     velocities = [f"{v} m/s" for v in (0, 1, 2, 3, 4, 70, 6, 7, 8, 9, 10, 11)]
-    spec = small(axes={**WIDE, "target.radial_velocity": velocities})
-    tiles = Tiles(Grid(spec))
-    (few,) = tiles.alike(np.arange(tiles.n_blocks), 4)
+    spec = small_spec(axes={**WIDE, "target.radial_velocity": velocities})
+    tiles = TileGrid(ParameterBlockGrid(spec))
+    (few,) = tiles.group_tiles(np.arange(tiles.n_blocks), 4)
     found = few.parameters["target.radial_velocity"]
-    assert found.max() == 70 and found.size < len(few.tiles) * tiles.block_shape[-1]
+    assert found.max() == 70 and found.size < len(few.requested_indices) * tiles.block_shape[-1]
 
 
 def test_points_are_computed_together_that_differ_in_no_effect_that_keeps_them_apart():
     bit = {name: np.uint32(1 << k) for k, name in enumerate(NAMES)}
     base, image, noise = bit["footprint"] | bit["doppler"], bit["image"], bit["signal_shot_noise"]
     flags = np.array([base, base | noise, base | image, base, base | image | noise], np.uint32)
-    found = {tuple(index): names for index, names, own in Selected(flags, flags * 0.0).together()}
+    found = {
+        tuple(index): names
+        for index, names, own in SelectedEffects(flags, flags * 0.0).iter_joint_groups()
+    }
     plain = ("footprint", "doppler", "signal_shot_noise")
     assert found == {(0, 1, 3): plain, (2, 4): (*plain, "image")}
-    for index, _, own in Selected(flags, flags * 0.0).together():
+    for index, _, own in SelectedEffects(flags, flags * 0.0).iter_joint_groups():
         np.testing.assert_array_equal(own, flags[index])
 
 
@@ -133,7 +136,7 @@ def test_flags_and_names_are_each_other():
 
 def test_what_is_simulated_does_not_depend_on_blocks():
     """Bit for bit: plans are those of tiles, and a point's result depends on its effects alone."""
-    few, many = (whole(small(axes=WIDE, storage={"block_points": n})) for n in (333, 65536))
+    few, many = (whole(small_spec(axes=WIDE, storage={"block_points": n})) for n in (333, 65536))
     for name in ("effects", "effects_error", "pd_up", "pd_shot", "p_leakage_up", "snr_down"):
         assert few[name].tobytes() == many[name].tobytes(), name
 
@@ -143,12 +146,12 @@ def test_what_is_simulated_does_not_depend_on_blocks():
 def test_probabilities_differ_from_all_effects_on_by_no_more_than_the_tolerance(tolerance, phases):
     footprint = {"beamlets": 9, "phases": phases, "speckle": "none"}
     sections = {"axes": WIDE, "footprint": footprint, "storage": {"block_points": 65536}}
-    instrument = STUDY["instrument"]
+    instrument = STUDY_MAPPING["instrument"]
     # Records hold all of their echoes: with part of them, overlap leaves more than it is asked to.
     late = instrument["processing"] | {"acquisition_delay": "61 us"}
     sections["instrument"] = instrument | {"processing": late}
-    called = GridStudy(small(**sections, accuracy={"tolerance": tolerance})).evaluate(0)
-    every = GridStudy(small(**sections, effects=FORCED, accuracy={"tolerance": 0})).evaluate(0)
+    called = GridStudy(small_spec(**sections, accuracy={"tolerance": tolerance})).evaluate(0)
+    every = GridStudy(small_spec(**sections, effects=FORCED, accuracy={"tolerance": 0})).evaluate(0)
     for name in PROBABILITIES:
         assert np.abs(called[name] - every[name]).max() <= tolerance, name
     assert called["effects_error"].max() <= tolerance
@@ -160,9 +163,11 @@ def test_probabilities_differ_from_all_effects_on_by_no_more_than_the_tolerance(
 def test_less_is_simulated_the_larger_the_tolerance():
     counts = [
         np.bitwise_count(
-            GridStudy(small(axes=WIDE, accuracy={"tolerance": t}, storage={"block_points": 65536}))
-            .selection.of_block(0)
-            .flags
+            GridStudy(
+                small_spec(axes=WIDE, accuracy={"tolerance": t}, storage={"block_points": 65536})
+            )
+            .effect_planner.select_for_block(0)
+            .effect_flags
         ).sum()
         for t in (1e-3, 1e-2, 1e-1)
     ]
@@ -170,35 +175,39 @@ def test_less_is_simulated_the_larger_the_tolerance():
 
 
 def test_an_effect_is_simulated_everywhere_or_nowhere_if_the_spec_says_so():
-    flags = whole(small(effects={"leakage": "on", "image": "off"}))["effects"]
+    flags = whole(small_spec(effects={"leakage": "on", "image": "off"}))["effects"]
     assert (flags >> NAMES.index("leakage") & 1).all()
     assert not (flags >> NAMES.index("image") & 1).any()
 
 
 def test_a_plan_is_made_once_for_a_tile(monkeypatch):
-    spec = small(axes=WIDE, storage={"block_points": 100})
-    selection, planned = EffectSelection(spec, Grid(spec)), []
-    plans = selection.plans
-    monkeypatch.setattr(selection, "plans", lambda tiles: planned.extend(tiles) or plans(tiles))
-    for block in range(Grid(spec).n_blocks):
-        selection.of_block(block)
+    spec = small_spec(axes=WIDE, storage={"block_points": 100})
+    selection, planned = EffectPlanner(spec, ParameterBlockGrid(spec)), []
+    plans = selection.iter_plans
+    monkeypatch.setattr(
+        selection, "iter_plans", lambda tiles: planned.extend(tiles) or plans(tiles)
+    )
+    for block in range(ParameterBlockGrid(spec).n_blocks):
+        selection.select_for_block(block)
     assert sorted(planned) == list(range(selection.tiles.n_blocks))
 
 
 def test_some_points_of_a_block_have_the_effects_that_they_have_among_all(monkeypatch):
     """And only their tiles are planned: all those of a block of 10^6 points took a minute."""
-    spec = small(axes=WIDE, storage={})
+    spec = small_spec(axes=WIDE, storage={})
     whole, selection, planned = (
-        EffectSelection(spec, Grid(spec)),
-        EffectSelection(spec, Grid(spec)),
+        EffectPlanner(spec, ParameterBlockGrid(spec)),
+        EffectPlanner(spec, ParameterBlockGrid(spec)),
         [],
     )
-    plans = selection.plans
-    monkeypatch.setattr(selection, "plans", lambda tiles: planned.extend(tiles) or plans(tiles))
+    plans = selection.iter_plans
+    monkeypatch.setattr(
+        selection, "iter_plans", lambda tiles: planned.extend(tiles) or plans(tiles)
+    )
     points = np.array([7, 0, 2000, 7, 4199])
-    found, among = selection.of_block(0, points), whole.of_block(0).some(points)
-    np.testing.assert_array_equal(found.flags, among.flags)
-    np.testing.assert_array_equal(found.error, among.error)
+    found, among = selection.select_for_block(0, points), whole.select_for_block(0).subset(points)
+    np.testing.assert_array_equal(found.effect_flags, among.effect_flags)
+    np.testing.assert_array_equal(found.error_bound, among.error_bound)
     assert 0 < len(planned) <= 4 < selection.tiles.n_blocks
 
 
@@ -207,16 +216,19 @@ def test_a_plan_plans_the_effects_of_few_points_of_a_large_block(monkeypatch):
         "target.range": {"linear": ["1 km", "3 km"], "number": 1000},
         "target.grazing_angle": {"linear": ["10 deg", "80 deg"], "number": 1000},
     }
-    study, looked = study_of(small(axes=axes, storage={"block_points": 10**6}), Path("no.zarr")), []
-    of_block = study.selection.of_block
+    study, looked = (
+        make_study(small_spec(axes=axes, storage={"block_points": 10**6}), Path("no.zarr")),
+        [],
+    )
+    of_block = study.effect_planner.select_for_block
 
     def noted(block, points=None):
         looked.append(study.grid.block_size(block) if points is None else len(points))
         return of_block(block, points)
 
-    monkeypatch.setattr(study.selection, "of_block", noted)
-    monkeypatch.setattr(planned, "MEASURING", 0.01)
-    assert study.n_blocks == 1 and planned.measured(study) > 0
+    monkeypatch.setattr(study.effect_planner, "select_for_block", noted)
+    monkeypatch.setattr(planned, "POINT_TIMING_SECONDS", 0.01)
+    assert study.n_blocks == 1 and planned.measure_seconds_per_point(study) > 0
     assert max(looked) < 1000
 
 
@@ -226,8 +238,8 @@ def test_a_smooth_target_has_no_speckle_whatever_targets_are_beside_it():
     footprint = {"beamlets": 7, "phases": "incoherent", "speckle": "none"}
     draws = {"number": 50, "batch": 50}
     same = {"footprint": footprint, "draws": draws}
-    beside = whole(small(axes=axes, **same))
-    alone = whole(small(axes=axes | {"target.roughness": ["0 um"]}, **same))
+    beside = whole(small_spec(axes=axes, **same))
+    alone = whole(small_spec(axes=axes | {"target.roughness": ["0 um"]}, **same))
     bit = np.uint32(1 << NAMES.index("speckle"))
     assert (beside["effects"] & bit > 0).tolist() == [[False] * 2, [True] * 2]
     np.testing.assert_allclose(beside["pd_shot"][0], alone["pd_shot"][0], atol=1e-3, rtol=0)
@@ -239,16 +251,16 @@ HALF_ROUGH = {"target.roughness": ["0 um", "10 um"], "target.range": ["1 km", "6
 
 @pytest.mark.parametrize("kind", ["grid with absent effects", "flight"])
 def test_a_plan_tells_the_shares_of_points_that_the_store_has(kind, flight, tmp_path):
-    spec, store = small_scene(), flight
+    spec, store = small_scene_spec(), flight
     if kind != "flight":
-        spec = small(axes=HALF_ROUGH, draws={"number": 3})
-        store = quiet(spec, tmp_path / "some.zarr").store
+        spec = small_spec(axes=HALF_ROUGH, draws={"number": 3})
+        store = run_serially(spec, tmp_path / "some.zarr").store
     arrays = [zarr.open_array(path, mode="r")[...] for path in store.rglob("effects")]
     flags = np.concatenate([values.ravel() for values in arrays])
     shares = {name: float(np.mean(flags >> k & 1)) for k, name in enumerate(NAMES)}
-    table = effects_table(study_of(spec, store), costs=False)
-    assert {row.name: row.share for row in table.rows} == pytest.approx(shares)
-    assert len(set(shares.values())) > 1 and table.looked_at == 1
+    table = effects_table(make_study(spec, store), costs=False)
+    assert {row.name: row.simulated_fraction for row in table.rows} == pytest.approx(shares)
+    assert len(set(shares.values())) > 1 and table.tile_fraction == 1
 
 
 def test_a_plan_measures_few_points_where_each_takes_long(monkeypatch):
@@ -259,9 +271,9 @@ def test_a_plan_measures_few_points_where_each_takes_long(monkeypatch):
         clock.now += 0.1 * count
         return {}
 
-    study = study_of(small(axes=WIDE), Path("nowhere.zarr"))
+    study = make_study(small_spec(axes=WIDE), Path("nowhere.zarr"))
     monkeypatch.setattr(planned, "evaluate_points", evaluated)
     monkeypatch.setattr(planned, "time", clock)
-    assert planned.measured(study) == pytest.approx(0.1)
-    kept = [row for row in effects_table(study).rows if row.share > 0]
+    assert planned.measure_seconds_per_point(study) == pytest.approx(0.1)
+    kept = [row for row in effects_table(study).rows if row.simulated_fraction > 0]
     assert len(kept) > 5 and clock.now < 5 + 2 * len(kept)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from click.testing import CliRunner
-from small import quiet, small
+from small_studies import run_serially, small_spec
 
 from sweep.cli import main
 from sweep.model.effects.catalogue import CORE
@@ -16,16 +16,16 @@ from sweep.model.outputs import (
     RUNNING,
     RUNNING_COLUMNS,
 )
-from sweep.tasks.grid_study import evaluate_points, select
-from sweep.tasks.study import Grid
-from sweep.tasks.summary import beyond_model
+from sweep.tasks.engine.blocks import ParameterBlockGrid
+from sweep.tasks.studies.grid_study import evaluate_points, select_parameters
+from sweep.tasks.studies.store_summary import count_unsupported_points
 
 RANDOM = (*CORE, "speckle", "pointing_jitter")
 
 
 def points(**draws):
-    spec = small(draws=draws, axes={"target.range": {"linear": ["1 km", "9 km"], "number": 5}})
-    grid = Grid(spec)
+    spec = small_spec(draws=draws, axes={"target.range": {"linear": ["1 km", "9 km"], "number": 5}})
+    grid = ParameterBlockGrid(spec)
     rough = {"target.roughness": 1e-5, "target.pointing_jitter": 1e-5}
     return spec, grid.parameters(0) | rough, grid.block_size(0)
 
@@ -41,7 +41,7 @@ def test_points_are_evaluated_alone_as_they_are_together(much, effects, method):
     random = together["pd_up_error"] > 0
     assert random.any() if effects == RANDOM else not random.any()
     for i in range(count):
-        alone = evaluate_points(spec, select(parameters, np.array([i])), 1, effects)
+        alone = evaluate_points(spec, select_parameters(parameters, np.array([i])), 1, effects)
         for name, values in alone.items():
             in_batches = name in DRAW_OUTPUTS and "number" in much
             assert values.shape == (1, *((2,) if in_batches else sums.get(name, ())))
@@ -63,10 +63,10 @@ def test_a_point_beyond_the_model_costs_itself_alone(tmp_path, draws):
     every = ("line_width", "range_walk", "image", "leakage", "footprint", "doppler_spread")
     modes = dict.fromkeys(every, "on")  # whatever is beside a point
     given = {"draws": draws, "effects": modes, "axes": {"instrument.laser.line_width": widths}}
-    outcome = quiet(small(**given), tmp_path / "some.zarr")
+    outcome = run_serially(small_spec(**given), tmp_path / "some.zarr")
     assert outcome.complete and not outcome.failures
     kept = given | {"axes": {"instrument.laser.line_width": [widths[k] for k in (0, 1, 3)]}}
-    part = xr.open_zarr(quiet(small(**kept), tmp_path / "part.zarr").store)
+    part = xr.open_zarr(run_serially(small_spec(**kept), tmp_path / "part.zarr").store)
     whole = xr.open_zarr(outcome.store)
     for name in part.data_vars:
         found, there = whole[name].values, part[name].values
@@ -75,15 +75,15 @@ def test_a_point_beyond_the_model_costs_itself_alone(tmp_path, draws):
         if not name.startswith("effects"):
             lost = found[[2, 4]]
             assert (np.isnan(lost) if lost.dtype.kind == "f" else lost == -1).all(), name
-    number, why = beyond_model(outcome.store)
+    number, why = count_unsupported_points(outcome.store)
     assert number == 2 and "instrument.laser.line_width" in why and "can be simulated" in why
-    assert beyond_model(tmp_path / "part.zarr") == (0, "")
+    assert count_unsupported_points(tmp_path / "part.zarr") == (0, "")
     told = CliRunner().invoke(main, ["status", str(outcome.store)])
     assert told.exit_code == 0 and why in told.stderr
 
 
 def test_a_block_beyond_the_model_is_committed_without_results(tmp_path):
-    spec = small(axes={"instrument.laser.line_width": ["1 THz", "2 THz"]})
-    outcome = quiet(spec, tmp_path / "none.zarr")
+    spec = small_spec(axes={"instrument.laser.line_width": ["1 THz", "2 THz"]})
+    outcome = run_serially(spec, tmp_path / "none.zarr")
     assert outcome.complete
     assert np.isnan(xr.open_zarr(outcome.store).pd_shot.values).all()

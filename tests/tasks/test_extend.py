@@ -10,23 +10,31 @@ from pathlib import Path
 import pytest
 import zarr
 from click.testing import CliRunner
-from engine import every
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from small import STUDY, copied, everything, failing, quiet, small, tree
-from small_flights import small_scene
+from shot_helpers import parametrize_product
+from small_flights import small_scene_spec
+from small_studies import (
+    STUDY_MAPPING,
+    copy_store,
+    file_contents,
+    file_digests,
+    make_failing_evaluate,
+    run_serially,
+    small_spec,
+)
 
 from sweep.cli import main
 from sweep.model import sampling
-from sweep.storage.locations import successor
-from sweep.tasks import grid_study
+from sweep.storage.locations import staging_path_for
 from sweep.tasks.driver import extend, resume
-from sweep.tasks.grid_study import GridStudy
-from sweep.tasks.progress import Progress, StoreError
-from sweep.tasks.summary import status
-from sweep.tasks.verify import verify
+from sweep.tasks.engine.progress import Progress, StoreError
+from sweep.tasks.studies import grid_study
+from sweep.tasks.studies.grid_study import GridStudy
+from sweep.tasks.studies.store_summary import status
+from sweep.tasks.studies.store_verification import verify
 
-AXES = STUDY["axes"]
+AXES = STUDY_MAPPING["axes"]
 POWER, RANGE, ANGLE = AXES
 REFLECTANCE = "target.reflectance"
 
@@ -42,7 +50,7 @@ def computed(monkeypatch):
         return real(spec, parameters, count, *rest)
 
     monkeypatch.setattr(grid_study, "evaluate_points", counted)
-    monkeypatch.setattr(GridStudy, "compile", lambda self: None)
+    monkeypatch.setattr(GridStudy, "compile_kernels", lambda self: None)
     return calls
 
 
@@ -58,7 +66,7 @@ def at_once(spec, tmp_path):
     """Files of a study that is run at once, each study once."""
     written = repr(spec.to_yaml_mapping())
     if written not in RUN:
-        RUN[written] = tree(quiet(spec, tmp_path / "at_once.zarr").store)
+        RUN[written] = file_digests(run_serially(spec, tmp_path / "at_once.zarr").store)
         shutil.rmtree(tmp_path / "at_once.zarr")
     return RUN[written]
 
@@ -82,17 +90,17 @@ MORE = {
 APPENDED, NEW_AXIS = ({**AXES, POWER: ["1 W", "3 W", "5 W"]}, {**AXES, REFLECTANCE: [0.01, 0.02]})
 
 
-@pytest.mark.parametrize("name", every(3, MORE))
+@pytest.mark.parametrize("name", parametrize_product(3, MORE))
 def test_more_values_and_axes_end_as_the_larger_study_run_at_once(
     undisturbed, tmp_path, computed, name
 ):
     axes, new = MORE[name]
-    store, spec = copied(undisturbed, tmp_path), small(axes=axes)
+    store, spec = copy_store(undisturbed, tmp_path), small_spec(axes=axes)
     outcome = larger(store, spec)
     assert outcome.complete and outcome.store == store and sum(computed) == new
     assert not [file.name for file in tmp_path.iterdir() if file.name != store.name]
     assert not (store / ".sweep" / "recipe.json").exists()
-    assert tree(store) == at_once(spec, tmp_path)
+    assert file_digests(store) == at_once(spec, tmp_path)
     assert all(report.sound and report.complete for report in verify(store))
 
 
@@ -125,16 +133,20 @@ FIXED = {POWER: 1.0, RANGE: 2.0, "target.radial_velocity": 3.0, REFLECTANCE: 0.5
 
 def of(axes, block_points, **changes):
     """The small study with its fixed values, other axes and blocks."""
-    target = STUDY["target"] | {"range": "2.0 km", "radial_velocity": "3.0 m/s", "reflectance": 0.5}
-    return small(axes=axes, target=target, storage={"block_points": block_points}, **changes)
+    target = STUDY_MAPPING["target"] | {
+        "range": "2.0 km",
+        "radial_velocity": "3.0 m/s",
+        "reflectance": 0.5,
+    }
+    return small_spec(axes=axes, target=target, storage={"block_points": block_points}, **changes)
 
 
 def see_that_it_extends(here, pair):
     """The one study is extended to the other, to the bytes of the other run at once."""
     older, spec = (of(*each) for each in pair)
-    store = quiet(older, here / "store.zarr").store
+    store = run_serially(older, here / "store.zarr").store
     assert larger(store, spec).complete
-    assert tree(store) == at_once(spec, here)
+    assert file_digests(store) == at_once(spec, here)
     shutil.rmtree(here)
 
 
@@ -164,21 +176,21 @@ ON_DEMAND = {
 
 
 def test_points_whose_effects_are_others_in_the_larger_grid_are_computed_anew(tmp_path, computed):
-    store = quiet(small(**ON_DEMAND), tmp_path / "store.zarr").store
+    store = run_serially(small_spec(**ON_DEMAND), tmp_path / "store.zarr").store
     axes = {**ON_DEMAND["axes"], ANGLE: {"linear": ["2 deg", "178/2 deg"], "number": 30}}
     axes[RANGE] = {"linear": ["100 m", "17.9 km"], "number": 79}
     axes[ANGLE] = ON_DEMAND["axes"][ANGLE]
-    spec = small(**ON_DEMAND | {"axes": axes})
+    spec = small_spec(**ON_DEMAND | {"axes": axes})
     computed.clear()
     assert larger(store, spec).complete
     new = sum(computed)
     assert 39 * 30 <= new < 79 * 30
-    assert tree(store) == at_once(spec, tmp_path)
+    assert file_digests(store) == at_once(spec, tmp_path)
 
 
 COARSE = {**AXES, RANGE: ["1 km", "3 km"]}
 ROUGH = {
-    "target": STUDY["target"] | {"roughness": "10 um"},
+    "target": STUDY_MAPPING["target"] | {"roughness": "10 um"},
     "footprint": {"beamlets": 1, "speckle": "none"},
 }
 CLOSE = {"line_error": 1e-5, "leakage_error": 1e-5}
@@ -221,28 +233,30 @@ MORE_DRAWS = {
 
 @pytest.mark.parametrize(
     "drawn_as, more",
-    every(4, [("probabilities", ROUGH), ("noise", {}), ("noise", ROUGH)], MORE_DRAWS),
+    parametrize_product(4, [("probabilities", ROUGH), ("noise", {}), ("noise", ROUGH)], MORE_DRAWS),
 )
 def test_more_draws_go_on_from_those_that_are_there(tmp_path, drawn, drawn_as, more):
     method, scene = drawn_as
     before, after, accuracy, tighter = MORE_DRAWS[more]
-    older = small(axes=COARSE, draws=before | {"method": method}, accuracy=accuracy, **scene)
-    spec = small(
+    older = small_spec(axes=COARSE, draws=before | {"method": method}, accuracy=accuracy, **scene)
+    spec = small_spec(
         axes=COARSE, draws=after | {"method": method}, accuracy=accuracy | tighter, **scene
     )
-    store = quiet(older, tmp_path / "store.zarr").store
+    store = run_serially(older, tmp_path / "store.zarr").store
     there = number_of_draws(store)
     drawn.clear()
     assert larger(store, spec).complete
     assert sum(drawn) == number_of_draws(store) - there
-    assert tree(store) == at_once(spec, tmp_path)
+    assert file_digests(store) == at_once(spec, tmp_path)
 
 
 def test_more_draws_and_more_values_together(tmp_path, drawn):
     draws = {"limit": 60, "batch": 20}
     same = {"accuracy": {"tolerance": 0.09}, "effects": dict.fromkeys(CALLED_FOR, "on")}
-    store = quiet(small(axes=COARSE, draws=draws, **same), tmp_path / "store.zarr").store
-    spec = small(
+    store = run_serially(
+        small_spec(axes=COARSE, draws=draws, **same), tmp_path / "store.zarr"
+    ).store
+    spec = small_spec(
         axes={**COARSE, "target.roughness": ["0 m", "10 um"], ANGLE: ["9 deg", *AXES[ANGLE]]},
         draws=draws | {"limit": 100},
         **same,
@@ -251,64 +265,67 @@ def test_more_draws_and_more_values_together(tmp_path, drawn):
     drawn.clear()
     assert larger(store, spec).complete
     assert sum(drawn) == number_of_draws(store) - there
-    assert tree(store) == at_once(spec, tmp_path)
+    assert file_digests(store) == at_once(spec, tmp_path)
 
 
 def test_an_axis_of_effects_that_are_drawn_takes_the_points_without_them(tmp_path, computed):
     kept = dict.fromkeys(("doppler_spread", "range_walk"), "on")
     same = {"draws": {"number": 30}, "effects": kept}
-    store = quiet(small(axes=COARSE, **same), tmp_path / "store.zarr").store
-    spec = small(axes={**COARSE, "target.roughness": ["0 m", "10 um"]}, **same)
+    store = run_serially(small_spec(axes=COARSE, **same), tmp_path / "store.zarr").store
+    spec = small_spec(axes={**COARSE, "target.roughness": ["0 m", "10 um"]}, **same)
     computed.clear()
     assert larger(store, spec).complete and sum(computed) == 12
-    assert tree(store) == at_once(spec, tmp_path)
+    assert file_digests(store) == at_once(spec, tmp_path)
 
 
 def test_whole_spectra_are_drawn_anew_and_it_says_so(tmp_path, capsys):
-    changes = {"axes": {RANGE: ["1 km"]}, "target": STUDY["target"] | {"radial_velocity": "0 m/s"}}
+    changes = {
+        "axes": {RANGE: ["1 km"]},
+        "target": STUDY_MAPPING["target"] | {"radial_velocity": "0 m/s"},
+    }
     draws = {"method": "spectra", "number": 10}
-    store = quiet(small(draws=draws, **changes), tmp_path / "store.zarr").store
-    spec = small(draws=draws | {"number": 20}, **changes)
+    store = run_serially(small_spec(draws=draws, **changes), tmp_path / "store.zarr").store
+    spec = small_spec(draws=draws | {"number": 20}, **changes)
     assert extend(store, spec, scheduler="none").complete
     assert "0 of 1 points are there; 1 to compute (whole spectra are" in capsys.readouterr().err
-    assert tree(store) == at_once(spec, tmp_path)
+    assert file_digests(store) == at_once(spec, tmp_path)
 
 
 def test_spectra_of_random_effects_are_taken_where_points_are_added(tmp_path, computed):
     same = {
-        "target": {**STUDY["target"], "roughness": "10 um"},
+        "target": {**STUDY_MAPPING["target"], "roughness": "10 um"},
         "draws": {"method": "spectra", "number": 4},
         "accuracy": {"tolerance": 0},  # else effects follow from the points that are there
     }
-    store = quiet(small(axes={RANGE: ["1 km"]}, **same), tmp_path / "store.zarr").store
-    spec = small(axes={RANGE: ["1 km", "2 km"]}, **same)
+    store = run_serially(small_spec(axes={RANGE: ["1 km"]}, **same), tmp_path / "store.zarr").store
+    spec = small_spec(axes={RANGE: ["1 km", "2 km"]}, **same)
     computed.clear()
     assert larger(store, spec).complete and computed == [1]
-    assert tree(store) == at_once(spec, tmp_path)
+    assert file_digests(store) == at_once(spec, tmp_path)
 
 
 @pytest.mark.parametrize("errors, new", [({}, 12), (CLOSE, 0)], ids=["by tolerance", "given"])
 def test_a_tighter_tolerance_computes_what_follows_from_it(tmp_path, computed, errors, new):
-    older = small(axes=COARSE, accuracy={"tolerance": 1e-2, **errors})
-    store = quiet(older, tmp_path / "store.zarr").store
-    spec = small(axes=COARSE, accuracy={"tolerance": 9e-3, **errors})
+    older = small_spec(axes=COARSE, accuracy={"tolerance": 1e-2, **errors})
+    store = run_serially(older, tmp_path / "store.zarr").store
+    spec = small_spec(axes=COARSE, accuracy={"tolerance": 9e-3, **errors})
     computed.clear()
     assert larger(store, spec).complete and sum(computed) == new
-    assert tree(store) == at_once(spec, tmp_path)
+    assert file_digests(store) == at_once(spec, tmp_path)
 
 
 def test_only_what_is_committed_of_an_incomplete_store_is_taken(tmp_path, undisturbed, computed):
-    store, spec = copied(undisturbed, tmp_path), small(axes=APPENDED)
+    store, spec = copy_store(undisturbed, tmp_path), small_spec(axes=APPENDED)
     log = store / ".sweep" / "receipts.jsonl"
     log.write_text("".join(log.read_text().splitlines(keepends=True)[:5]))
     assert larger(store, spec, to=store, overwrite=True).complete  # its own place, though named
-    assert sum(computed) == 108 - sum(GridStudy(small()).block_size(b) for b in range(5))
-    assert tree(store) == at_once(spec, tmp_path)
+    assert sum(computed) == 108 - sum(GridStudy(small_spec()).block_size(b) for b in range(5))
+    assert file_digests(store) == at_once(spec, tmp_path)
 
 
 @pytest.mark.parametrize("name", ["pd_shot", "effects"])
 def test_a_damaged_block_is_computed_anew(tmp_path, undisturbed, computed, name):
-    store, spec = copied(undisturbed, tmp_path), small(axes=NEW_AXIS)
+    store, spec = copy_store(undisturbed, tmp_path), small_spec(axes=NEW_AXIS)
     chunk = store / name / "c" / "0" / "1" / "0"
     content = bytearray(chunk.read_bytes())
     content[len(content) // 2] ^= 4
@@ -316,35 +333,35 @@ def test_a_damaged_block_is_computed_anew(tmp_path, undisturbed, computed, name)
     outcome = larger(store, spec)
     assert outcome.complete
     size = next(
-        GridStudy(small()).block_size(b)
+        GridStudy(small_spec()).block_size(b)
         for b in range(12)
-        if GridStudy(small()).chunks(b)[name] == (0, 1, 0)
+        if GridStudy(small_spec()).chunk_positions(b)[name] == (0, 1, 0)
     )
     assert sum(computed) == outcome.points_computed == 72 + size
-    assert tree(store) == at_once(spec, tmp_path)
+    assert file_digests(store) == at_once(spec, tmp_path)
 
 
 def test_in_another_place_not_a_byte_of_the_store_changes(tmp_path, undisturbed):
-    store, new = copied(undisturbed, tmp_path), tmp_path / "elsewhere" / "larger.zarr"
-    before, spec = everything(store), small(axes=APPENDED)
+    store, new = copy_store(undisturbed, tmp_path), tmp_path / "elsewhere" / "larger.zarr"
+    before, spec = file_contents(store), small_spec(axes=APPENDED)
     for file in [store, *store.rglob("*")]:
         file.chmod(0o555 if file.is_dir() else 0o444)
     outcome = larger(store, spec, to=new)
     assert outcome.complete and outcome.store == new
-    assert everything(store) == before
-    assert tree(new) == at_once(spec, tmp_path)
+    assert file_contents(store) == before
+    assert file_digests(new) == at_once(spec, tmp_path)
 
 
 def test_the_same_study_is_nothing_to_extend(tmp_path, undisturbed, computed, capsys):
-    store = copied(undisturbed, tmp_path)
-    assert extend(store, small(title="Again"), scheduler="none").blocks_computed == 0
+    store = copy_store(undisturbed, tmp_path)
+    assert extend(store, small_spec(title="Again"), scheduler="none").blocks_computed == 0
     assert "nothing to extend" in capsys.readouterr().err and not computed
-    assert tree(store) == tree(undisturbed)
+    assert file_digests(store) == file_digests(undisturbed)
 
 
 REFUSED = {
     "another instrument": (
-        {"seed": 4, "target": STUDY["target"] | {"reflectance": 0.03}},
+        {"seed": 4, "target": STUDY_MAPPING["target"] | {"reflectance": 0.03}},
         ["target.reflectance: 0.02 -> 0.03, and must stay", "seed: 3 -> 4, and must stay"],
     ),
     "an effect": ({"effects": {"leakage": "on"}}, ["effects.leakage: auto -> on, and must stay"]),
@@ -363,33 +380,38 @@ REFUSED = {
 
 def see_it_refused(store, spec, *told, match="needs a store of its own"):
     """An extension that is refused in words, and of which nothing is left."""
-    before = everything(store)
+    before = file_contents(store)
     with pytest.raises(StoreError, match=match) as error:
         larger(store, spec)
     assert all(line in str(error.value) for line in told)
-    assert everything(store) == before and not successor(store).exists()
+    assert file_contents(store) == before and not staging_path_for(store).exists()
 
 
 @pytest.mark.parametrize("changes, told", REFUSED.values(), ids=REFUSED)
 def test_what_is_no_larger_study_is_refused_field_by_field(undisturbed, changes, told):
-    see_it_refused(undisturbed, small(**changes), *told)
+    see_it_refused(undisturbed, small_spec(**changes), *told)
 
 
 def test_a_flight_is_no_larger_grid(undisturbed):
-    see_it_refused(undisturbed, small_scene(), match="have nothing in common")
+    see_it_refused(undisturbed, small_scene_spec(), match="have nothing in common")
 
 
 def test_another_extension_that_was_begun_is_not_mixed_up(tmp_path, undisturbed):
-    path = copied(undisturbed, tmp_path)
-    begun, other = (small(axes={**AXES, POWER: ["1 W", "3 W", p]}) for p in ("5 W", "7 W"))
-    assert larger(path, begun, evaluate=failing(set(range(99)), tmp_path / "log")).blocks_done == 0
+    path = copy_store(undisturbed, tmp_path)
+    begun, other = (small_spec(axes={**AXES, POWER: ["1 W", "3 W", p]}) for p in ("5 W", "7 W"))
+    assert (
+        larger(
+            path, begun, evaluate=make_failing_evaluate(set(range(99)), tmp_path / "log")
+        ).blocks_done
+        == 0
+    )
     told = CliRunner().invoke(main, ["status", str(path)]).output
     assert "complete" in told and "being extended: sweep status" in told
     with pytest.raises(StoreError, match=r"\[1, 3, 5\] W -> \[1, 3, 7\] W"):
         larger(path, other)
-    assert tree(path) == tree(undisturbed)
+    assert file_digests(path) == file_digests(undisturbed)
     assert larger(path, other, overwrite=True).complete
-    assert tree(path) == at_once(other, tmp_path)
+    assert file_digests(path) == at_once(other, tmp_path)
 
 
 class Interrupting(Progress):
@@ -401,14 +423,14 @@ class Interrupting(Progress):
 
 
 def test_ctrl_c_leaves_the_store_and_both_commands_go_on(tmp_path, undisturbed, computed):
-    path, spec = copied(undisturbed, tmp_path), small(axes=APPENDED)
+    path, spec = copy_store(undisturbed, tmp_path), small_spec(axes=APPENDED)
     for _ in range(2):
         outcome = extend(path, spec, progress=Interrupting(), scheduler="none")
-        assert outcome.stopped == "interrupted" and outcome.store == successor(path)
-        assert tree(path) == tree(undisturbed)
+        assert outcome.stopped == "interrupted" and outcome.store == staging_path_for(path)
+        assert file_digests(path) == file_digests(undisturbed)
     told = CliRunner().invoke(main, ["resume", str(path), "--scheduler", "none"])
     assert told.exit_code == 0 and f"{path}: 108 of 108 points" in told.stdout
-    assert sum(computed) == 36 and tree(path) == at_once(spec, tmp_path)
+    assert sum(computed) == 36 and file_digests(path) == at_once(spec, tmp_path)
 
 
 #: A client of its own, which dies of SIGKILL at a moment of an extension.
@@ -416,10 +438,10 @@ CLIENT = """
 import os, signal, sys
 sys.path.insert(0, sys.argv[1])
 from pathlib import Path
-from small import STUDY, small
+from small_studies import STUDY_MAPPING, small_spec
 from sweep.storage import locations
 from sweep.tasks import driver
-from sweep.tasks.journal import Journal
+from sweep.tasks.engine.journal import Journal
 
 store, moment = Path(sys.argv[2]), sys.argv[3]
 die = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
@@ -433,7 +455,7 @@ def committing(self, *receipts):
         die()
 
 def renaming(old, new):
-    ahead = {"old": store, "new": locations.successor(store)}
+    ahead = {"old": store, "new": locations.staging_path_for(store)}
     if moment == f"before the {''.join(k for k, v in ahead.items() if v == Path(old))} one moves":
         die()
     rename(old, new)
@@ -444,7 +466,7 @@ elif moment == "as the old one is removed":
     locations.shutil.rmtree = lambda path, **_: Path(path).exists() and die()
 else:
     os.rename = renaming
-spec = small(axes={**STUDY["axes"], "instrument.laser.power": ["1 W", "2 W", "3 W"]})
+spec = small_spec(axes={**STUDY_MAPPING["axes"], "instrument.laser.power": ["1 W", "2 W", "3 W"]})
 if sys.argv[4] == "overwrite":
     driver.run(spec, store=store, overwrite=True, progress=False, scheduler="none")
 else:
@@ -469,7 +491,10 @@ MOMENTS = (
 def test_killed_at_any_moment_a_whole_store_is_there_and_it_goes_on(
     tmp_path, undisturbed, computed, moment, how, again
 ):
-    path, spec = copied(undisturbed, tmp_path), small(axes={**AXES, POWER: ["1 W", "2 W", "3 W"]})
+    path, spec = (
+        copy_store(undisturbed, tmp_path),
+        small_spec(axes={**AXES, POWER: ["1 W", "2 W", "3 W"]}),
+    )
     larger_tree = at_once(spec, tmp_path)
     here = str(Path(__file__).parent)
     ended = subprocess.run(
@@ -478,13 +503,13 @@ def test_killed_at_any_moment_a_whole_store_is_there_and_it_goes_on(
     assert ended.returncode == -signal.SIGKILL
     grid = GridStudy(spec).grid
     there = status(path)  # the next command
-    assert there.complete and tree(path) in (tree(undisturbed), larger_tree)
+    assert there.complete and file_digests(path) in (file_digests(undisturbed), larger_tree)
     computed.clear()
     if again == "extend":
         assert larger(path, spec).complete
     else:
         assert resume(path, progress=False, scheduler="none").complete
-    assert tree(path) == larger_tree
+    assert file_digests(path) == larger_tree
     assert list(tmp_path.iterdir()) == [path]
     taken = 72 if how == "extend" else 0
     done = (

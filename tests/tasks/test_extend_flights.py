@@ -6,25 +6,26 @@ import shutil
 
 import pytest
 from click.testing import CliRunner
-from small import everything, quiet, tree
-from small_flights import SCENE, small_scene
+from small_flights import SCENE_MAPPING, small_scene_spec
+from small_studies import file_contents, file_digests, run_serially
 from test_extend import Interrupting, larger, see_it_refused
 
 from sweep.cli import main
 from sweep.model import clouds, navigation
-from sweep.tasks import flight_study, worker
 from sweep.tasks.driver import extend, resume
-from sweep.tasks.flight_study import FlightStudy
-from sweep.tasks.journal import read_recipe
-from sweep.tasks.verify import verify
+from sweep.tasks.engine import worker
+from sweep.tasks.engine.journal import read_recipe
+from sweep.tasks.studies import flight_study
+from sweep.tasks.studies.flight_study import FlightStudy
+from sweep.tasks.studies.store_verification import verify
 
 POWER, APERTURE = "instrument.laser.power", "instrument.telescope.aperture"
-DESCENT = SCENE["platform"]["path"]
+DESCENT = SCENE_MAPPING["platform"]["path"]
 SMALLER = {
-    "platform": SCENE["platform"] | {"path": DESCENT | {"to": ["0 m", "0 m", "1 km"]}},
+    "platform": SCENE_MAPPING["platform"] | {"path": DESCENT | {"to": ["0 m", "0 m", "1 km"]}},
     "scanners": {
-        "three": SCENE["scanners"]["three"],
-        "line": SCENE["scanners"]["line"] | {"rate": "2 Hz"},
+        "three": SCENE_MAPPING["scanners"]["three"],
+        "line": SCENE_MAPPING["scanners"]["line"] | {"rate": "2 Hz"},
     },
     "draws": {"number": 3, "returns": 3},
     "storage": {"block_shots": 48, "block_draws": 2},
@@ -34,21 +35,21 @@ SMALLER = {
 
 def flight(**changes):
     """The short flight: two scanners, two powers, three draws."""
-    return small_scene(**SMALLER | changes)
+    return small_scene_spec(**SMALLER | changes)
 
 
 def shots_of(spec, *names):
     """Shots of some scanners of a study, by default of all."""
-    return sum(spec.cycles(n) * spec.shots_a_cycle(n) for n in names or spec.scanners)
+    return sum(spec.number_of_cycles(n) * spec.shots_per_cycle(n) for n in names or spec.scanners)
 
 
-SHOTS, CYCLES = shots_of(flight()), flight().cycles("three")
+SHOTS, CYCLES = shots_of(flight()), flight().number_of_cycles("three")
 
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory):
     """The store of the short flight, beside it its eyepoints; not to be changed."""
-    return quiet(flight(), tmp_path_factory.mktemp("flown") / "flight.zarr").store
+    return run_serially(flight(), tmp_path_factory.mktemp("flown") / "flight.zarr").store
 
 
 @pytest.fixture
@@ -81,7 +82,7 @@ def computed(monkeypatch):
 
     monkeypatch.setattr(clouds, "cloud", drawn)
     monkeypatch.setattr(navigation, "solve", solved)
-    monkeypatch.setattr(FlightStudy, "compile", lambda self: None)
+    monkeypatch.setattr(FlightStudy, "compile_kernels", lambda self: None)
     return count
 
 
@@ -95,7 +96,7 @@ def drawn_more(flown):
 
 def at_once(spec, store):
     """Files of a study that is run at once, with the eyepoints of another."""
-    return tree(quiet(spec, store.with_name("at_once.zarr")).store)
+    return file_digests(run_serially(spec, store.with_name("at_once.zarr")).store)
 
 
 TWO, THREE = ["0.01 W", "1 W"], ["3 W", "1 W", "0.01 W"]
@@ -135,33 +136,33 @@ def test_it_ends_as_the_larger_study_run_at_once(here, computed, changes, new):
     assert computed.shots == outcome.points_computed == SHOTS * new
     assert computed.cycles == CYCLES * new
     assert sorted(file.name for file in here.parent.iterdir()) == ["eyepoints", here.name]
-    assert tree(here) == at_once(spec, here)
+    assert file_digests(here) == at_once(spec, here)
 
 
 def test_an_axis_may_come_where_there_was_none(here, computed):
-    one = quiet(flight(axes={}), here.with_name("one.zarr")).store
+    one = run_serially(flight(axes={}), here.with_name("one.zarr")).store
     computed.shots = 0
     assert larger(one, flight()).complete and computed.shots == SHOTS * 3
-    assert tree(one) == tree(here)
+    assert file_digests(one) == file_digests(here)
 
 
 def test_a_scanner_may_come_and_nothing_of_the_others_is_computed(here, computed):
-    cone = SCENE["scanners"]["three"] | {"beams": 4, "rate": "2 Hz"}
+    cone = SCENE_MAPPING["scanners"]["three"] | {"beams": 4, "rate": "2 Hz"}
     spec = flight(scanners={"four": cone, **SMALLER["scanners"]})
     outcome = larger(here, spec)
     assert outcome.complete and computed.shots == shots_of(spec, "four") * 3 * 2
     assert outcome.rays["four"] > 0 == outcome.rays["three"] == outcome.rays["line"]
-    assert tree(here) == at_once(spec, here)
+    assert file_digests(here) == at_once(spec, here)
 
 
 def test_by_workers_in_another_place_and_not_a_byte_of_the_store_changes(
     here, computed, drawn_more
 ):
-    before, new = everything(here), here.with_name("larger.zarr")
+    before, new = file_contents(here), here.with_name("larger.zarr")
     spec = flight(draws=MORE_DRAWS)
     outcome = extend(here, spec, to=new, workers=2, processes=False, progress=False)
     assert outcome.complete and outcome.store == new and computed.shots == SHOTS * 6
-    assert everything(here) == before and tree(new) == drawn_more
+    assert file_contents(here) == before and file_digests(new) == drawn_more
 
 
 def test_as_it_is_typed(here, monkeypatch):
@@ -185,18 +186,18 @@ def test_with_a_tighter_tolerance_only_shots_that_call_for_more_are_computed(
     here, computed, monkeypatch, capsys
 ):
     """Tiles of 16 shots, which neither blocks nor cycles fit: some cycles are known in part."""
-    monkeypatch.setattr(flight_study, "TILE_SHOTS", 16)
+    monkeypatch.setattr(flight_study, "SHOTS_PER_TILE", 16)
     axes = {POWER: ["0.03 W", "0.1 W"]}
     coarse, fine = (
         flight(accuracy={"tolerance": tolerance, **CLOSE}, axes=axes) for tolerance in (0.2, 0.02)
     )
-    store = quiet(coarse, here.with_name("coarse.zarr")).store
+    store = run_serially(coarse, here.with_name("coarse.zarr")).store
     whole, solved = computed.shots, computed.cycles
     computed.shots = computed.cycles = 0
     assert extend(store, fine, scheduler="none").complete
     assert 0 < computed.shots < whole and 0 < computed.cycles < solved
     assert "shots that call for more effects with the tolerance" in capsys.readouterr().err
-    assert tree(store) == at_once(fine, here)
+    assert file_digests(store) == at_once(fine, here)
 
 
 def test_where_the_tolerance_says_how_closely_all_is_computed_anew(here, computed, capsys):
@@ -206,14 +207,14 @@ def test_where_the_tolerance_says_how_closely_all_is_computed_anew(here, compute
     told = capsys.readouterr().err
     assert f"0 of {SHOTS * 6:,} shots are there" in told
     assert "computed more closely, and anew, but where accuracy.line_error and" in told
-    assert tree(here) == at_once(spec, here)
+    assert file_digests(here) == at_once(spec, here)
 
 
 def chunk(store, name, part, scanner="three"):
     """File of a block's chunk, by its place on the axis, draws and cycles."""
     study = FlightStudy(flight(), store)
-    block = study.first_block(scanner) + study.scanners[scanner].number(part)
-    place = study.chunks(block)[f"{scanner}/{name}"]
+    block = study.first_block_of_group(scanner) + study.scanner_grids[scanner].block_at(part)
+    place = study.chunk_positions(block)[f"{scanner}/{name}"]
     return store.joinpath(scanner, name, "c", *map(str, place))
 
 
@@ -237,7 +238,7 @@ def test_a_damaged_block_is_computed_anew(here, computed, drawn_more, name, stre
     assert damaged.read_bytes() != other
     damaged.write_bytes(other)
     assert larger(here, flight(draws=MORE_DRAWS)).complete
-    assert computed.shots == SHOTS * 6 + 48 * lost and tree(here) == drawn_more
+    assert computed.shots == SHOTS * 6 + 48 * lost and file_digests(here) == drawn_more
 
 
 def test_only_what_is_committed_of_an_incomplete_store_is_taken(here, computed, capsys):
@@ -246,14 +247,14 @@ def test_only_what_is_committed_of_an_incomplete_store_is_taken(here, computed, 
     lines = log.read_text().splitlines(keepends=True)[1:7]
     log.write_text("".join(lines))
     older = FlightStudy(flight(), here)
-    useless = older.first_block("three") + older.scanners["three"].number((0, 1, 0))
+    useless = older.first_block_of_group("three") + older.scanner_grids["three"].block_at((0, 1, 0))
     found = {record["block"]: record["points"] for record in map(json.loads, lines)}
     there = sum(found.values()) - found[useless]
     spec = flight(axes={POWER: [*TWO, "3 W"]}, storage=LARGE)
     assert extend(here, spec, scheduler="none").complete
     assert computed.shots == SHOTS * 9 - there
     assert f"{there:,} of {SHOTS * 9:,} shots are there" in capsys.readouterr().err
-    assert tree(here) == at_once(spec, here)
+    assert file_digests(here) == at_once(spec, here)
 
 
 def test_the_store_still_says_where_the_files_of_its_scene_are(tmp_path, monkeypatch, computed):
@@ -263,13 +264,13 @@ def test_the_store_still_says_where_the_files_of_its_scene_are(tmp_path, monkeyp
         csv.writer(file).writerows(
             [["time [s]", "x [m]", "y [m]", "z [m]"], [0, 0, 0, 900], [3, 90, 0, 750]]
         )
-    platform = SCENE["platform"] | {"path": {"kind": "waypoints", "file": "path.csv"}}
-    changes = SCENE | SMALLER | {"platform": platform, "draws": {"number": 1}}
+    platform = SCENE_MAPPING["platform"] | {"path": {"kind": "waypoints", "file": "path.csv"}}
+    changes = SCENE_MAPPING | SMALLER | {"platform": platform, "draws": {"number": 1}}
     older, spec = (
-        type(small_scene()).from_mapping(changes | more, base=base)
+        type(small_scene_spec()).from_mapping(changes | more, base=base)
         for more in ({}, {"draws": {"number": 2}})
     )
-    store = quiet(older, tmp_path / "flight.zarr").store
+    store = run_serially(older, tmp_path / "flight.zarr").store
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     monkeypatch.chdir(elsewhere)
@@ -278,18 +279,21 @@ def test_the_store_still_says_where_the_files_of_its_scene_are(tmp_path, monkeyp
     assert computed.shots == shots_of(spec) * 2
     assert read_recipe(store) == {"base": str(base)}
     assert resume(store, progress=False, scheduler="none").complete
-    assert tree(store) == at_once(spec, store)
+    assert file_digests(store) == at_once(spec, store)
 
 
 def moved(thing, **changes):
     """The scene with one of its objects changed."""
-    objects = SCENE["scene"]["objects"]
-    return {"scene": SCENE["scene"] | {"objects": objects | {thing: objects[thing] | changes}}}
+    objects = SCENE_MAPPING["scene"]["objects"]
+    return {
+        "scene": SCENE_MAPPING["scene"] | {"objects": objects | {thing: objects[thing] | changes}}
+    }
 
 
 REFUSED = {
     "fewer draws": (
-        {"draws": DRAWS | {"number": 2}}, ["draws.number: 3 -> 2, and may only grow"],
+        {"draws": DRAWS | {"number": 2}},
+        ["draws.number: 3 -> 2, and may only grow"],
     ),
     "other draws": (
         {"draws": DRAWS | {"method": "noise", "returns": 4}},
@@ -298,25 +302,30 @@ REFUSED = {
     "a value lost": ({"axes": {POWER: ["1 W", "3 W"]}}, [POWER + ": 0.01 W: lost, and must stay"]),
     "an axis lost": ({"axes": {}}, [POWER + ": 0.01 W: lost"]),
     "a looser tolerance": (
-        {"accuracy": {"tolerance": 0.1}}, ["tolerance: 0.001 -> 0.1, and may only become tighter"],
+        {"accuracy": {"tolerance": 0.1}},
+        ["tolerance: 0.001 -> 0.1, and may only become tighter"],
     ),
     "another scene": (
         moved("stone", radius="25 m", reflectance=0.2),
         ["stone.radius: 20 m -> 25 m, and must stay", "stone.reflectance: 0.3 -> 0.2, and must"],
     ),
-    "another flight": ({"platform": SCENE["platform"]}, ["path.to: ", ", and must stay"]),
+    "another flight": ({"platform": SCENE_MAPPING["platform"]}, ["path.to: ", ", and must stay"]),
     "a scanner lost": (
         {"scanners": {"three": SMALLER["scanners"]["three"]}},
         ["scanners.line.kind: line -> (none), and must stay"],
     ),
     "another scanner": (
-        {"scanners": SMALLER["scanners"] | {"three": SCENE["scanners"]["three"] | {"beams": 4}}},
+        {
+            "scanners": SMALLER["scanners"]
+            | {"three": SCENE_MAPPING["scanners"]["three"] | {"beams": 4}}
+        },
         ["scanners.three.beams: 3 -> 4, and must stay"],
     ),
     "another test": (
-        {"navigation": {"test_level": 0.01}}, ["navigation.test_level: 0 -> 0.01, and must stay"],
+        {"navigation": {"test_level": 0.01}},
+        ["navigation.test_level: 0 -> 0.01, and must stay"],
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("changes, told", REFUSED.values(), ids=REFUSED)
@@ -333,7 +342,7 @@ def test_another_study_put_in_the_older_ones_place_is_not_taken_for_it(
     stopped = {"progress": Interrupting(), "scheduler": "none"}
     extend(here, flight(draws=MORE_DRAWS), to=new, **stopped)
     shutil.rmtree(here)
-    quiet(flight(**moved("ground", reflectance=0.01)), here)
-    worker._opened.cache_clear()
+    run_serially(flight(**moved("ground", reflectance=0.01)), here)
+    worker._cached_block_writer.cache_clear()
     assert resume(new, progress=False, scheduler="none").complete
-    assert tree(new) == drawn_more
+    assert file_digests(new) == drawn_more

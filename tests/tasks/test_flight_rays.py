@@ -8,37 +8,37 @@ import numpy as np
 import pytest
 import xarray as xr
 from click.testing import CliRunner
-from small import quiet, tree
-from small_flights import SCENE
+from small_flights import SCENE_MAPPING
+from small_studies import file_digests, run_serially
 
 import sweep
 from sweep.analysis.answers.comparison import compare_flights as compare
-from sweep.analysis.opening import open_scene
+from sweep.analysis.datasets import open_scene
 from sweep.cli import main
 from sweep.model.accuracy import Accuracy
 from sweep.model.resolution import rays_needed
-from sweep.report.writing import accuracy
-from sweep.spec import SceneSpec, Spec
+from sweep.report.study_report import accuracy_sentences
+from sweep.spec import GridSpec, SceneSpec
 from sweep.storage.locations import eyepoints_path
-from sweep.tasks import eyepoint_study
 from sweep.tasks.driver import extend, run
-from sweep.tasks.progress import StoreError
-from sweep.tasks.summary import rays_table
+from sweep.tasks.engine.progress import StoreError
+from sweep.tasks.studies import eyepoint_study
+from sweep.tasks.studies.store_summary import ray_accuracy_rows
 
 RAYS = Accuracy.rays
 
-LASER = SCENE["instrument"]["laser"] | {"beam_divergence": "4 mrad", "power": "1 mW"}
-OVER_FACETS = SCENE | {
-    "instrument": SCENE["instrument"] | {"laser": LASER},
+LASER = SCENE_MAPPING["instrument"]["laser"] | {"beam_divergence": "4 mrad", "power": "1 mW"}
+OVER_FACETS = SCENE_MAPPING | {
+    "instrument": SCENE_MAPPING["instrument"] | {"laser": LASER},
     "scene": {"origin": "ground", "objects": {"ground": {
         "kind": "hills", "size": "200 m", "spacing": "1 m", "rms_height": "1 m",
         "correlation_length": "4 m", "seed": 1, "reflectance": 0.1,
     }}},
-    "platform": {"path": SCENE["platform"]["path"] | {
+    "platform": {"path": SCENE_MAPPING["platform"]["path"] | {
         "from": ["0 m", "0 m", "160 m"], "to": ["0 m", "0 m", "100 m"],
         "initial_speed": "30 m/s", "final_speed": "20 m/s",
     }},
-    "scanners": {"three": SCENE["scanners"]["three"] | {"rate": "8 Hz"}},
+    "scanners": {"three": SCENE_MAPPING["scanners"]["three"] | {"rate": "8 Hz"}},
     "draws": {"number": 2, "returns": 2},
     "axes": {"instrument.laser.power": ["40 uW", "1 mW"]},
 }  # fmt: skip
@@ -61,7 +61,7 @@ def flown(tmp_path_factory):
     """Stores of the flight at two tolerances, and with many rays by hand."""
     folder = tmp_path_factory.mktemp("flown")
     specs = {"coarse": facets(1e-2), "fine": facets(1e-3), "by hand": facets(1e-4, 8017)}
-    return {name: quiet(spec, folder / f"{name}.zarr").store for name, spec in specs.items()}
+    return {name: run_serially(spec, folder / f"{name}.zarr").store for name, spec in specs.items()}
 
 
 def shots(store):
@@ -75,7 +75,7 @@ def test_the_tolerance_is_in_the_geometry_as_far_as_it_changes_the_rays():
     geometries = [facets(t).geometry_id("three") for t in (1e-1, 1e-2, 1e-3)]
     assert geometries[0] == geometries[1] != geometries[2]
     beamlets = [facets(t).parameters()["footprint.beamlets"] for t in (1e-2, 1e-3, 0)]
-    assert beamlets == [19, 37, 109] and facets().rays_by_tolerance
+    assert beamlets == [19, 37, 109] and facets().is_ray_number_set_by_tolerance
     assert len({facets(t).id for t in (1e-2, 2e-2)}) == 2
     assert facets(1e-3).id != facets(1e-3, 37).id, "other effects, and no estimate"
     assert facets(1e-3).geometry_id("three") == facets(1e-3, 37).geometry_id("three")
@@ -84,16 +84,19 @@ def test_the_tolerance_is_in_the_geometry_as_far_as_it_changes_the_rays():
 @pytest.mark.parametrize("tolerance", [1e-1, 1e-5])
 def test_numbers_by_hand_and_coherent_flights_do_not_follow_it(tolerance):
     by_hand = facets(tolerance, 7)
-    assert by_hand.parameters()["footprint.beamlets"] == 7 and not by_hand.rays_by_tolerance
+    assert (
+        by_hand.parameters()["footprint.beamlets"] == 7
+        and not by_hand.is_ray_number_set_by_tolerance
+    )
     assert by_hand.identity()["parameters"]["footprint.beamlets"] == 7
     coherent = facets(tolerance, footprint={"phases": "coherent"})
     thesis = facets(tolerance, footprint={"phases": "coherent", "beamlets": 109})
-    assert not coherent.rays_by_tolerance and coherent.id == thesis.id
+    assert not coherent.is_ray_number_set_by_tolerance and coherent.id == thesis.id
     assert coherent.geometry_id("three") == thesis.geometry_id("three")
 
 
 def test_the_tolerance_is_on_no_axis_of_a_flight():
-    assert not SceneSpec.may_vary("accuracy.tolerance")
+    assert not SceneSpec.may_be_on_axis("accuracy.tolerance")
 
 
 # The store
@@ -118,7 +121,7 @@ def test_a_shot_with_more_rays_is_as_if_all_had_so_many(flown, tmp_path):
     """Bit for bit, where the same effects are simulated."""
     found = shots(flown["coarse"])
     number = int(np.unique(found.beamlets)[-1])
-    other = shots(quiet(facets(1e-2, number), tmp_path / "all.zarr").store)
+    other = shots(run_serially(facets(1e-2, number), tmp_path / "all.zarr").store)
     alike = ((found.beamlets == number) & (found.effects == other.effects)).values
     assert alike.any()
     for name in (*DETECTED, "snr_up", "range_interpolated", "true_range", "surface"):
@@ -127,7 +130,7 @@ def test_a_shot_with_more_rays_is_as_if_all_had_so_many(flown, tmp_path):
 
 def test_rays_given_by_hand_leave_nothing_that_is_told(flown):
     assert shots(flown["by hand"]).beamlets_error.isnull().all()
-    assert rays_table(flown["by hand"]) == []
+    assert ray_accuracy_rows(flown["by hand"]) == []
 
 
 def test_a_comparison_allows_what_is_told(flown):
@@ -143,17 +146,17 @@ def test_the_table_after_a_run_tells_who_misses_the_tolerance(tmp_path, monkeypa
     few = partial(Accuracy.of, rays=(19, 37))
     monkeypatch.setattr(Accuracy, "of", few)
     spec = facets(1e-3, draws={"number": 1})
-    store = quiet(spec, tmp_path / "most.zarr").store
-    (row,) = rays_table(store)
+    store = run_serially(spec, tmp_path / "most.zarr").store
+    (row,) = ray_accuracy_rows(store)
     told, rays = shots(store).beamlets_error, shots(store).beamlets
-    assert (row.name, row.most, row.tolerance) == ("three", 37, 1e-3)
-    assert row.mean == pytest.approx(float(rays.mean())) == 37
-    assert row.points == told.size and row.met == (told <= 1e-3).sum() < row.points
-    assert row.error == told.max() and row.missed == pytest.approx(row.error - 1e-3)
+    assert (row.name, row.samples_max, row.tolerance_at_worst) == ("three", 37, 1e-3)
+    assert row.mean_samples == pytest.approx(float(rays.mean())) == 37
+    assert row.n_points == told.size and row.n_met == (told <= 1e-3).sum() < row.n_points
+    assert row.worst_error == told.max() and row.excess == pytest.approx(row.worst_error - 1e-3)
     shot = int(told.values[0].argmax())
-    assert row.where == f"power 40 uW, time {float(shots(store).time[shot]):.4g} s"
+    assert row.worst_label == f"power 40 uW, time {float(shots(store).time[shot]):.4g} s"
     said = CliRunner().invoke(main, ["status", str(store)]).output
-    assert "What more rays may change" in said and f"{row.met} of {row.points}" in said
+    assert "What more rays may change" in said and f"{row.n_met} of {row.n_points}" in said
     spec_file = tmp_path / "most.yaml"
     spec_file.write_text(json.dumps(spec.to_yaml_mapping()))
     said = CliRunner().invoke(main, ["plan", str(spec_file)]).output
@@ -171,11 +174,11 @@ def test_rays_are_added_until_they_are_enough():
         return rough[places] / rays
 
     latest = np.full(rough.size, 37)
-    eyepoint_study.refine(37, rough / 37, Accuracy(1e-4), again)
+    eyepoint_study.refine_rays(37, rough / 37, Accuracy(1e-4), again)
     error = rough / latest
     assert (error[latest < RAYS[-1]] <= 1e-4).all() and (latest == 37).any()
     assert (latest[error > 1e-4] == RAYS[-1]).all() and (latest < RAYS[-1]).mean() > 0.8
-    assert max(rays * number for rays, number in asked) <= eyepoint_study.CAST_BEAMLETS
+    assert max(rays * number for rays, number in asked) <= eyepoint_study.RAYS_PER_CAST_MAX
     wasted = latest[latest > 37] / (rough[latest > 37] / 1e-4)
     assert wasted.max() <= 60, "no more than a step of the ladder and the least jump call for"
 
@@ -187,11 +190,11 @@ def test_a_tighter_tolerance_casts_its_own_rays(flown, tmp_path):
     """Errors that are numbers change nothing: other rays leave nothing to be taken."""
     close = {"line_error": 1e-5, "leakage_error": 1e-5}
     coarse, fine = (facets(accuracy={"tolerance": t, **close}) for t in (1e-2, 1e-3))
-    store = quiet(coarse, tmp_path / "flight.zarr").store
+    store = run_serially(coarse, tmp_path / "flight.zarr").store
     outcome = extend(store, fine, progress=False, scheduler="none")
-    assert outcome.complete and outcome.rays["three"] > 37 * fine.cycles("three")
+    assert outcome.complete and outcome.rays["three"] > 37 * fine.number_of_cycles("three")
     assert eyepoints_path(store, fine.geometry_id("three")).exists()
-    assert tree(store) == tree(quiet(fine, tmp_path / "fine.zarr").store)
+    assert file_digests(store) == file_digests(run_serially(fine, tmp_path / "fine.zarr").store)
 
 
 def test_rays_by_hand_are_no_tighter_tolerance(flown):
@@ -201,15 +204,15 @@ def test_rays_by_hand_are_no_tighter_tolerance(flown):
 
 def test_it_is_the_same_however_it_is_cut(flown, tmp_path):
     cut = facets(1e-2, storage={"block_shots": 21, "block_draws": 1})
-    found = shots(quiet(cut, tmp_path / "cut.zarr").store)
+    found = shots(run_serially(cut, tmp_path / "cut.zarr").store)
     np.testing.assert_array_equal(found.beamlets_error, shots(flown["coarse"]).beamlets_error)
 
 
 def test_a_report_says_so_too(flown):
-    told = " ".join(accuracy(shots(flown["coarse"]), facets(1e-2)))
+    told = " ".join(accuracy_sentences(shots(flown["coarse"]), facets(1e-2)))
     worst = float(shots(flown["coarse"]).beamlets_error.max())
     assert f"More beamlets would change one by {worst:.2g} at the most." in told
-    by_hand = " ".join(accuracy(shots(flown["by hand"]), facets(1e-4, 8017)))
+    by_hand = " ".join(accuracy_sentences(shots(flown["by hand"]), facets(1e-4, 8017)))
     assert "What more beamlets would change is not checked." in by_hand
 
 
@@ -224,7 +227,7 @@ def test_a_flight_has_the_probabilities_of_the_grid_where_footprints_are_wide(tm
     common = {"title": "Wide", "instrument": instrument, "footprint": {"speckle": "none"}}
     distance, sine, cosine = 1600.0, math.sin(math.radians(5)), math.cos(math.radians(5))
     height = distance * sine
-    grid = Spec.from_mapping(common | {
+    grid = GridSpec.from_mapping(common | {
         "target": {"reflectance": 0.1, "radial_velocity": "50 m/s", "grazing_angle": "5 deg",
                    "range": f"{distance} m"},
     })  # fmt: skip

@@ -10,18 +10,27 @@ from pathlib import Path
 import pytest
 import yaml
 from click.testing import CliRunner
-from small import STUDY, Said, copied, failing, quiet, small, small_file, tree
+from small_studies import (
+    STUDY_MAPPING,
+    RecordingProgress,
+    copy_store,
+    file_digests,
+    make_failing_evaluate,
+    run_serially,
+    small_mapping,
+    small_spec,
+)
 
 from sweep.cli import main
 from sweep.storage import locations
-from sweep.storage.foreign import foreign_names
-from sweep.storage.locations import is_free, settle, successor
-from sweep.tasks import journal
+from sweep.storage.foreign_files import list_foreign_files
+from sweep.storage.locations import is_free, recover_interrupted_replace, staging_path_for
 from sweep.tasks.driver import extend, resume, run
-from sweep.tasks.progress import StoreError
-from sweep.tasks.verify import pack, verify
+from sweep.tasks.engine import journal
+from sweep.tasks.engine.progress import StoreError
+from sweep.tasks.studies.store_verification import pack_store, verify
 
-POWERS = {**STUDY["axes"], "instrument.laser.power": ["1 W", "2 W", "3 W"]}
+POWERS = {**STUDY_MAPPING["axes"], "instrument.laser.power": ["1 W", "2 W", "3 W"]}
 
 MINE = {
     "notes.txt": "mine", "plots/a.png": "picture", "plots/more/b.png": "another",
@@ -48,24 +57,28 @@ def kept(store: Path, files=MINE) -> dict[str, str]:
 
 def without_mine(store: Path) -> dict:
     names = {*MINE, "reflectance.1"}
-    return {name: content for name, content in tree(store).items() if str(name) not in names}
+    return {
+        name: content for name, content in file_digests(store).items() if str(name) not in names
+    }
 
 
 @pytest.fixture(scope="module")
 def larger(tmp_path_factory):
     """The larger study, run at once."""
     path = tmp_path_factory.mktemp("larger") / "larger.zarr"
-    assert quiet(small(axes=POWERS), path).complete
+    assert run_serially(small_spec(axes=POWERS), path).complete
     return path
 
 
 def test_a_store_as_it_is_made_has_no_foreign_files(undisturbed, tmp_path):
-    assert foreign_names(undisturbed) == []
-    assert foreign_names(pack(undisturbed, tmp_path / "packed.zarr", progress=False)) == []
+    assert list_foreign_files(undisturbed) == []
+    assert (
+        list_foreign_files(pack_store(undisturbed, tmp_path / "packed.zarr", progress=False)) == []
+    )
 
 
 def test_verify_tells_of_them_and_is_content(undisturbed, tmp_path):
-    store = copied(undisturbed, tmp_path)
+    store = copy_store(undisturbed, tmp_path)
     put(store)
     (store / "elsewhere").symlink_to(tmp_path)
     (report,) = verify(store, progress=False)
@@ -79,50 +92,50 @@ def test_verify_tells_of_them_and_is_content(undisturbed, tmp_path):
 
 @pytest.mark.parametrize("name", LITTER)
 def test_what_programs_leave_behind_is_no_damage(undisturbed, tmp_path, name):
-    store = copied(undisturbed, tmp_path)
+    store = copy_store(undisturbed, tmp_path)
     (store / name).write_text("")
     result = CliRunner().invoke(main, ["verify", str(store)], catch_exceptions=False)
     assert result.exit_code == 0 and name in result.output
     assert run(
-        small(seed=4), store=store, overwrite=True, progress=False, scheduler="none"
+        small_spec(seed=4), store=store, overwrite=True, progress=False, scheduler="none"
     ).complete
 
 
 def test_extending_carries_them_over(undisturbed, larger, tmp_path):
-    store = copied(undisturbed, tmp_path)
+    store = copy_store(undisturbed, tmp_path)
     put(store)
     (store / "elsewhere").symlink_to(tmp_path)
-    assert extend(store, small(axes=POWERS), progress=False, scheduler="none").complete
+    assert extend(store, small_spec(axes=POWERS), progress=False, scheduler="none").complete
     assert kept(store) == MINE and (store / "elsewhere").readlink() == tmp_path
     (store / "elsewhere").unlink()
-    assert without_mine(store) == tree(larger)
+    assert without_mine(store) == file_digests(larger)
     assert os.listdir(tmp_path) == [store.name]
 
 
 def test_one_in_the_way_of_a_new_array_gets_a_name_of_its_own(undisturbed, tmp_path):
-    store = copied(undisturbed, tmp_path)
+    store = copy_store(undisturbed, tmp_path)
     put(store)
-    axes = {**STUDY["axes"], "target.reflectance": [0.02, 0.1]}
-    assert extend(store, small(axes=axes), progress=False, scheduler="none").complete
+    axes = {**STUDY_MAPPING["axes"], "target.reflectance": [0.02, 0.1]}
+    assert extend(store, small_spec(axes=axes), progress=False, scheduler="none").complete
     assert (store / "reflectance" / "zarr.json").exists()
     assert (store / "reflectance.1").read_text() == MINE["reflectance"]
     assert verify(store, progress=False)[0].sound
 
 
 def test_those_that_come_while_a_store_is_extended_are_carried_over(undisturbed, larger, tmp_path):
-    store = copied(undisturbed, tmp_path)
-    first = extend(store, small(axes=POWERS), progress=False, scheduler="none",
-                   evaluate=failing(set(range(99)), tmp_path / "log"))  # fmt: skip
-    assert not first.complete and successor(store).exists()
+    store = copy_store(undisturbed, tmp_path)
+    first = extend(store, small_spec(axes=POWERS), progress=False, scheduler="none",
+                   evaluate=make_failing_evaluate(set(range(99)), tmp_path / "log"))  # fmt: skip
+    assert not first.complete and staging_path_for(store).exists()
     put(store)
     assert resume(store, progress=False, scheduler="none", retry_failed=True).complete
-    assert kept(store) == MINE and without_mine(store).keys() == tree(larger).keys()
+    assert kept(store) == MINE and without_mine(store).keys() == file_digests(larger).keys()
 
 
 @pytest.mark.parametrize("number", range(1, 12))
 def test_a_kill_at_any_renaming_loses_none(undisturbed, tmp_path, monkeypatch, number):
     """Killed within the replacement; the next command ends it."""
-    store = copied(undisturbed, tmp_path)
+    store = copy_store(undisturbed, tmp_path)
     put(store)
     rename, count = os.rename, [0]
 
@@ -135,7 +148,7 @@ def test_a_kill_at_any_renaming_loses_none(undisturbed, tmp_path, monkeypatch, n
             raise Killed
         rename(*places)
 
-    succeed = locations.take_place
+    succeed = locations.replace_path
 
     def watched(new, path):
         monkeypatch.setattr(os, "rename", counted)
@@ -143,43 +156,43 @@ def test_a_kill_at_any_renaming_loses_none(undisturbed, tmp_path, monkeypatch, n
 
     monkeypatch.setattr("sweep.tasks.driver.take_place", watched)
     with suppress(Killed):
-        extend(store, small(axes=POWERS), progress=False, scheduler="none")
+        extend(store, small_spec(axes=POWERS), progress=False, scheduler="none")
     monkeypatch.undo()
     for left in tmp_path.glob(".copy.zarr.*"):  # as of a process that is no more
         if "-" in left.name:
             left.rename(left.with_name(left.name.replace(f"-{os.getpid()}.", f"-{2**22 + 1}.")))
     assert resume(store, progress=False, scheduler="none").complete
-    settle(store)
+    recover_interrupted_replace(store)
     assert kept(store) == MINE
     assert os.listdir(tmp_path) == [store.name]
     assert verify(store, progress=False)[0].sound
 
 
 def test_overwriting_refuses_and_names_them(undisturbed, tmp_path):
-    store = copied(undisturbed, tmp_path)
+    store = copy_store(undisturbed, tmp_path)
     put(store)
-    before = tree(store)
+    before = file_digests(store)
     with pytest.raises(StoreError, match=r"notes\.txt.*move them elsewhere"):
-        quiet(small(seed=9), store, overwrite=True, scheduler="none")
-    assert tree(store) == before and os.listdir(tmp_path) == [store.name]
+        run_serially(small_spec(seed=9), store, overwrite=True, scheduler="none")
+    assert file_digests(store) == before and os.listdir(tmp_path) == [store.name]
     (tmp_path / "other").mkdir()
-    other = copied(undisturbed, tmp_path / "other")
+    other = copy_store(undisturbed, tmp_path / "other")
     with pytest.raises(StoreError, match="not sweep's"):
-        extend(other, small(axes=POWERS), to=store, overwrite=True, progress=False)
+        extend(other, small_spec(axes=POWERS), to=store, overwrite=True, progress=False)
     assert kept(store) == MINE
 
 
 def test_those_that_come_while_a_store_is_overwritten_are_carried_over(undisturbed, tmp_path):
-    store = copied(undisturbed, tmp_path)
-    quiet(small(seed=9), store, overwrite=True, scheduler="none",
-          evaluate=failing({3}, tmp_path / "log"))  # fmt: skip
+    store = copy_store(undisturbed, tmp_path)
+    run_serially(small_spec(seed=9), store, overwrite=True, scheduler="none",
+          evaluate=make_failing_evaluate({3}, tmp_path / "log"))  # fmt: skip
     put(store)
     assert resume(store, progress=False, scheduler="none", retry_failed=True).complete
     assert kept(store) == MINE
 
 
 def test_where_they_cannot_be_moved_the_old_folder_stays(undisturbed, tmp_path, monkeypatch):
-    store = copied(undisturbed, tmp_path)
+    store = copy_store(undisturbed, tmp_path)
     put(store)
     rename = os.rename
 
@@ -189,7 +202,7 @@ def test_where_they_cannot_be_moved_the_old_folder_stays(undisturbed, tmp_path, 
         rename(old, new)
 
     monkeypatch.setattr(os, "rename", no_notes)
-    assert extend(store, small(axes=POWERS), progress=False, scheduler="none").complete
+    assert extend(store, small_spec(axes=POWERS), progress=False, scheduler="none").complete
     (old,) = tmp_path.glob(".copy.zarr.replaced-*")
     assert (old / "notes.txt").read_text() == "mine"
 
@@ -197,13 +210,15 @@ def test_where_they_cannot_be_moved_the_old_folder_stays(undisturbed, tmp_path, 
 def test_an_empty_folder_is_a_free_place(undisturbed, tmp_path):
     for name in ("a.zarr", "b.zarr", "c.zarr", "d.zarr"):
         (tmp_path / name).mkdir()
-    assert quiet(small(), tmp_path / "a.zarr").complete
-    assert tree(tmp_path / "a.zarr") == tree(undisturbed)
-    assert pack(undisturbed, tmp_path / "b.zarr", progress=False)
-    grown = small(axes=POWERS)
+    assert run_serially(small_spec(), tmp_path / "a.zarr").complete
+    assert file_digests(tmp_path / "a.zarr") == file_digests(undisturbed)
+    assert pack_store(undisturbed, tmp_path / "b.zarr", progress=False)
+    grown = small_spec(axes=POWERS)
     to = tmp_path / "c.zarr"
     assert extend(undisturbed, grown, to=to, progress=False, scheduler="none").complete
-    assert quiet(small(), tmp_path / "d.zarr", overwrite=True, scheduler="none").complete
+    assert run_serially(
+        small_spec(), tmp_path / "d.zarr", overwrite=True, scheduler="none"
+    ).complete
     assert sorted(os.listdir(tmp_path)) == ["a.zarr", "b.zarr", "c.zarr", "d.zarr"]
 
 
@@ -212,7 +227,7 @@ def test_a_folder_with_anything_in_it_is_not(tmp_path):
     (tmp_path / "a.zarr" / "notes.txt").write_text("mine")
     for overwrite in (False, True):
         with pytest.raises(StoreError, match="not a Zarr store"):
-            quiet(small(), tmp_path / "a.zarr", overwrite=overwrite, scheduler="none")
+            run_serially(small_spec(), tmp_path / "a.zarr", overwrite=overwrite, scheduler="none")
     assert not is_free(tmp_path / "a.zarr" / "notes.txt") and is_free(tmp_path / "b" / "c")
     assert (tmp_path / "a.zarr" / "notes.txt").read_text() == "mine"
 
@@ -221,34 +236,39 @@ def test_a_folder_with_anything_in_it_is_not(tmp_path):
 
 
 def test_run_with_resume_begins_goes_on_and_is_content(undisturbed, tmp_path):
-    store, study = tmp_path / "a.zarr", small()
+    store, study = tmp_path / "a.zarr", small_spec()
     how = {"store": store, "resume": True, "progress": False, "scheduler": "none"}
-    first = run(study, **how, evaluate=failing({3, 4}, tmp_path / "log"))
+    first = run(study, **how, evaluate=make_failing_evaluate({3, 4}, tmp_path / "log"))
     assert not first.complete and first.blocks_done == first.blocks - 2
     second = run(study, **how, retry_failed=True)
     assert second.complete and second.blocks_computed == 2
-    assert tree(store) == tree(undisturbed)
+    assert file_digests(store) == file_digests(undisturbed)
     third = run(study, **how)
     assert third.complete and third.blocks_computed == 0
     with pytest.raises(StoreError, match="holds another study"):
-        run(small(seed=9), **how)
-    assert tree(store) == tree(undisturbed)
+        run(small_spec(seed=9), **how)
+    assert file_digests(store) == file_digests(undisturbed)
     with pytest.raises(ValueError, match="give one of them"):
         run(study, **how, overwrite=True)
 
 
 def test_run_with_resume_goes_on_with_what_is_to_replace_a_store(undisturbed, tmp_path):
-    store = copied(undisturbed, tmp_path)
+    store = copy_store(undisturbed, tmp_path)
     how = {"store": store, "progress": False, "scheduler": "none"}
-    run(small(seed=9), **how, overwrite=True, evaluate=failing({3}, tmp_path / "log"))
-    outcome = run(small(seed=9), **how, resume=True, retry_failed=True)
+    run(
+        small_spec(seed=9),
+        **how,
+        overwrite=True,
+        evaluate=make_failing_evaluate({3}, tmp_path / "log"),
+    )
+    outcome = run(small_spec(seed=9), **how, resume=True, retry_failed=True)
     assert outcome.complete and outcome.blocks_computed == 1 and outcome.store == store
-    assert not successor(store).exists()
+    assert not staging_path_for(store).exists()
 
 
 def test_run_with_resume_is_one_command_for_all_starts_of_a_job(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    Path("small.yaml").write_text(yaml.safe_dump(small_file()))
+    Path("small.yaml").write_text(yaml.safe_dump(small_mapping()))
     command = ["run", "small.yaml", "--resume", "--scheduler", "none"]
 
     def start(*more):
@@ -260,7 +280,7 @@ def test_run_with_resume_is_one_command_for_all_starts_of_a_job(tmp_path, monkey
     next(file for file in Path("results/small.zarr/pd_up/c").rglob("*") if file.is_file()).unlink()
     mended = start()
     assert mended.exit_code == 0 and "computed 1 of 9 blocks" in mended.output
-    Path("small.yaml").write_text(yaml.safe_dump(small_file(seed=9)))
+    Path("small.yaml").write_text(yaml.safe_dump(small_mapping(seed=9)))
     refused = start()
     assert refused.exit_code == 2 and "seed: 3 -> 9" in refused.output
     both = start("--overwrite")
@@ -275,12 +295,12 @@ def test_run_with_resume_waits_for_a_driver_killed_elsewhere(
     undisturbed, tmp_path, monkeypatch, lives
 ):
     """As of a job that is started again on another node, seconds after it was killed."""
-    monkeypatch.setattr(journal, "EXPIRY", 2.0)
-    monkeypatch.setattr(journal, "WATCH", 0.5)
-    store = copied(undisturbed, tmp_path)
+    monkeypatch.setattr(journal, "HEARTBEAT_AGE_MAX", 2.0)
+    monkeypatch.setattr(journal, "SILENCE_WATCH_SECONDS", 0.5)
+    store = copy_store(undisturbed, tmp_path)
     lock = store / ".sweep" / "lock"
     lock.write_text(json.dumps({"host": "elsewhere", "pid": 1, "start": 1, "token": "t"}))
-    said, stop = Said(), threading.Event()
+    said, stop = RecordingProgress(), threading.Event()
 
     def beat():
         while not stop.wait(0.1):
@@ -292,11 +312,11 @@ def test_run_with_resume_waits_for_a_driver_killed_elsewhere(
         if lives:
             beating.start()
             with pytest.raises(StoreError, match="process 1 on elsewhere"):
-                run(small(), **how, resume=True)
+                run(small_spec(), **how, resume=True)
         else:
             with pytest.raises(StoreError, match="process 1 on elsewhere"):
                 resume(store, progress=False, scheduler="none")
-            assert run(small(), **how, resume=True).complete
+            assert run(small_spec(), **how, resume=True).complete
     finally:
         stop.set()
         if lives:

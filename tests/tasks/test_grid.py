@@ -3,56 +3,56 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from small import STUDY, small
-from small_flights import small_scene
+from small_flights import small_scene_spec
+from small_studies import STUDY_MAPPING, small_spec
 
-from sweep.storage.locations import located
-from sweep.tasks.flight_study import FlightStudy
-from sweep.tasks.grid_study import canonical_rows
-from sweep.tasks.study import (
-    BLOCK_POINTS,
-    MOST_BLOCKS,
-    Grid,
-    block_shape,
-    points_a_block,
-    seconds_a_point,
+from sweep.storage.locations import parse_location
+from sweep.tasks.engine.blocks import (
+    DEFAULT_BLOCK_POINTS,
+    DEFAULT_BLOCKS_MAX,
+    ParameterBlockGrid,
+    default_block_points,
+    fit_block_shape,
+    worst_cpu_seconds_per_point,
 )
+from sweep.tasks.studies.flight_study import FlightStudy
+from sweep.tasks.studies.grid_study import canonical_point_rows
 
 
-def points_of(grid: Grid) -> np.ndarray:
+def points_of(grid: ParameterBlockGrid) -> np.ndarray:
     """Numbers of the points of every block, laid end to end."""
-    numbers = np.arange(grid.points).reshape(grid.shape)
-    return np.concatenate([numbers[grid.block(i)].ravel() for i in range(grid.n_blocks)])
+    numbers = np.arange(grid.n_points).reshape(grid.shape)
+    return np.concatenate([numbers[grid.block_slices(i)].ravel() for i in range(grid.n_blocks)])
 
 
 @pytest.mark.parametrize("block_points", [1, 5, 7, 36, 1000])
 def test_blocks_hold_every_point_once(block_points):
-    grid = Grid(small(storage={"block_points": block_points}))
-    assert sorted(points_of(grid)) == list(range(grid.points)) == list(range(72))
+    grid = ParameterBlockGrid(small_spec(storage={"block_points": block_points}))
+    assert sorted(points_of(grid)) == list(range(grid.n_points)) == list(range(72))
     assert max(grid.block_size(i) for i in range(grid.n_blocks)) <= block_points
-    assert sum(grid.block_size(i) for i in range(grid.n_blocks)) == grid.points
+    assert sum(grid.block_size(i) for i in range(grid.n_blocks)) == grid.n_points
     marked = np.zeros(grid.n_blocks, bool)
     marked[::2] = True
-    assert grid.points_in(marked) == sum(grid.block_size(i) for i in range(0, grid.n_blocks, 2))
+    assert grid.count_points(marked) == sum(grid.block_size(i) for i in range(0, grid.n_blocks, 2))
 
 
 def test_a_block_keeps_radiometric_axes_whole_before_geometric_ones():
-    assert block_shape((3, 10_000, 90), (False, True, True), 32768) == (3, 121, 90)
-    assert block_shape((10_000, 90, 3, 3), (True, True, False, False), 32768) == (40, 90, 3, 3)
-    assert block_shape((50_000, 4), (False, True), 32768) == (32768, 1)
-    assert block_shape((), (), 10) == ()
-    assert Grid(small()).block_shape == (2, 1, 3)
+    assert fit_block_shape((3, 10_000, 90), (False, True, True), 32768) == (3, 121, 90)
+    assert fit_block_shape((10_000, 90, 3, 3), (True, True, False, False), 32768) == (40, 90, 3, 3)
+    assert fit_block_shape((50_000, 4), (False, True), 32768) == (32768, 1)
+    assert fit_block_shape((), (), 10) == ()
+    assert ParameterBlockGrid(small_spec()).block_shape == (2, 1, 3)
 
 
 def test_parameters_of_a_block_are_those_of_its_points_in_c_order():
-    spec = small()
-    grid = Grid(spec)
-    by_name = {m.path: np.asarray(m.values) for axis in spec.axes for m in axis.members}
+    spec = small_spec()
+    grid = ParameterBlockGrid(spec)
+    by_name = {m.path: np.asarray(m.values) for axis in spec.axes for m in axis.parameters}
     whole = np.meshgrid(*by_name.values(), indexing="ij")
     for i in range(grid.n_blocks):
         parameters = grid.parameters(i)
         for path, values in zip(by_name, whole, strict=True):
-            np.testing.assert_array_equal(parameters[path], values[grid.block(i)].ravel())
+            np.testing.assert_array_equal(parameters[path], values[grid.block_slices(i)].ravel())
         assert parameters["target.reflectance"] == 0.02
 
 
@@ -65,7 +65,7 @@ def test_members_of_a_zipped_axis_run_together():
             ]
         }
     }
-    grid = Grid(small(axes=axes, storage={"block_points": 5}))
+    grid = ParameterBlockGrid(small_spec(axes=axes, storage={"block_points": 5}))
     assert grid.dims == ("cut",)
     parameters = grid.parameters(0)
     np.testing.assert_allclose(parameters["target.range"], [1e3, 2e3, 3e3, 3e3, 3e3])
@@ -74,13 +74,13 @@ def test_members_of_a_zipped_axis_run_together():
 
 
 def test_a_study_without_axes_is_one_point_in_one_block():
-    grid = Grid(small(axes={}))
-    assert (grid.points, grid.n_blocks, grid.block(0), grid.block_size(0)) == (1, 1, (), 1)
-    assert canonical_rows(grid.parameters(0), 1).shape[0] == 1
+    grid = ParameterBlockGrid(small_spec(axes={}))
+    assert (grid.n_points, grid.n_blocks, grid.block_slices(0), grid.block_size(0)) == (1, 1, (), 1)
+    assert canonical_point_rows(grid.parameters(0), 1).shape[0] == 1
 
 
 def test_geometry_order_brings_equal_geometry_together_and_drops_nothing():
-    grid = Grid(small(storage={"block_points": 36}))
+    grid = ParameterBlockGrid(small_spec(storage={"block_points": 36}))
     order, parameters = grid.geometry_order(0), grid.parameters(0)
     assert sorted(order) == list(range(grid.block_size(0)))
     ranges = parameters["target.range"][order]
@@ -89,40 +89,44 @@ def test_geometry_order_brings_equal_geometry_together_and_drops_nothing():
     assert changes + 1 == len(set(zip(ranges, angles, strict=True)))
 
 
-def rows_by_point(grid: Grid) -> dict[tuple, bytes]:
+def rows_by_point(grid: ParameterBlockGrid) -> dict[tuple, bytes]:
     """Canonical row of each point, by range, angle and power."""
     rows = {}
     for i in range(grid.n_blocks):
         p, n = grid.parameters(i), grid.block_size(i)
         names = ("target.range", "target.grazing_angle", "instrument.laser.power")
         columns = [np.broadcast_to(p[name], (n,)) for name in names]
-        for key, row in zip(zip(*columns, strict=True), canonical_rows(p, n), strict=True):
+        for key, row in zip(zip(*columns, strict=True), canonical_point_rows(p, n), strict=True):
             rows[key] = row.tobytes()
     return rows
 
 
 def test_a_points_row_follows_from_its_values_not_from_axes_order_or_blocks():
-    whole = rows_by_point(Grid(small()))
-    axes = dict(reversed(list(STUDY["axes"].items())))
-    turned = rows_by_point(Grid(small(axes=axes, storage={"block_points": 5})))
+    whole = rows_by_point(ParameterBlockGrid(small_spec()))
+    axes = dict(reversed(list(STUDY_MAPPING["axes"].items())))
+    turned = rows_by_point(ParameterBlockGrid(small_spec(axes=axes, storage={"block_points": 5})))
     assert whole == turned
     assert len(set(whole.values())) == 72
     del axes["instrument.laser.power"]
-    one_watt = rows_by_point(Grid(small(axes=axes)))  # 1 W is now a parameter, not an axis
+    one_watt = rows_by_point(
+        ParameterBlockGrid(small_spec(axes=axes))
+    )  # 1 W is now a parameter, not an axis
     assert len(one_watt) == 36
     assert all(whole[point] == row for point, row in one_watt.items())
 
 
 def test_words_and_signed_zeros_are_canonical():
-    one = canonical_rows({"a": "hamming", "b": 0.0}, 2)
-    other = canonical_rows({"b": np.array([-0.0, 0.0]), "a": np.array(["hamming", "hann"])}, 2)
+    one = canonical_point_rows({"a": "hamming", "b": 0.0}, 2)
+    other = canonical_point_rows(
+        {"b": np.array([-0.0, 0.0]), "a": np.array(["hamming", "hann"])}, 2
+    )
     assert one[0].tobytes() == other[0].tobytes()
     assert one[1].tobytes() != other[1].tobytes()
 
 
 def test_no_text_makes_a_row_that_holds_nan():
     texts = np.array([f"kaiser({i / 100})" for i in range(20_000)])
-    assert not np.isnan(canonical_rows({"window": texts}, texts.size)).any()
+    assert not np.isnan(canonical_point_rows({"window": texts}, texts.size)).any()
 
 
 def test_a_grid_of_ten_million_blocks_costs_the_length_of_its_axes():
@@ -130,9 +134,9 @@ def test_a_grid_of_ten_million_blocks_costs_the_length_of_its_axes():
         "target.range": {"linear": ["1 m", "10 km"], "number": 10_000},
         "target.radial_velocity": {"linear": ["0 m/s", "100 m/s"], "number": 1000},
     }
-    spec = small(axes=axes, storage={"block_points": 1})
+    spec = small_spec(axes=axes, storage={"block_points": 1})
     tracemalloc.start()
-    grid = Grid(spec)
+    grid = ParameterBlockGrid(spec)
     assert math.prod(grid.shape) == grid.n_blocks == 10_000_000
     last = grid.parameters(grid.n_blocks - 1)
     peak = tracemalloc.get_traced_memory()[1]
@@ -141,16 +145,16 @@ def test_a_grid_of_ten_million_blocks_costs_the_length_of_its_axes():
     assert last["target.radial_velocity"] == pytest.approx(100.0)
     assert peak < 1_000_000
     with pytest.raises(IndexError):
-        grid.block(grid.n_blocks)
+        grid.block_slices(grid.n_blocks)
 
 
 @pytest.mark.parametrize("points", [1, 10**6, 10**9, 10**10, 10**12])
 def test_files_stay_countable_however_large_a_study_is(points):
     """Blocks of a single axis: 25 arrays of them are less than half a million files."""
-    (size,) = block_shape((points,), (False,), points_a_block(points))
-    assert -(-points // size) <= MOST_BLOCKS
-    assert size >= min(points, BLOCK_POINTS)
-    assert points > BLOCK_POINTS * MOST_BLOCKS or size <= BLOCK_POINTS
+    (size,) = fit_block_shape((points,), (False,), default_block_points(points))
+    assert -(-points // size) <= DEFAULT_BLOCKS_MAX
+    assert size >= min(points, DEFAULT_BLOCK_POINTS)
+    assert points > DEFAULT_BLOCK_POINTS * DEFAULT_BLOCKS_MAX or size <= DEFAULT_BLOCK_POINTS
 
 
 SPECTRA = {"number": 1000, "method": "spectra"}
@@ -165,25 +169,25 @@ SPECTRA = {"number": 1000, "method": "spectra"}
         ({"draws": {"number": 1000, "batch": 10}}, 1435),
         ({"draws": {"limit": 1000}}, 1435),
         ({"draws": {"number": 10**9}}, 1),
-        ({"footprint": STUDY["footprint"] | {"beamlets": 100_000}}, 2994),
+        ({"footprint": STUDY_MAPPING["footprint"] | {"beamlets": 100_000}}, 2994),
         ({"draws": SPECTRA}, 18),
     ],
 )
 def test_a_block_of_points_that_take_long_holds_fewer(changes, most):
     """So that no block takes more than a minute or so: (40 us + 0.2 us a beamlet) a draw."""
     axes = {"target.range": {"linear": ["1 km", "2 km"], "number": 100_000}}
-    spec = small(axes=axes, storage={"block_points": 50_000}, **changes)
-    assert Grid(spec).block_shape == (most,)
+    spec = small_spec(axes=axes, storage={"block_points": 50_000}, **changes)
+    assert ParameterBlockGrid(spec).block_shape == (most,)
 
 
 def test_the_dearest_value_of_an_axis_decides_how_large_blocks_are():
     sizes = {"instrument.processing.fft_size": [2**12, 2**16, 2**14]}
-    spec = small(axes=STUDY["axes"] | sizes, draws=SPECTRA)
-    assert 1.1 > seconds_a_point(spec) / (1000 * 2e-7 * 2**16) > 1
+    spec = small_spec(axes=STUDY_MAPPING["axes"] | sizes, draws=SPECTRA)
+    assert 1.1 > worst_cpu_seconds_per_point(spec) / (1000 * 2e-7 * 2**16) > 1
 
 
 def test_what_runs_along_each_dimension_is_known_as_a_grid_is_made():
     """Threads share a grid: what filled in later could be seen half filled."""
-    for grid in FlightStudy(small_scene(), located("none.zarr")).grids:
-        sizes = [len(next(iter(values.values()))) for values in grid.values_along()]
+    for grid in FlightStudy(small_scene_spec(), parse_location("none.zarr")).grids:
+        sizes = [len(next(iter(values.values()))) for values in grid.values_by_dim()]
         assert sizes == list(grid.shape)

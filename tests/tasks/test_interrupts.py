@@ -8,13 +8,13 @@ import time
 from pathlib import Path
 
 import pytest
-from small import quiet, receipts, small
+from small_studies import receipt_blocks, run_serially, small_spec
 
 import sweep
-from sweep.messages import INCOMPLETE
-from sweep.tasks import interrupts
-from sweep.tasks.interrupts import Interrupts
-from sweep.tasks.progress import Progress
+from sweep.messages import EXIT_INCOMPLETE
+from sweep.tasks.engine import interrupts
+from sweep.tasks.engine.interrupts import InterruptHandler
+from sweep.tasks.engine.progress import Progress
 
 RUN = """
 import os, sys, time
@@ -22,11 +22,11 @@ from contextlib import nullcontext
 from pathlib import Path
 
 store, as_what, sys.path[:0] = sys.argv[1], sys.argv[2], sys.argv[3:]
-from small import small
+from small_studies import small_spec
 import numpy as np
 import sweep
-from sweep.kernels import njit
-from sweep.messages import as_command
+from sweep.kernel_cache import njit
+from sweep.messages import suggest_shell_commands
 
 @njit()
 def spin(n):
@@ -48,8 +48,8 @@ def long(study, block):
         spin(SECONDS * per_second)
     return results
 
-with as_command() if as_what == "command" else nullcontext():
-    outcome = sweep.run(small(), store=store, scheduler="none", evaluate=long)
+with suggest_shell_commands() if as_what == "command" else nullcontext():
+    outcome = sweep.run(small_spec(), store=store, scheduler="none", evaluate=long)
 print(outcome.blocks_done, outcome.stopped, flush=True)
 sys.exit(0 if outcome.complete else 3)
 """
@@ -106,13 +106,13 @@ def run(tmp_path):
 
 
 def assert_goes_on(store):
-    assert len(receipts(store)) == 2
+    assert len(receipt_blocks(store)) == 2
     outcome = sweep.resume(store, scheduler="none", progress=False)
     assert outcome.complete and outcome.blocks_computed == outcome.blocks - 2
 
 
 @pytest.mark.parametrize(
-    ("as_what", "code"), [("command", INCOMPLETE), ("program", 128 + signal.SIGTERM)]
+    ("as_what", "code"), [("command", EXIT_INCOMPLETE), ("program", 128 + signal.SIGTERM)]
 )
 def test_sigterm_ends_a_run_in_compiled_code_within_seconds(run, as_what, code):
     """A batch system kills what is left after 30 s."""
@@ -130,7 +130,7 @@ def test_one_ctrl_c_in_compiled_code_is_answered_and_the_second_ends_the_command
     time.sleep(1.0)
     assert long.process.poll() is None
     since = long.send(signal.SIGINT)
-    assert long.process.wait(10) == INCOMPLETE and time.monotonic() - since < 5
+    assert long.process.wait(10) == EXIT_INCOMPLETE and time.monotonic() - since < 5
     assert_goes_on(long.store)
 
 
@@ -150,7 +150,7 @@ def test_ctrl_c_twice_never_ends_a_program_of_the_users(run):
 def test_a_closed_terminal_lets_compiled_code_end(run):
     long = run("command", 8)
     long.send(signal.SIGHUP)
-    assert long.process.wait(60) == INCOMPLETE
+    assert long.process.wait(60) == EXIT_INCOMPLETE
     assert long.process.stdout.read().strip() == "3 interrupted"
 
 
@@ -174,7 +174,7 @@ def test_after_sigterm_a_block_that_does_not_end_is_stopped(tmp_path, monkeypatc
                 time.sleep(0.01)
         return study.evaluate(block)
 
-    outcome = quiet(small(), tmp_path / "store.zarr", scheduler="none", evaluate=long)
+    outcome = run_serially(small_spec(), tmp_path / "store.zarr", scheduler="none", evaluate=long)
     assert time.monotonic() - begun[0] < 5
     assert outcome.stopped == "stopped at once" and outcome.blocks_done == 2
     assert_goes_on(tmp_path / "store.zarr")
@@ -187,7 +187,7 @@ def test_what_ends_soon_after_sigterm_is_committed(tmp_path):
             time.sleep(0.5)
         return study.evaluate(block)
 
-    outcome = quiet(small(), tmp_path / "store.zarr", scheduler="none", evaluate=soon)
+    outcome = run_serially(small_spec(), tmp_path / "store.zarr", scheduler="none", evaluate=soon)
     assert outcome.stopped == "interrupted" and outcome.blocks_done == 2
     assert_goes_on(tmp_path / "store.zarr")
 
@@ -195,12 +195,12 @@ def test_what_ends_soon_after_sigterm_is_committed(tmp_path):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_is_announced_at_once_where_python_runs(number):
     listener = Listener()
-    with Interrupts(listener) as asked:
+    with InterruptHandler(listener) as asked:
         os.kill(os.getpid(), number)
         end = time.monotonic() + 5
         while not listener.lines and time.monotonic() < end:
             time.sleep(0.01)
-        assert asked.stopping and len(listener.lines) == 1
+        assert asked.is_stopping and len(listener.lines) == 1
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), number)
             time.sleep(5)
@@ -211,11 +211,11 @@ def test_signals_of_others_leave_a_run_alone(tmp_path):
     heard = []
     before = signal.signal(signal.SIGUSR1, lambda *_: heard.append(True))
     try:
-        with Interrupts() as asked:
+        with InterruptHandler() as asked:
             for _ in range(3):
                 os.kill(os.getpid(), signal.SIGUSR1)
                 time.sleep(0.05)
-            assert quiet(small(), tmp_path / "s.zarr", scheduler="none").complete
+            assert run_serially(small_spec(), tmp_path / "s.zarr", scheduler="none").complete
     finally:
         signal.signal(signal.SIGUSR1, before)
-    assert len(heard) == 3 and not asked.stopping
+    assert len(heard) == 3 and not asked.is_stopping

@@ -2,17 +2,17 @@ import os
 
 import pytest
 
-from sweep.storage.locations import JOURNAL
-from sweep.storage.opening import (
-    RECEIPTS,
-    read_lines,
-    read_receipts,
-    read_sealed,
-    sealed,
-    unsealed,
+from sweep.storage.locations import JOURNAL_DIR
+from sweep.storage.store_format import (
+    RECEIPTS_FILE,
+    decode_record,
+    encode_record,
+    iter_lines_and_records,
+    iter_records,
+    read_receipt_totals,
 )
-from sweep.tasks import journal
-from sweep.tasks.journal import Failure, Journal, Receipt
+from sweep.tasks.engine import journal
+from sweep.tasks.engine.journal import Failure, Journal, Receipt
 
 
 def receipt(block: int) -> Receipt:
@@ -34,18 +34,18 @@ def test_receipts_are_lines_that_a_second_opening_appends_to(tmp_path):
         opened = Journal(tmp_path)
         for block in blocks:
             opened.commit(receipt(block))
-    records = list(read_lines(tmp_path / JOURNAL / RECEIPTS))
+    records = list(iter_records(tmp_path / JOURNAL_DIR / RECEIPTS_FILE))
     assert [record["block"] for record in records] == [4, 2, 7]
     assert records[0]["digest"] == "ab"
 
 
 def test_lines_that_are_not_as_they_were_written_are_passed_over_and_dropped(tmp_path):
-    log = tmp_path / JOURNAL / RECEIPTS
+    log = tmp_path / JOURNAL_DIR / RECEIPTS_FILE
     log.parent.mkdir()
-    one, two, three = (sealed({"block": block}) for block in (1, 2, 3))
+    one, two, three = (encode_record({"block": block}) for block in (1, 2, 3))
     log.write_bytes(one + b'nonsense\n[3]\n{"block":4}\n' + two.replace(b"2", b"5", 1) + three)
-    assert [record["block"] for record in read_lines(log)] == [1, 3]
-    records = [record for _, record in read_sealed(log)]
+    assert [record["block"] for record in iter_records(log)] == [1, 3]
+    records = [record for _, record in iter_lines_and_records(log)]
     assert [n for n, record in enumerate(records, 1) if record is None] == [2, 3, 4, 5]
     Journal(tmp_path)
     assert log.read_bytes() == one + three
@@ -56,16 +56,16 @@ def test_lines_that_are_not_as_they_were_written_are_passed_over_and_dropped(tmp
 
 
 def test_no_byte_of_a_line_can_change_unseen():
-    line = sealed({"block": 12, "digest": "ab", "time": 1.5})
-    assert unsealed(line) == {"block": 12, "digest": "ab", "time": 1.5}
+    line = encode_record({"block": 12, "digest": "ab", "time": 1.5})
+    assert decode_record(line) == {"block": 12, "digest": "ab", "time": 1.5}
     for place in range(len(line)):
         for bit in range(8):
             flipped = bytearray(line)
             flipped[place] ^= 1 << bit
-            assert unsealed(bytes(flipped)) is None
-        assert unsealed(line[:place]) is None
-        assert unsealed(line[:place] + line[place + 1 :]) is None
-        assert unsealed(line[:place] + b"x" + line[place:]) is None
+            assert decode_record(bytes(flipped)) is None
+        assert decode_record(line[:place]) is None
+        assert decode_record(line[:place] + line[place + 1 :]) is None
+        assert decode_record(line[:place] + b"x" + line[place:]) is None
 
 
 def test_a_receipt_that_was_withdrawn_leaves_its_block_to_be_done_again(tmp_path):
@@ -73,9 +73,9 @@ def test_a_receipt_that_was_withdrawn_leaves_its_block_to_be_done_again(tmp_path
     opened.commit(receipt(1))
     opened.commit(receipt(2))
     opened.withdraw(1, "a chunk is damaged")
-    assert journal.digests(tmp_path, 4).tolist() == [b"", b"", b"ab", b""]
+    assert journal.committed_digests(tmp_path, 4).tolist() == [b"", b"", b"ab", b""]
     opened.commit(receipt(1))
-    assert journal.digests(tmp_path, 4).tolist() == [b"", b"ab", b"ab", b""]
+    assert journal.committed_digests(tmp_path, 4).tolist() == [b"", b"ab", b"ab", b""]
 
 
 def test_a_block_that_failed_and_was_done_since_is_not_given_up(tmp_path):
@@ -83,36 +83,36 @@ def test_a_block_that_failed_and_was_done_since_is_not_given_up(tmp_path):
     for block in (1, 2):
         opened.record_failure(Failure(block=block, error="e", traceback="t", host="h", pid=1))
     opened.commit(receipt(1))
-    assert list(journal.given_up(tmp_path, 4)) == [2]
-    assert list(journal.given_up(tmp_path, 2)) == []
+    assert list(journal.permanently_failed(tmp_path, 4)) == [2]
+    assert list(journal.permanently_failed(tmp_path, 2)) == []
     opened.withdraw(1, "a chunk is damaged")
-    assert list(journal.given_up(tmp_path, 4)) == [2]
+    assert list(journal.permanently_failed(tmp_path, 4)) == [2]
 
 
 def test_a_line_that_the_disk_takes_in_part_is_taken_back(tmp_path, monkeypatch):
     opened = Journal(tmp_path)
     opened.commit(receipt(1))
-    before = (tmp_path / JOURNAL / RECEIPTS).read_bytes()
+    before = (tmp_path / JOURNAL_DIR / RECEIPTS_FILE).read_bytes()
     write = os.write
     monkeypatch.setattr(os, "write", lambda log, line: write(log, line[:20]))
     with pytest.raises(OSError, match="No space left"):
         opened.commit(receipt(2))
-    assert (tmp_path / JOURNAL / RECEIPTS).read_bytes() == before
+    assert (tmp_path / JOURNAL_DIR / RECEIPTS_FILE).read_bytes() == before
 
 
 def test_runs_are_recorded_with_their_times(tmp_path):
     opened = Journal(tmp_path)
-    assert journal.last_begun(tmp_path) == float("inf")
-    opened.record_session("begun", pid=5)
-    opened.record_session("ended", blocks=3)
-    begun, ended = read_lines(tmp_path / JOURNAL / journal.SESSIONS)
+    assert journal.last_run_start(tmp_path) == float("inf")
+    opened.record_run_event("begun", pid=5)
+    opened.record_run_event("ended", blocks=3)
+    begun, ended = iter_records(tmp_path / JOURNAL_DIR / journal.SESSION_LOG)
     assert begun["event"] == "begun" and begun["pid"] == 5 and ended["blocks"] == 3
-    assert journal.last_begun(tmp_path) == begun["time"] > 0
+    assert journal.last_run_start(tmp_path) == begun["time"] > 0
 
 
 @pytest.mark.parametrize(("n_blocks", "points"), [(2, [5, 0]), (3, [5, 0, 7]), (4, [5, 0, 7, 0])])
 def test_receipts_of_other_blocks_count_for_nothing(tmp_path, n_blocks, points):
-    (tmp_path / JOURNAL).mkdir()
-    lines = [sealed({"block": b, "points": p, "time": 1.5}) for b, p in ((0, 5), (2, 7))]
-    (tmp_path / JOURNAL / RECEIPTS).write_bytes(b"".join(lines))
-    assert read_receipts(tmp_path, n_blocks).points.tolist() == points
+    (tmp_path / JOURNAL_DIR).mkdir()
+    lines = [encode_record({"block": b, "points": p, "time": 1.5}) for b, p in ((0, 5), (2, 7))]
+    (tmp_path / JOURNAL_DIR / RECEIPTS_FILE).write_bytes(b"".join(lines))
+    assert read_receipt_totals(tmp_path, n_blocks).points_by_block.tolist() == points

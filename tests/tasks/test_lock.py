@@ -15,80 +15,84 @@ from pathlib import Path
 import psutil
 import pytest
 from click.testing import CliRunner
-from small import STUDY, Said, quiet, receipts, small
+from small_studies import STUDY_MAPPING, RecordingProgress, receipt_blocks, run_serially, small_spec
 
 from sweep.cli import main
 from sweep.storage import locations
-from sweep.storage.locations import JOURNAL, located, process_start
-from sweep.tasks import journal
+from sweep.storage.locations import JOURNAL_DIR, parse_location, process_start_id
 from sweep.tasks.driver import resume, run
-from sweep.tasks.journal import Holder, Lock, holder, is_live
-from sweep.tasks.progress import BusyError, StoreError
-from sweep.tasks.verify import pack
+from sweep.tasks.engine import journal
+from sweep.tasks.engine.journal import LockHolder, StoreLock, is_holder_alive, read_lock_holder
+from sweep.tasks.engine.progress import BusyError, StoreError
+from sweep.tasks.studies.store_verification import pack_store
 
 
-def put(store, who: Holder, *, age: float = 0.0) -> None:
+def put(store, who: LockHolder, *, age: float = 0.0) -> None:
     """A lock of someone else's, its last heartbeat some seconds old."""
-    path = store / JOURNAL / journal.LOCK
+    path = store / JOURNAL_DIR / journal.LOCK_FILE
     path.parent.mkdir(exist_ok=True)
     path.write_text(json.dumps(asdict(who)))
     os.utime(path, (time.time() - age, time.time() - age))
 
 
 def test_a_held_lock_refuses_a_second_driver_and_says_who_holds_it(tmp_path):
-    held = Lock(tmp_path)
+    held = StoreLock(tmp_path)
     with pytest.raises(StoreError, match=f"process {os.getpid()} on {socket.gethostname()}"):
-        Lock(tmp_path)
-    assert held.is_mine()
+        StoreLock(tmp_path)
+    assert held.is_held()
     held.release()
-    assert holder(tmp_path) is None
-    Lock(tmp_path).release()
+    assert read_lock_holder(tmp_path) is None
+    StoreLock(tmp_path).release()
 
 
 def test_the_lock_of_a_dead_process_is_taken_over(tmp_path):
     code = (
-        "import os, sys; from pathlib import Path; from sweep.tasks.journal import Lock;"
-        "Lock(Path(sys.argv[1])); os.kill(os.getpid(), 9)"
+        "import os, sys; from pathlib import Path;"
+        "from sweep.tasks.engine.journal import StoreLock;"
+        "StoreLock(Path(sys.argv[1])); os.kill(os.getpid(), 9)"
     )
     subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=False)
-    dead = holder(tmp_path)
+    dead = read_lock_holder(tmp_path)
     assert dead is not None and dead.pid != os.getpid()
-    assert not is_live(tmp_path, dead)
-    mine = Lock(tmp_path)
-    assert mine.is_mine()
+    assert not is_holder_alive(tmp_path, dead)
+    mine = StoreLock(tmp_path)
+    assert mine.is_held()
     mine.release()
 
 
 def test_a_pid_used_again_by_another_process_does_not_keep_a_lock_alive(tmp_path):
-    put(tmp_path, replace(Holder.myself(), start=Holder.myself().start - 3600))
-    assert not is_live(tmp_path, holder(tmp_path))
-    mine = Lock(tmp_path)
-    assert mine.is_mine()
+    put(
+        tmp_path,
+        replace(LockHolder.of_this_process(), start=LockHolder.of_this_process().start - 3600),
+    )
+    assert not is_holder_alive(tmp_path, read_lock_holder(tmp_path))
+    mine = StoreLock(tmp_path)
+    assert mine.is_held()
     mine.release()
 
 
 @pytest.mark.parametrize("pid", [-1, 0, 2**31, 10**30])
 def test_a_lock_of_a_number_that_no_process_can_have_is_taken_over(tmp_path, pid):
-    put(tmp_path, replace(Holder.myself(), pid=pid))
-    assert not is_live(tmp_path, holder(tmp_path))
-    Lock(tmp_path).release()
+    put(tmp_path, replace(LockHolder.of_this_process(), pid=pid))
+    assert not is_holder_alive(tmp_path, read_lock_holder(tmp_path))
+    StoreLock(tmp_path).release()
 
 
 @pytest.mark.parametrize(("age", "live"), [(0.0, True), (60.0, True), (600.0, False)])
 def test_on_another_host_the_heartbeat_decides(tmp_path, monkeypatch, age, live):
-    monkeypatch.setattr(journal, "WATCH", 0.1)
-    put(tmp_path, Holder(host="elsewhere", pid=1, start=1, token="t"), age=age)
+    monkeypatch.setattr(journal, "SILENCE_WATCH_SECONDS", 0.1)
+    put(tmp_path, LockHolder(host="elsewhere", pid=1, start=1, token="t"), age=age)
     if live:
         with pytest.raises(StoreError, match="process 1 on elsewhere"):
-            Lock(tmp_path)
+            StoreLock(tmp_path)
     else:
-        Lock(tmp_path).release()
+        StoreLock(tmp_path).release()
 
 
 def test_a_held_lock_beats(tmp_path, monkeypatch):
-    monkeypatch.setattr(journal, "HEARTBEAT", 0.02)
-    held = Lock(tmp_path)
-    path = tmp_path / JOURNAL / journal.LOCK
+    monkeypatch.setattr(journal, "HEARTBEAT_INTERVAL", 0.02)
+    held = StoreLock(tmp_path)
+    path = tmp_path / JOURNAL_DIR / journal.LOCK_FILE
     os.utime(path, (0, 0))
     deadline = time.monotonic() + 5
     while path.stat().st_mtime == 0 and time.monotonic() < deadline:
@@ -98,17 +102,17 @@ def test_a_held_lock_beats(tmp_path, monkeypatch):
 
 
 def test_a_lock_taken_by_someone_else_is_not_ours_to_release(tmp_path):
-    held = Lock(tmp_path)
-    other = Holder(host="elsewhere", pid=1, start=1, token="t")
+    held = StoreLock(tmp_path)
+    other = LockHolder(host="elsewhere", pid=1, start=1, token="t")
     put(tmp_path, other)
-    assert not held.is_mine()
+    assert not held.is_held()
     held.release()
-    assert holder(tmp_path) == other
+    assert read_lock_holder(tmp_path) == other
 
 
 def _try(store, results, over) -> None:
     try:
-        Lock(store)
+        StoreLock(store)
         results.put(True)
         over.wait(60)  # hold it while the others try
     except StoreError:
@@ -116,7 +120,7 @@ def _try(store, results, over) -> None:
 
 
 def test_of_many_that_find_a_stale_lock_one_gets_it(tmp_path):
-    put(tmp_path, replace(Holder.myself(), pid=2**22 + 1))
+    put(tmp_path, replace(LockHolder.of_this_process(), pid=2**22 + 1))
     context = multiprocessing.get_context("fork")
     results, over = context.SimpleQueue(), context.Event()
     tries = [context.Process(target=_try, args=(tmp_path, results, over)) for _ in range(6)]
@@ -131,7 +135,7 @@ def test_of_many_that_find_a_stale_lock_one_gets_it(tmp_path):
 
 def test_a_driver_whose_lock_was_taken_commits_nothing_more(tmp_path):
     """As one that stood still so long that another host held it for dead."""
-    other = Holder(host="elsewhere", pid=1, start=1, token="t")
+    other = LockHolder(host="elsewhere", pid=1, start=1, token="t")
 
     def evaluate(study, block):
         if block == 4:
@@ -139,26 +143,28 @@ def test_a_driver_whose_lock_was_taken_commits_nothing_more(tmp_path):
         return study.evaluate(block)
 
     study_path = tmp_path / "small.zarr"
-    outcome = quiet(small(), study_path, scheduler="none", evaluate=evaluate)
+    outcome = run_serially(small_spec(), study_path, scheduler="none", evaluate=evaluate)
     assert outcome.stopped == "another process took the store's lock"
-    assert receipts(study_path) == [0, 1, 2, 3]
-    assert holder(study_path) == other
+    assert receipt_blocks(study_path) == [0, 1, 2, 3]
+    assert read_lock_holder(study_path) == other
     with pytest.raises(StoreError, match="process 1 on elsewhere"):
         resume(study_path, progress=False, scheduler="none")
 
 
 @pytest.mark.parametrize("kind", ["file", "object"])
 def test_a_lock_beats_from_the_first_on_and_not_once_it_is_left(kind, tmp_path):
-    store = tmp_path if kind == "file" else located(f"memory://bucket/{time.time_ns()}/s.zarr")
-    assert holder(store) is None and journal.heartbeat_age(store) == float("inf")
-    held = Lock(store)
-    assert held.is_mine() and journal.heartbeat_age(store) < 60
+    store = (
+        tmp_path if kind == "file" else parse_location(f"memory://bucket/{time.time_ns()}/s.zarr")
+    )
+    assert read_lock_holder(store) is None and journal.heartbeat_age(store) == float("inf")
+    held = StoreLock(store)
+    assert held.is_held() and journal.heartbeat_age(store) < 60
     held.release()
-    assert holder(store) is None
+    assert read_lock_holder(store) is None
 
 
 def test_a_lock_on_a_read_only_disk_has_an_age(tmp_path, monkeypatch):
-    held = Lock(tmp_path)
+    held = StoreLock(tmp_path)
 
     def refuse(*_, **__):
         raise OSError(errno.EROFS, os.strerror(errno.EROFS))
@@ -171,12 +177,12 @@ def test_a_lock_on_a_read_only_disk_has_an_age(tmp_path, monkeypatch):
 
 def test_no_two_heartbeats_of_an_object_are_alike():
     """Its tag may be a digest: one who saw it before a beat must not replace it after."""
-    store = located(f"memory://bucket/{time.time_ns()}/s.zarr")
-    held, states = Lock(store), []
+    store = parse_location(f"memory://bucket/{time.time_ns()}/s.zarr")
+    held, states = StoreLock(store), []
     for _ in range(3):
-        states.append((store / JOURNAL / journal.LOCK).read_bytes())
-        held._claim.beat()
-        assert held.is_mine()
+        states.append((store / JOURNAL_DIR / journal.LOCK_FILE).read_bytes())
+        held._lock.send_heartbeat()
+        assert held.is_held()
     held.release()
     assert len(set(states)) == 3
 
@@ -199,8 +205,8 @@ class Clock:
 def holding(tmp_path):
     """A store that another living process of this machine has locked."""
     code = (
-        "import sys; from pathlib import Path; from sweep.tasks.journal import Lock;"
-        "held = Lock(Path(sys.argv[1])); print('held', flush=True); sys.stdin.read()"
+        "import sys; from pathlib import Path; from sweep.tasks.engine.journal import StoreLock;"
+        "held = StoreLock(Path(sys.argv[1])); print('held', flush=True); sys.stdin.read()"
     )
     command = [sys.executable, "-c", code, str(tmp_path)]
     pipe = subprocess.PIPE
@@ -220,28 +226,29 @@ def test_a_clock_that_is_set_takes_no_lock_from_a_living_process(holding, monkey
     clock = Clock()
     clock.ahead = step
     monkeypatch.setattr(time, "time", clock.time)
-    os.utime(store / JOURNAL / journal.LOCK, (1e9, 1e9))
-    assert is_live(store, holder(store))
+    os.utime(store / JOURNAL_DIR / journal.LOCK_FILE, (1e9, 1e9))
+    assert is_holder_alive(store, read_lock_holder(store))
     with pytest.raises(BusyError, match=f"process {process.pid} on"):
-        Lock(store)
+        StoreLock(store)
 
 
 def test_a_dead_process_that_nobody_has_waited_for_holds_no_lock(tmp_path):
     code = (
-        "import os, sys; from pathlib import Path; from sweep.tasks.journal import Lock;"
-        "Lock(Path(sys.argv[1])); os.kill(os.getpid(), 9)"
+        "import os, sys; from pathlib import Path;"
+        "from sweep.tasks.engine.journal import StoreLock;"
+        "StoreLock(Path(sys.argv[1])); os.kill(os.getpid(), 9)"
     )
     with subprocess.Popen([sys.executable, "-c", code, str(tmp_path)]) as process:
         deadline = time.monotonic() + 60
-        while process_start(process.pid) and time.monotonic() < deadline:
+        while process_start_id(process.pid) and time.monotonic() < deadline:
             time.sleep(0.05)
         assert psutil.pid_exists(process.pid)
-        Lock(tmp_path).release()
+        StoreLock(tmp_path).release()
 
 
 def elsewhere(store, *, age):
     """The lock of a process of another host, with a heartbeat of that age by the file's clock."""
-    put(store, Holder(host="elsewhere", pid=1, start=1, token="t"), age=age)
+    put(store, LockHolder(host="elsewhere", pid=1, start=1, token="t"), age=age)
 
 
 @pytest.mark.parametrize("age", [600.0, 1e9, -600.0])
@@ -250,12 +257,12 @@ def test_a_heartbeat_that_is_seen_to_change_is_alive_whatever_its_clock_says(
     tmp_path, monkeypatch, kind, age
 ):
     """The clock of the file server may have been set: an age that it gives proves nothing."""
-    monkeypatch.setattr(journal, "WATCH", 1.0)
+    monkeypatch.setattr(journal, "SILENCE_WATCH_SECONDS", 1.0)
     elsewhere(tmp_path, age=age)
     stop = threading.Event()
 
     def beat():
-        path, at = tmp_path / JOURNAL / journal.LOCK, time.time() - age
+        path, at = tmp_path / JOURNAL_DIR / journal.LOCK_FILE, time.time() - age
         while not stop.wait(0.2):
             at += 0.2
             os.utime(path, (at, at))
@@ -267,9 +274,9 @@ def test_a_heartbeat_that_is_seen_to_change_is_alive_whatever_its_clock_says(
     try:
         if kind == "beating":
             with pytest.raises(BusyError, match="process 1 on elsewhere"):
-                Lock(tmp_path, said.append)
+                StoreLock(tmp_path, said.append)
         else:
-            Lock(tmp_path, said.append).release()
+            StoreLock(tmp_path, said.append).release()
     finally:
         stop.set()
         if kind == "beating":
@@ -278,38 +285,38 @@ def test_a_heartbeat_that_is_seen_to_change_is_alive_whatever_its_clock_says(
 
 
 def test_an_object_whose_heartbeats_are_counted_is_alive(monkeypatch):
-    monkeypatch.setattr(journal, "WATCH", 1.0)
-    monkeypatch.setattr(journal, "HEARTBEAT", 0.1)
+    monkeypatch.setattr(journal, "SILENCE_WATCH_SECONDS", 1.0)
+    monkeypatch.setattr(journal, "HEARTBEAT_INTERVAL", 0.1)
     monkeypatch.setattr(journal, "heartbeat_age", lambda path: 1e6)
-    monkeypatch.setattr(Holder, "is_here", False)
-    store = located(f"memory://bucket/{time.time_ns()}/s.zarr")
-    held = Lock(store)
+    monkeypatch.setattr(LockHolder, "is_on_this_machine", False)
+    store = parse_location(f"memory://bucket/{time.time_ns()}/s.zarr")
+    held = StoreLock(store)
     with pytest.raises(BusyError):
-        Lock(store, lambda text: None)
-    held._released.set()  # it stands still
-    held._beating.join()
-    Lock(store, lambda text: None).release()
+        StoreLock(store, lambda text: None)
+    held._is_released.set()  # it stands still
+    held._heartbeat_thread.join()
+    StoreLock(store, lambda text: None).release()
 
 
 def test_a_lock_that_changes_hands_while_it_is_watched_is_not_taken(tmp_path, monkeypatch):
-    monkeypatch.setattr(journal, "WATCH", 0.5)
+    monkeypatch.setattr(journal, "SILENCE_WATCH_SECONDS", 0.5)
     elsewhere(tmp_path, age=600.0)
-    mark = journal._FileClaim.mark
+    mark = journal._FileLock.heartbeat_mark
 
     def overtaken(self):
         marked = mark(self)
-        put(tmp_path, Holder(host="third", pid=3, start=1, token="u"), age=600.0)
+        put(tmp_path, LockHolder(host="third", pid=3, start=1, token="u"), age=600.0)
         return marked
 
-    monkeypatch.setattr(journal._FileClaim, "mark", overtaken)
+    monkeypatch.setattr(journal._FileLock, "heartbeat_mark", overtaken)
     with pytest.raises(BusyError):
-        Lock(tmp_path, lambda text: None)
-    assert holder(tmp_path).host == "third"
+        StoreLock(tmp_path, lambda text: None)
+    assert read_lock_holder(tmp_path).host == "third"
 
 
 def test_a_lock_of_another_version_is_judged_by_its_heartbeat(tmp_path, monkeypatch):
-    monkeypatch.setattr(journal, "WATCH", 0.2)
-    path = tmp_path / JOURNAL / journal.LOCK
+    monkeypatch.setattr(journal, "SILENCE_WATCH_SECONDS", 0.2)
+    path = tmp_path / JOURNAL_DIR / journal.LOCK_FILE
     path.parent.mkdir()
     for text in (
         json.dumps({"host": socket.gethostname(), "pid": 2**22, "started": 1e9, "token": "t"}),
@@ -317,9 +324,9 @@ def test_a_lock_of_another_version_is_judged_by_its_heartbeat(tmp_path, monkeypa
     ):  # fmt: skip
         path.write_text(text)
         with pytest.raises(BusyError):
-            Lock(tmp_path)
+            StoreLock(tmp_path)
         os.utime(path, (1e9, 1e9))
-        Lock(tmp_path, lambda text: None).release()
+        StoreLock(tmp_path, lambda text: None).release()
 
 
 def fails(number):
@@ -333,14 +340,14 @@ def fails(number):
 def test_a_file_system_without_flock_is_warned_of_once_and_used(tmp_path, monkeypatch, number):
     """As Lustre without its option, or NFS without lockd."""
     monkeypatch.setattr(fcntl, "flock", fails(number))
-    monkeypatch.setattr(journal, "_warned", set())
+    monkeypatch.setattr(journal, "_issued_warnings", set())
     said = []
-    held = Lock(tmp_path, said.append)
+    held = StoreLock(tmp_path, said.append)
     assert said == [said[0]] and said[0].startswith("warning: ") and "has no flock" in said[0]
     with pytest.raises(BusyError):
-        Lock(tmp_path, said.append)
+        StoreLock(tmp_path, said.append)
     held.release()
-    Lock(tmp_path, said.append).release()
+    StoreLock(tmp_path, said.append).release()
     assert len(said) == 1
 
 
@@ -350,23 +357,23 @@ def test_a_file_system_without_flock_is_warned_of_once_and_used(tmp_path, monkey
 def test_a_file_system_without_links_is_warned_of_once_and_used(tmp_path, monkeypatch, number):
     """As FUSE and SMB have none, and exFAT."""
     monkeypatch.setattr(os, "link", fails(number))
-    monkeypatch.setattr(journal, "_warned", set())
+    monkeypatch.setattr(journal, "_issued_warnings", set())
     said = []
-    held = Lock(tmp_path, said.append)
-    assert held.is_mine() and len(said) == 1 and "has no hard links" in said[0]
+    held = StoreLock(tmp_path, said.append)
+    assert held.is_held() and len(said) == 1 and "has no hard links" in said[0]
     with pytest.raises(BusyError):
-        Lock(tmp_path, said.append)
+        StoreLock(tmp_path, said.append)
     held.release()
-    put(tmp_path, replace(Holder.myself(), pid=2**22 + 1))
-    Lock(tmp_path, said.append).release()
-    assert len(said) == 1 and sorted(os.listdir(tmp_path / JOURNAL)) == ["lock.guard"]
+    put(tmp_path, replace(LockHolder.of_this_process(), pid=2**22 + 1))
+    StoreLock(tmp_path, said.append).release()
+    assert len(said) == 1 and sorted(os.listdir(tmp_path / JOURNAL_DIR)) == ["lock.guard"]
 
 
 @pytest.mark.parametrize("number", [errno.EIO, errno.EACCES])
 def test_other_faults_of_a_file_system_refuse(tmp_path, monkeypatch, number):
     monkeypatch.setattr(fcntl, "flock", fails(number))
     with pytest.raises(StoreError, match="can't be locked"):
-        Lock(tmp_path)
+        StoreLock(tmp_path)
 
 
 @pytest.mark.parametrize("lacking", ["flock", "link", "both"])
@@ -386,47 +393,47 @@ def test_a_lock_that_another_takes_between_is_left_to_it(tmp_path, monkeypatch, 
     monkeypatch.setattr(fcntl, "flock", fails(errno.ENOSYS))
     if not links:
         monkeypatch.setattr(os, "link", fails(errno.EPERM))
-    put(tmp_path, replace(Holder.myself(), pid=2**22 + 1))
-    judge, quicker = Lock._refuse_a_living_one, []
+    put(tmp_path, replace(LockHolder.of_this_process(), pid=2**22 + 1))
+    judge, quicker = StoreLock._refuse_living_holder, []
 
     def overtaken(self):
         judge(self)
         if not quicker:
             quicker.append(None)
-            quicker.append(Lock(tmp_path, lambda text: None))
+            quicker.append(StoreLock(tmp_path, lambda text: None))
 
-    monkeypatch.setattr(Lock, "_refuse_a_living_one", overtaken)
+    monkeypatch.setattr(StoreLock, "_refuse_living_holder", overtaken)
     with pytest.raises(BusyError):
-        Lock(tmp_path, lambda text: None)
-    assert quicker[1].is_mine()
+        StoreLock(tmp_path, lambda text: None)
+    assert quicker[1].is_held()
     quicker[1].release()
 
 
 def test_a_run_without_flock_or_links_goes_to_its_end(tmp_path, monkeypatch):
     monkeypatch.setattr(fcntl, "flock", fails(errno.ENOLCK))
     monkeypatch.setattr(os, "link", fails(errno.EPERM))
-    monkeypatch.setattr(journal, "_warned", set())
-    said = Said()
+    monkeypatch.setattr(journal, "_issued_warnings", set())
+    said = RecordingProgress()
     store = tmp_path / "s.zarr"
-    assert run(small(), store=store, progress=said, scheduler="none").complete
+    assert run(small_spec(), store=store, progress=said, scheduler="none").complete
     assert sum("warning: " in line for line in said) == 2
     range_ = {"linear": ["10 m", "5 km"], "number": 3}
-    axes = {**STUDY["axes"], "target.range": range_}
-    again = run(small(axes=axes), store=store, overwrite=True, progress=said, scheduler="none")
-    assert again.complete and pack(store, tmp_path / "packed.zarr", progress=False)
+    axes = {**STUDY_MAPPING["axes"], "target.range": range_}
+    again = run(small_spec(axes=axes), store=store, overwrite=True, progress=said, scheduler="none")
+    assert again.complete and pack_store(store, tmp_path / "packed.zarr", progress=False)
     spectra = ["spectra", str(store), "--at", "range=10m", "-o", str(tmp_path / "spectra.zarr")]
     assert CliRunner().invoke(main, spectra, catch_exceptions=False).exit_code == 0
 
 
 def test_what_a_living_process_makes_is_not_cleared_up_after_the_clock_was_set(tmp_path):
-    made = locations._hidden(tmp_path / "s.zarr", "creating")
+    made = locations._hidden_path(tmp_path / "s.zarr", "creating")
     made.mkdir()
     os.utime(made, (1e9, 1e9))
-    locations.settle(tmp_path / "other.zarr")
+    locations.recover_interrupted_replace(tmp_path / "other.zarr")
     assert made.exists()
     dead = Path(str(made).replace(f"-{os.getpid()}.", f"-{2**22 + 1}."))
     dead.mkdir()
     reused = Path(re.sub(rf"-{os.getpid()}\.\d+", f"-{os.getpid()}.7", str(made)))
     reused.mkdir()
-    locations.settle(tmp_path / "other.zarr")
+    locations.recover_interrupted_replace(tmp_path / "other.zarr")
     assert made.exists() and not dead.exists() and not reused.exists()

@@ -10,13 +10,13 @@ import pytest
 
 SCRIPT = """
 import sys
-from small_flights import SCENE, small_scene
+from small_flights import SCENE_MAPPING, small_scene_spec
 from sweep.tasks.driver import run
 
 if __name__ == "__main__":
-    path = SCENE["platform"]["path"] | {"initial_speed": "24 m/s", "final_speed": "24 m/s"}
-    spec = small_scene(
-        platform=SCENE["platform"] | {"path": path},  # 50 s
+    path = SCENE_MAPPING["platform"]["path"] | {"initial_speed": "24 m/s", "final_speed": "24 m/s"}
+    spec = small_scene_spec(
+        platform=SCENE_MAPPING["platform"] | {"path": path},  # 50 s
         scanners={"corners": {"kind": "corners", "angle": "7.5 deg", "rate": sys.argv[1]}},
         draws={"number": 1},
         storage={},

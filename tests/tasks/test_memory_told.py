@@ -3,14 +3,15 @@
 from pathlib import Path
 
 import pytest
-from small import small
-from small_flights import small_scene
+from small_flights import small_scene_spec
+from small_studies import small_spec
 
 from sweep.spec import SpecError
-from sweep.tasks import driver, memory
-from sweep.tasks.plan import plan
-from sweep.tasks.store import create
-from sweep.tasks.studies import study_of
+from sweep.tasks import driver
+from sweep.tasks.engine.study_store import create_store
+from sweep.tasks.studies import memory_limits
+from sweep.tasks.studies.study_loading import make_study
+from sweep.tasks.studies.study_plan import plan_study
 
 HUGE = {"instrument.processing.fft_size": [2**16, 2**30]}
 
@@ -19,10 +20,10 @@ def runs(spec, path):
     return driver.run(spec, store=path, scheduler="none", progress=False)
 
 
-@pytest.mark.parametrize("use", [lambda spec, path: plan(spec), runs])
+@pytest.mark.parametrize("use", [lambda spec, path: plan_study(spec), runs])
 def test_an_fft_that_no_machine_holds_is_refused(use, tmp_path, monkeypatch):
     monkeypatch.setattr("distributed.system.MEMORY_LIMIT", 64 * 10**9)
-    spec = small(axes=HUGE)
+    spec = small_spec(axes=HUGE)
     with pytest.raises(SpecError, match=r"fft_size: makes a point take about 268.4 GB.*64.0 GB"):
         use(spec, tmp_path / "huge.zarr")
     assert not (tmp_path / "huge.zarr").exists()
@@ -59,7 +60,7 @@ def batch(memory):
 )  # fmt: skip
 def test_an_fft_is_held_against_the_memory_of_the_workers(options, told, tmp_path, monkeypatch):
     monkeypatch.setattr("distributed.system.MEMORY_LIMIT", 64 * 10**9)
-    spec = small(axes={"instrument.processing.fft_size": [2**16, 2**24]})  # 4.2 GB
+    spec = small_spec(axes={"instrument.processing.fft_size": [2**16, 2**24]})  # 4.2 GB
     with pytest.raises(SpecError, match=rf"fft_size: makes a point take about 4.2 GB.*{told}"):
         driver.run(spec, store=tmp_path / "huge.zarr", progress=False, **options)
     assert not (tmp_path / "huge.zarr").exists()
@@ -67,24 +68,26 @@ def test_an_fft_is_held_against_the_memory_of_the_workers(options, told, tmp_pat
 
 @pytest.mark.parametrize("limits", [(), (0,), (None, 10**12)])
 def test_workers_without_a_limit_take_any_study(limits):
-    memory.refuse_too_large(small(axes=HUGE), memory.worker_memory(ClientOf(*limits), None))
+    memory_limits.refuse_too_large_point(
+        small_spec(axes=HUGE), memory_limits.worker_memory(ClientOf(*limits), None)
+    )
 
 
 def test_a_scene_is_held_against_the_memory_of_each_worker(tmp_path, monkeypatch):
-    spec = small_scene()
-    needed = memory.point_bytes(spec) + memory.scene_bytes(spec)
-    assert memory.scene_bytes(spec) > 1000
+    spec = small_scene_spec()
+    needed = memory_limits.point_bytes_max(spec) + memory_limits.scene_bytes(spec)
+    assert memory_limits.scene_bytes(spec) > 1000
     monkeypatch.setattr("distributed.system.MEMORY_LIMIT", needed - 1)
-    for use in (lambda: plan(spec), lambda: runs(spec, tmp_path / "s.zarr")):
+    for use in (lambda: plan_study(spec), lambda: runs(spec, tmp_path / "s.zarr")):
         with pytest.raises(SpecError, match=r"scene\.objects: takes about .* in each process"):
             use()
     assert not (tmp_path / "s.zarr").exists()
 
 
 def test_a_store_that_goes_on_is_held_against_memory_too(tmp_path, monkeypatch):
-    spec, whole = small_scene(), small_scene(draws={"number": 6, "returns": 3})
+    spec, whole = small_scene_spec(), small_scene_spec(draws={"number": 6, "returns": 3})
     runs(spec, tmp_path / "s.zarr")
-    limit = memory.point_bytes(spec) + memory.scene_bytes(spec) - 1
+    limit = memory_limits.point_bytes_max(spec) + memory_limits.scene_bytes(spec) - 1
     monkeypatch.setattr("distributed.system.MEMORY_LIMIT", limit)
     plain = {"scheduler": "none", "progress": False}
     with pytest.raises(SpecError, match=r"scene\.objects: takes about .* in each process"):
@@ -92,7 +95,7 @@ def test_a_store_that_goes_on_is_held_against_memory_too(tmp_path, monkeypatch):
     assert not (tmp_path / "t.zarr").exists()
     assert driver.resume(tmp_path / "s.zarr", **plain).complete  # nothing is left to compute
     begun = tmp_path / "begun" / "s.zarr"
-    create(begun, study_of(spec, begun), recipe={"base": str(Path.cwd())})
+    create_store(begun, make_study(spec, begun), recipe={"base": str(Path.cwd())})
     with pytest.raises(SpecError, match=r"scene\.objects: takes about .* in each process"):
         driver.resume(begun, **plain)
 
@@ -101,10 +104,10 @@ def test_a_store_that_goes_on_is_held_against_memory_too(tmp_path, monkeypatch):
 def test_a_refusal_by_the_workers_of_a_scheduler_leaves_nothing(kind, tmp_path, monkeypatch):
     from distributed import LocalCluster
 
-    spec = small_scene() if kind == "flight" else small(axes=HUGE)
+    spec = small_scene_spec() if kind == "flight" else small_spec(axes=HUGE)
     monkeypatch.setattr("distributed.system.MEMORY_LIMIT", 10**13)
     if kind == "flight":  # a point fits into a worker, and the scene with it does not
-        monkeypatch.setattr(memory, "scene_bytes", lambda spec: 2 * 10**9)
+        monkeypatch.setattr(memory_limits, "scene_bytes", lambda spec: 2 * 10**9)
     one = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "dashboard_address": None}
     with (
         LocalCluster(**one, memory_limit="1 GB", protocol="tcp") as cluster,
@@ -117,10 +120,10 @@ def test_a_refusal_by_the_workers_of_a_scheduler_leaves_nothing(kind, tmp_path, 
 
 
 def test_a_block_that_no_memory_holds_is_refused(tmp_path, monkeypatch):
-    spec = small_scene(draws={"number": 10**7}, storage={"block_draws": 10**6})
+    spec = small_scene_spec(draws={"number": 10**7}, storage={"block_draws": 10**6})
     monkeypatch.setattr("distributed.system.MEMORY_LIMIT", 10**8)
-    monkeypatch.setattr(memory, "point_bytes", lambda spec: 0)
-    for use in (lambda: plan(spec), lambda: runs(spec, tmp_path / "s.zarr")):
+    monkeypatch.setattr(memory_limits, "point_bytes_max", lambda spec: 0)
+    for use in (lambda: plan_study(spec), lambda: runs(spec, tmp_path / "s.zarr")):
         with pytest.raises(SpecError, match=r"storage: makes a block take .* GB"):
             use()
     assert not (tmp_path / "s.zarr").exists()
@@ -129,17 +132,17 @@ def test_a_block_that_no_memory_holds_is_refused(tmp_path, monkeypatch):
 def few_shots(**changes):
     """One cycle of three shots."""
     scanners = {"three": {"kind": "cone", "beams": 3, "half_angle": "22.5 deg", "rate": "0.1 Hz"}}
-    return small_scene(scanners=scanners, axes={}, **changes)
+    return small_scene_spec(scanners=scanners, axes={}, **changes)
 
 
 def test_very_many_draws_of_few_shots_allocate_nothing_and_are_refused_by_their_blocks():
     import tracemalloc
 
-    study_of(few_shots(), Path("nowhere.zarr"))
+    make_study(few_shots(), Path("nowhere.zarr"))
     tracemalloc.start()
-    study_of(few_shots(draws={"number": 10**9}, storage={}), Path("nowhere.zarr"))
+    make_study(few_shots(draws={"number": 10**9}, storage={}), Path("nowhere.zarr"))
     with pytest.raises(SpecError, match=r"storage.block_draws: cuts 1,000,000,000 draws of .*; ra"):
-        study_of(few_shots(draws={"number": 10**9}, storage={"block_draws": 3}), Path("no.zarr"))
+        make_study(few_shots(draws={"number": 10**9}, storage={"block_draws": 3}), Path("no.zarr"))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 20e6
@@ -151,11 +154,14 @@ def test_a_grid_of_too_many_blocks_is_refused():
         "target.grazing_angle": {"linear": ["10 deg", "90 deg"], "number": 10**4},
     }
     with pytest.raises(SpecError, match=r"axes: makes 1e\+09 points in .* blocks"):
-        study_of(small(axes=axes, storage={"block_points": 1}), Path("nowhere.zarr"))
+        make_study(small_spec(axes=axes, storage={"block_points": 1}), Path("nowhere.zarr"))
 
 
 def test_a_grid_of_too_many_blocks_is_refused_before_any_point_is_looked_at(monkeypatch):
-    monkeypatch.setattr("sweep.tasks.plan.measured", lambda study: pytest.fail("it was measured"))
+    monkeypatch.setattr(
+        "sweep.tasks.studies.study_plan.measure_seconds_per_point",
+        lambda study: pytest.fail("it was measured"),
+    )
     many = {"linear": ["1 W", "3 W"], "number": 10**4}
     axes = {
         "instrument.laser.power": many,
@@ -163,12 +169,12 @@ def test_a_grid_of_too_many_blocks_is_refused_before_any_point_is_looked_at(monk
         "target.grazing_angle": {"linear": ["1 deg", "80 deg"], "number": 10**4},
     }
     with pytest.raises(SpecError, match=r"axes: makes 1e\+12 points in 1e\+08 blocks"):
-        plan(small(axes=axes, storage={"block_points": 10**4}))
+        plan_study(small_spec(axes=axes, storage={"block_points": 10**4}))
 
 
 def test_the_memory_of_a_plan_counts_a_point():
-    spec = small()
-    assert plan(spec).worker_memory > memory.point_bytes(spec) > 1e6
+    spec = small_spec()
+    assert plan_study(spec).worker_bytes > memory_limits.point_bytes_max(spec) > 1e6
 
 
 @pytest.mark.parametrize(
@@ -182,12 +188,12 @@ def test_the_memory_of_a_plan_counts_a_point():
         ({"draws": {"number": 10**9}}, r"draws\.number: makes .* shots in all draws"),
     ],
 )  # fmt: skip
-@pytest.mark.parametrize("use", [runs, study_of])
+@pytest.mark.parametrize("use", [runs, make_study])
 def test_a_flight_of_too_many_shots_is_refused(changes, told, use, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "path.csv").write_text(
         "time [s],x [m],y [m],z [m]\n1e300,0,0,100\n2e300,10,0,100\n"
     )
     with pytest.raises(SpecError, match=told):
-        use(small_scene(**changes), tmp_path / "huge.zarr")
+        use(small_scene_spec(**changes), tmp_path / "huge.zarr")
     assert not (tmp_path / "huge.zarr").exists()

@@ -5,28 +5,28 @@ import numpy as np
 import pytest
 import xarray as xr
 from click.testing import CliRunner
-from small import everything, quiet, small
-from small_flights import small_scene
+from small_flights import small_scene_spec
+from small_studies import file_contents, run_serially, small_spec
 from zarr.storage import LocalStore, WrapperStore
 
 import sweep
-from sweep.analysis.scenes.recording import place
+from sweep.analysis.scene_results.recordings import find_axis_position
 from sweep.cli import main
-from sweep.storage.locations import files_below
+from sweep.storage.locations import file_sizes_below
 from sweep.tasks.driver import resume
-from sweep.tasks.progress import StoreError
-from sweep.tasks.study import ArrayLayout
-from sweep.tasks.summary import scene_summary, status
-from sweep.tasks.verify import pack, shard_shape, verify
+from sweep.tasks.engine.blocks import ArrayLayout
+from sweep.tasks.engine.progress import StoreError
+from sweep.tasks.studies.store_summary import scene_summary, status
+from sweep.tasks.studies.store_verification import pack_store, shard_shape, verify
 
 
 @pytest.fixture(scope="module")
 def packed(undisturbed, tmp_path_factory):
-    return pack(undisturbed, tmp_path_factory.mktemp("packed") / "final.zarr", progress=False)
+    return pack_store(undisturbed, tmp_path_factory.mktemp("packed") / "final.zarr", progress=False)
 
 
 def test_a_packed_copy_has_the_same_values_bit_for_bit_in_a_file_an_array(undisturbed, packed):
-    before = everything(undisturbed)
+    before = file_contents(undisturbed)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         expected, found = xr.open_zarr(undisturbed), xr.open_zarr(packed)
@@ -34,9 +34,9 @@ def test_a_packed_copy_has_the_same_values_bit_for_bit_in_a_file_an_array(undist
     for name, values in expected.variables.items():
         assert found[name].values.tobytes() == values.values.tobytes(), name
         assert found[name].attrs == values.attrs and found[name].dims == values.dims
-        chunks = [f for f in files_below(packed / name) if f.startswith("c/")]
+        chunks = [f for f in file_sizes_below(packed / name) if f.startswith("c/")]
         assert len(chunks) == 1
-    assert everything(undisturbed) == before
+    assert file_contents(undisturbed) == before
     assert sweep.open(packed).attrs["finished"] == sweep.open(undisturbed).attrs["finished"] != ""
 
 
@@ -44,20 +44,20 @@ def test_a_copy_does_not_name_the_machine_that_made_it(undisturbed, packed):
     import socket
 
     host = socket.gethostname().encode()
-    assert any(host in content for content in everything(undisturbed).values())
-    assert not any(host in content for content in everything(packed).values())
+    assert any(host in content for content in file_contents(undisturbed).values())
+    assert not any(host in content for content in file_contents(packed).values())
     assert status(packed).points_done == status(undisturbed).points_done == 72
 
 
 def test_what_reads_stores_reads_the_copy_and_what_writes_them_refuses_it(packed):
     found = status(packed)
-    assert found.complete and found.bytes == sum(files_below(packed).values())
+    assert found.complete and found.bytes == sum(file_sizes_below(packed).values())
     with pytest.raises(StoreError, match="nothing to resume"):
         resume(packed, progress=False)
     with pytest.raises(StoreError, match="nothing to resume"):
-        quiet(small(), packed)
+        run_serially(small_spec(), packed)
     with pytest.raises(StoreError, match="is packed already"):
-        pack(packed, packed.with_name("twice.zarr"))
+        pack_store(packed, packed.with_name("twice.zarr"))
 
 
 def test_a_flipped_bit_in_a_copy_is_found(packed, tmp_path):
@@ -74,15 +74,15 @@ def test_a_flipped_bit_in_a_copy_is_found(packed, tmp_path):
 
 
 def test_what_is_not_complete_or_in_the_way_is_refused(undisturbed, packed, tmp_path):
-    from small import copied
+    from small_studies import copy_store
 
-    store = copied(undisturbed, tmp_path)
+    store = copy_store(undisturbed, tmp_path)
     (store / "pd_up" / "c" / "0" / "5" / "0").unlink()
     with pytest.raises(StoreError, match="lacks 1 blocks"):
-        pack(store, tmp_path / "final.zarr")
+        pack_store(store, tmp_path / "final.zarr")
     assert not (tmp_path / "final.zarr").exists()
     with pytest.raises(StoreError, match="is there already"):
-        pack(undisturbed, packed)
+        pack_store(undisturbed, packed)
 
 
 class Losing(WrapperStore):
@@ -93,14 +93,16 @@ class Losing(WrapperStore):
 
 
 def test_a_copy_that_does_not_read_back_is_not_kept(undisturbed, tmp_path, monkeypatch):
-    monkeypatch.setattr("sweep.tasks.verify.zarr_store", lambda place: Losing(LocalStore(place)))
+    monkeypatch.setattr(
+        "sweep.tasks.studies.store_verification.zarr_store", lambda place: Losing(LocalStore(place))
+    )
     with pytest.raises(StoreError, match="does not read back as it was written"):
-        pack(undisturbed, tmp_path / "final.zarr")
+        pack_store(undisturbed, tmp_path / "final.zarr")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_the_copy_goes_to_an_object_store_too(undisturbed, tmp_path):
-    there = pack(undisturbed, f"memory://bucket{tmp_path}/final.zarr", progress=False)
+    there = pack_store(undisturbed, f"memory://bucket{tmp_path}/final.zarr", progress=False)
     np.testing.assert_array_equal(
         sweep.open(there).pd_shot.values, sweep.open(undisturbed).pd_shot.values
     )
@@ -112,13 +114,17 @@ def test_a_scene_is_packed_with_all_that_is_told_of_it(flight, tmp_path):
     told = CliRunner().invoke(main, ["finalize", str(made)])
     assert told.exit_code == 0, told.output
     copy = tmp_path / "scene_final.zarr"
-    assert len(files_below(copy)) < len(files_below(made)) / 2
-    assert scene_summary(copy)[0].shots > 0
+    assert len(file_sizes_below(copy)) < len(file_sizes_below(made)) / 2
+    assert scene_summary(copy)[0].n_shots > 0
     for one, other in zip(scene_summary(made), scene_summary(copy), strict=True):
-        assert (one.shots, one.true, one.false) == (other.shots, other.true, other.false)
+        assert (one.n_shots, one.shots_with_true_return, one.false_points) == (
+            other.n_shots,
+            other.shots_with_true_return,
+            other.false_points,
+        )
     tree = sweep.open_scene(copy)
-    recording = place(small_scene(), {}).recording(tree, "three")
-    assert recording.computed(slice(0, 12)).all()
+    recording = find_axis_position(small_scene_spec(), {}).recording(tree, "three")
+    assert recording.computed_shots(slice(0, 12)).all()
 
 
 @pytest.mark.parametrize(

@@ -10,13 +10,21 @@ from functools import partial
 
 import dask
 import pytest
-from small import copied, evaluated, quiet, receipts, small, threads, tree
+from small_studies import (
+    copy_store,
+    file_digests,
+    logged_blocks,
+    receipt_blocks,
+    run_serially,
+    small_spec,
+    thread_cluster_client,
+)
 
-from sweep.tasks import worker
-from sweep.tasks.clusters import machines
 from sweep.tasks.driver import resume, run
-from sweep.tasks.summary import status
-from sweep.tasks.worker import Overtime
+from sweep.tasks.engine import worker
+from sweep.tasks.engine.deploy import local_ssh
+from sweep.tasks.engine.worker import BlockTimeoutError
+from sweep.tasks.studies.store_summary import status
 
 
 def endless(block, log):
@@ -41,7 +49,7 @@ def endless(block, log):
 )
 def test_a_block_that_takes_longer_than_it_may_is_given_up(undisturbed, tmp_path, place):
     path, log = tmp_path / "small.zarr", tmp_path / "log"
-    study = small()
+    study = small_spec()
     outcome = run(
         study, store=path, progress=False, block_timeout=2.0, evaluate=endless(4, log), **place
     )
@@ -50,19 +58,19 @@ def test_a_block_that_takes_longer_than_it_may_is_given_up(undisturbed, tmp_path
     assert failure.block == 4
     assert failure.error == "Overtime: took longer than the 2 s that a block may take"
     assert "time.sleep(0.01)" in failure.traceback  # where it was
-    assert evaluated(log).count(4) == 2
+    assert logged_blocks(log).count(4) == 2
     assert resume(path, progress=False, scheduler="none").left_out == 1
     assert resume(path, progress=False, scheduler="none", retry_failed=True).complete
-    assert tree(path) == tree(undisturbed)
+    assert file_digests(path) == file_digests(undisturbed)
 
 
 def stuck_or_hungry(stuck, hungry):
     """The model, with a block stuck in compiled code and one that takes all memory."""
 
     def evaluate(study, block):
-        from sweep.tasks import worker
+        from sweep.tasks.engine import worker
 
-        worker.GRACE = 0.2
+        worker.INTERRUPT_GRACE_SECONDS = 0.2
         if block == stuck:
             time.sleep(600)
         taken = []
@@ -79,10 +87,10 @@ def test_workers_that_are_stuck_or_out_of_memory_are_replaced_and_their_blocks_g
     undisturbed, tmp_path, monkeypatch
 ):
     path = tmp_path / "small.zarr"
-    monkeypatch.setattr(machines, "_memory", lambda cluster, bounds: 1 << 30)
+    monkeypatch.setattr(local_ssh, "worker_memory_limit", lambda cluster, bounds: 1 << 30)
     with dask.config.set({"distributed.scheduler.allowed-failures": 0}):
         outcome = run(
-            small(), store=path, progress=False, workers=2, block_timeout=20.0,
+            small_spec(), store=path, progress=False, workers=2, block_timeout=20.0,
             evaluate=stuck_or_hungry(2, 8),
         )  # fmt: skip
     assert outcome.blocks_done == 10
@@ -92,14 +100,14 @@ def test_workers_that_are_stuck_or_out_of_memory_are_replaced_and_their_blocks_g
         assert "--block-timeout" in failure.error and "memory" in failure.error
     assert set(status(path).failures) == {2, 8}
     assert resume(path, progress=False, scheduler="none", retry_failed=True).complete
-    assert tree(path) == tree(undisturbed)
+    assert file_digests(path) == file_digests(undisturbed)
 
 
 def test_a_block_that_failed_goes_to_another_worker(tmp_path):
     log = tmp_path / "log"
 
     def evaluate(study, block):
-        from sweep.tasks.worker import worker_address
+        from sweep.tasks.engine.worker import worker_address
 
         with open(log, "a") as lines:
             lines.write(f"{block} {worker_address()}\n")
@@ -107,8 +115,14 @@ def test_a_block_that_failed_goes_to_another_worker(tmp_path):
             raise ValueError("nothing good comes of it")
         return study.evaluate(block)
 
-    with threads(3) as client:
-        run(small(), store=tmp_path / "s.zarr", client=client, evaluate=evaluate, progress=False)
+    with thread_cluster_client(3) as client:
+        run(
+            small_spec(),
+            store=tmp_path / "s.zarr",
+            client=client,
+            evaluate=evaluate,
+            progress=False,
+        )
     first, second = (line.split()[1] for line in log.read_text().splitlines() if line[:2] == "5 ")
     assert first != second
 
@@ -126,14 +140,14 @@ def until_about(seconds):
 
 
 def test_a_time_limit_interrupts_what_it_limits_and_nothing_after_it():
-    with pytest.raises(Overtime, match=r"longer than the 0\.05 s"):
-        worker.limited(forever, 0.05)
+    with pytest.raises(BlockTimeoutError, match=r"longer than the 0\.05 s"):
+        worker.run_with_timeout(forever, 0.05)
     for _ in range(200):  # ends about when the alarm rings
-        with contextlib.suppress(Overtime):
-            assert worker.limited(partial(until_about, 0.002), 0.002) == "done"
+        with contextlib.suppress(BlockTimeoutError):
+            assert worker.run_with_timeout(partial(until_about, 0.002), 0.002) == "done"
         sum(range(1000))  # where a stray interruption would arrive
-    assert worker.limited(lambda: "done", 60.0) == "done"
-    assert worker.limited(lambda: "done", None) == "done"
+    assert worker.run_with_timeout(lambda: "done", 60.0) == "done"
+    assert worker.run_with_timeout(lambda: "done", None) == "done"
     deadline = time.monotonic() + 10
     while any(isinstance(t, threading.Timer) and t.is_alive() for t in threading.enumerate()):
         assert time.monotonic() < deadline, "an alarm is still set"
@@ -149,20 +163,20 @@ def test_an_interruption_that_comes_too_late_is_overtime_and_leaves_no_thread():
             forever()
         return "done"
 
-    with pytest.raises(Overtime):
-        worker.limited(done_after_all, 0.05)
+    with pytest.raises(BlockTimeoutError):
+        worker.run_with_timeout(done_after_all, 0.05)
     assert not seen[0].is_alive()
 
 
 def test_limited_work_sees_what_is_set_where_it_was_asked_for_as_dasks_worker_is():
     here = contextvars.ContextVar("here")
     here.set("a worker")
-    assert worker.limited(here.get, 60.0) == "a worker"
+    assert worker.run_with_timeout(here.get, 60.0) == "a worker"
 
 
 def test_a_limited_work_that_raises_or_is_stopped_by_ctrl_c_ends_with_it():
     with pytest.raises(ValueError, match="nothing good"):
-        worker.limited(lambda: int("nothing good"), 60.0)
+        worker.run_with_timeout(lambda: int("nothing good"), 60.0)
     seen = []
 
     def asleep():
@@ -171,7 +185,7 @@ def test_a_limited_work_that_raises_or_is_stopped_by_ctrl_c_ends_with_it():
 
     threading.Timer(0.2, os.kill, [os.getpid(), signal.SIGINT]).start()
     with pytest.raises(KeyboardInterrupt):
-        worker.limited(asleep, 60.0)
+        worker.run_with_timeout(asleep, 60.0)
     seen[0].join(10)
     assert not seen[0].is_alive()
 
@@ -179,26 +193,28 @@ def test_a_limited_work_that_raises_or_is_stopped_by_ctrl_c_ends_with_it():
 def test_a_durable_study_is_the_same_and_has_its_disk_synced_before_its_receipts(
     undisturbed, tmp_path, monkeypatch
 ):
-    from sweep.tasks import store
+    from sweep.tasks.engine import study_store
 
     path, at = tmp_path / "small.zarr", []
-    sync = store.sync
-    monkeypatch.setattr(store, "sync", lambda place: (sync(place), at.append(receipts(path))))
-    assert quiet(small(), path, scheduler="none", durable=True).complete
-    assert tree(path) == tree(undisturbed)
+    sync = study_store.sync_to_disk
+    monkeypatch.setattr(
+        study_store, "sync_to_disk", lambda place: (sync(place), at.append(receipt_blocks(path)))
+    )
+    assert run_serially(small_spec(), path, scheduler="none", durable=True).complete
+    assert file_digests(path) == file_digests(undisturbed)
     # the store as it is made, then each block before it is committed
     assert [len(before) for before in at] == [0, *range(12)]
 
 
 def test_what_cannot_be_synced_is_not_committed(undisturbed, tmp_path, monkeypatch):
-    from sweep.tasks import store
+    from sweep.tasks.engine import study_store
 
-    path = copied(undisturbed, tmp_path)
+    path = copy_store(undisturbed, tmp_path)
     (path / "pd_up" / "c" / "0" / "5" / "0").unlink()
 
     def broken(place):
         raise OSError(5, "Input/output error", str(place))
 
-    monkeypatch.setattr(store, "sync", broken)
+    monkeypatch.setattr(study_store, "sync_to_disk", broken)
     outcome = resume(path, progress=False, scheduler="none", durable=True)
     assert outcome.blocks_computed == 0 and "Input/output error" in outcome.stopped

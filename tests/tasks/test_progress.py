@@ -5,13 +5,13 @@ import time
 import pytest
 from click.testing import CliRunner
 from numba.core.event import trigger_event
-from small import small, small_file
+from small_studies import small_mapping, small_spec
 
 from sweep.cli import main
 from sweep.model.unsupported import UnsupportedShot
-from sweep.tasks import progress
 from sweep.tasks.driver import run
-from sweep.tasks.grid_study import GridStudy
+from sweep.tasks.engine import progress
+from sweep.tasks.studies.grid_study import GridStudy
 
 
 class Told(progress.Progress):
@@ -34,8 +34,8 @@ class Told(progress.Progress):
 @pytest.fixture
 def at_once(monkeypatch):
     """No time that passes before something is said, and little between lines."""
-    monkeypatch.setattr(progress, "LATE", 0.01)
-    monkeypatch.setattr(progress, "LINE_EVERY", 0.01)
+    monkeypatch.setattr(progress, "ACTIVITY_SILENT_SECONDS", 0.01)
+    monkeypatch.setattr(progress, "LINE_INTERVAL", 0.01)
 
 
 def compiling():
@@ -46,7 +46,7 @@ def compiling():
 @pytest.mark.usefixtures("at_once")
 def test_functions_are_counted_while_they_are_compiled_and_not_told_of_otherwise():
     told = Told()
-    with progress.working("planning", told):
+    with progress.show_activity("planning", told):
         told.until("planning, 0.0")
         assert not any("compiling" in line for line in told.lines)
         with compiling():
@@ -63,7 +63,7 @@ def test_functions_are_counted_while_they_are_compiled_and_not_told_of_otherwise
 
 def test_what_is_over_soon_is_not_told_of():
     told = Told()
-    with progress.working("planning", told), compiling():
+    with progress.show_activity("planning", told), compiling():
         pass
     assert told.lines == []
 
@@ -72,7 +72,7 @@ def test_what_is_over_soon_is_not_told_of():
 def test_a_bar_cuts_no_number(monkeypatch, capsys, width):
     monkeypatch.setenv("COLUMNS", str(width))
     monkeypatch.setenv("TTY_COMPATIBLE", "1")
-    bar = progress.Bar()
+    bar = progress.ProgressBar()
     bar.begin(points=12_345_678, done=1_234_567, unit="points")
     bar.at_work(workers=12, stored=3_100_000)
     bar.advance(points=1_000, failed=3)
@@ -86,8 +86,8 @@ def test_a_bar_cuts_no_number(monkeypatch, capsys, width):
 @pytest.mark.usefixtures("at_once")
 def test_a_run_that_compiles_nothing_does_not_say_that_it_compiles(tmp_path, monkeypatch):
     told = Told()
-    monkeypatch.setattr(GridStudy, "compile", lambda study: told.until("loading the model"))
-    run(small(axes={}), store=tmp_path / "small.zarr", scheduler="none", progress=told)
+    monkeypatch.setattr(GridStudy, "compile_kernels", lambda study: told.until("loading the model"))
+    run(small_spec(axes={}), store=tmp_path / "small.zarr", scheduler="none", progress=told)
     assert not any("compiling" in line for line in told.lines)
 
 
@@ -95,23 +95,28 @@ def test_a_run_that_compiles_nothing_does_not_say_that_it_compiles(tmp_path, mon
 @pytest.mark.parametrize(
     "arguments, inner",
     [
-        (("plan", "small.yaml"), "sweep.tasks.plan.effects_table"),
-        (("shot", "small.yaml"), "sweep.analysis.shot_figure.report"),
-        (("spectra", "small.yaml", "-o", "s.npz"), "sweep.tasks.spectra_export.spectra"),
-        (("figures", "small.zarr"), "sweep.analysis.figures.draw"),
-        (("export", "small.zarr", "s.csv"), "sweep.analysis.export.export"),
-        (("compare", "small.zarr", "small.zarr"),
-         "sweep.analysis.answers.comparison.compared"),
+        (("plan", "small.yaml"), "sweep.tasks.studies.study_plan.effects_table"),
+        (("shot", "small.yaml"), "sweep.analysis.shot_spectra.write_shot_report"),
+        (
+            ("spectra", "small.yaml", "-o", "s.npz"),
+            "sweep.tasks.studies.spectra_export.point_spectra",
+        ),
+        (("figures", "small.zarr"), "sweep.analysis.study_figures.draw_figures"),
+        (("export", "small.zarr", "s.csv"), "sweep.analysis.scene_results.point_export.export"),
+        (
+            ("compare", "small.zarr", "small.zarr"),
+            "sweep.analysis.answers.comparison.tabulated_differences",
+        ),
     ],
-)  # fmt: skip
+)
 def test_commands_say_that_they_compile(undisturbed, tmp_path, monkeypatch, arguments, inner):
     import yaml
 
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "small.yaml").write_text(yaml.safe_dump(small_file()))
+    (tmp_path / "small.yaml").write_text(yaml.safe_dump(small_mapping()))
     (tmp_path / "small.zarr").symlink_to(undisturbed)
     told = Told()
-    monkeypatch.setattr(progress.Lines, "say", lambda self, text: told.say(text))
+    monkeypatch.setattr(progress.ProgressLines, "say", lambda self, text: told.say(text))
 
     def compiled(*_, **__):
         with compiling():

@@ -3,14 +3,21 @@ import json
 import dask
 import pytest
 import xarray as xr
-from small import STUDY, copied, everything, quiet, small, tree
+from small_studies import (
+    STUDY_MAPPING,
+    copy_store,
+    file_contents,
+    file_digests,
+    run_serially,
+    small_spec,
+)
 
-from sweep.tasks import cluster
 from sweep.tasks.driver import resume, run
-from sweep.tasks.journal import Lock
-from sweep.tasks.progress import ClusterError, StoreError
-from sweep.tasks.store import software
-from sweep.tasks.summary import status
+from sweep.tasks.engine import cluster_connection
+from sweep.tasks.engine.journal import StoreLock
+from sweep.tasks.engine.progress import ClusterError, StoreError
+from sweep.tasks.engine.study_store import current_versions
+from sweep.tasks.studies.store_summary import status
 
 
 def altered(store, **changes):
@@ -22,28 +29,28 @@ def altered(store, **changes):
 
 
 def test_resuming_with_a_changed_spec_is_refused_with_the_differences(undisturbed, tmp_path):
-    store = copied(undisturbed, tmp_path)
-    before = everything(store)
-    other = small(seed=4, target={**STUDY["target"], "reflectance": 0.2})
+    store = copy_store(undisturbed, tmp_path)
+    before = file_contents(store)
+    other = small_spec(seed=4, target={**STUDY_MAPPING["target"], "reflectance": 0.2})
     with pytest.raises(StoreError) as refusal:
         resume(store, spec=other, progress=False, scheduler="none")
     assert "seed: 3 -> 4" in str(refusal.value)
     assert "target.reflectance: 0.02 -> 0.2" in str(refusal.value)
     with pytest.raises(StoreError, match="seed: 3 -> 4"):
-        quiet(other, store)
-    assert everything(store) == before
+        run_serially(other, store)
+    assert file_contents(store) == before
 
 
 def test_a_changed_title_or_place_of_execution_is_the_same_study(undisturbed, tmp_path):
-    store = copied(undisturbed, tmp_path)
-    spec = small(title="Another title", execution={"workers": 7})
+    store = copy_store(undisturbed, tmp_path)
+    spec = small_spec(title="Another title", execution={"workers": 7})
     assert resume(store, spec=spec, progress=False, scheduler="none").blocks_computed == 0
 
 
 @pytest.mark.parametrize(
     ("changes", "shown"),
     [
-        ({"software": {**software(), "numpy": "1.0"}}, "numpy: 1.0 in the store, "),
+        ({"software": {**current_versions(), "numpy": "1.0"}}, "numpy: 1.0 in the store, "),
         ({"model_version": "0.0"}, "model: 0.0 in the store, "),
         ({"study_id": "0" * 32}, "attributes were changed"),
         ({"layout": 99}, "laid out as version 99"),
@@ -54,12 +61,12 @@ def test_a_changed_title_or_place_of_execution_is_the_same_study(undisturbed, tm
 def test_resuming_with_other_versions_or_altered_attributes_is_refused(
     undisturbed, tmp_path, changes, shown
 ):
-    store = copied(undisturbed, tmp_path)
+    store = copy_store(undisturbed, tmp_path)
     altered(store, **changes)
-    before = everything(store)
+    before = file_contents(store)
     with pytest.raises(StoreError, match=shown):
         resume(store, progress=False, scheduler="none")
-    assert everything(store) == before
+    assert file_contents(store) == before
 
 
 def test_what_is_no_store_of_ours_is_refused_and_left_as_it_is(tmp_path):
@@ -68,7 +75,7 @@ def test_what_is_no_store_of_ours_is_refused_and_left_as_it_is(tmp_path):
     (tmp_path / "notes").mkdir()
     (tmp_path / "notes" / "text").write_text("mine")
     (tmp_path / "file").write_text("mine")
-    before = everything(tmp_path)
+    before = file_contents(tmp_path)
     for name, shown in (
         ("theirs.zarr", "not one that"),
         ("notes", "not a"),
@@ -78,48 +85,48 @@ def test_what_is_no_store_of_ours_is_refused_and_left_as_it_is(tmp_path):
             resume(tmp_path / name, progress=False)
         for overwrite in (False, True):
             with pytest.raises(StoreError, match=shown):
-                run(small(), store=tmp_path / name, progress=False, overwrite=overwrite)
+                run(small_spec(), store=tmp_path / name, progress=False, overwrite=overwrite)
     with pytest.raises(StoreError, match="there is no store"):
         resume(tmp_path / "absent", progress=False)
-    assert everything(tmp_path) == before
+    assert file_contents(tmp_path) == before
 
 
 def test_a_run_into_a_whole_store_of_the_same_study_points_to_status_and_overwrite(undisturbed):
-    before = everything(undisturbed)
+    before = file_contents(undisturbed)
     with pytest.raises(StoreError, match=r"12 of 12 blocks done: `sweep.status\(.*overwrite=True"):
-        quiet(small(), undisturbed)
-    assert everything(undisturbed) == before
+        run_serially(small_spec(), undisturbed)
+    assert file_contents(undisturbed) == before
 
 
 def test_overwriting_puts_another_study_in_the_place_of_an_older_versions(undisturbed, tmp_path):
-    store = copied(undisturbed, tmp_path)
+    store = copy_store(undisturbed, tmp_path)
     altered(store, layout=1)
-    outcome = quiet(small(seed=9), store, scheduler="none", overwrite=True)
+    outcome = run_serially(small_spec(seed=9), store, scheduler="none", overwrite=True)
     assert outcome.complete and outcome.blocks_computed == 12
-    assert status(store).study_id == small(seed=9).id
+    assert status(store).study_id == small_spec(seed=9).id
     assert [child.name for child in tmp_path.iterdir()] == ["copy.zarr"]
 
 
 def test_a_store_that_someone_writes_to_is_neither_resumed_nor_overwritten(undisturbed, tmp_path):
-    store = copied(undisturbed, tmp_path)
-    held = Lock(store)
+    store = copy_store(undisturbed, tmp_path)
+    held = StoreLock(store)
     with pytest.raises(StoreError, match="is being written by process"):
         resume(store, progress=False, scheduler="none")
     with pytest.raises(StoreError, match="is being written by process"):
-        quiet(small(), store, scheduler="none", overwrite=True)
+        run_serially(small_spec(), store, scheduler="none", overwrite=True)
     assert status(store).holder_lives
     held.release()
     assert status(store).holder is None
 
 
 def test_a_worker_with_other_software_writes_nothing(undisturbed, tmp_path, monkeypatch):
-    store = copied(undisturbed, tmp_path)
+    store = copy_store(undisturbed, tmp_path)
     (store / "pd_up" / "c" / "0" / "5" / "0").unlink()
-    before = tree(store)
-    monkeypatch.setattr("sweep.tasks.store.refuse_other_versions", refusing_on_workers)
+    before = file_digests(store)
+    monkeypatch.setattr("sweep.tasks.engine.study_store.refuse_other_versions", refusing_on_workers)
     with pytest.raises(StoreError, match="worker on"):
         resume(store, progress=False, workers=1, processes=False)
-    assert tree(store) == before
+    assert file_digests(store) == before
 
 
 def refusing_on_workers(path, attributes, *, where):
@@ -129,8 +136,13 @@ def refusing_on_workers(path, attributes, *, where):
 
 
 def test_a_scheduler_that_does_not_answer_leaves_no_store_behind(tmp_path, monkeypatch):
-    monkeypatch.setattr(cluster, "CONNECT_TIMEOUT", 0.5)
+    monkeypatch.setattr(cluster_connection, "CONNECT_TIMEOUT", 0.5)
     with pytest.raises(ClusterError, match=r"answers at tcp://127\.0\.0\.1:9"):
-        run(small(), store=tmp_path / "small.zarr", scheduler="tcp://127.0.0.1:9", progress=False)
+        run(
+            small_spec(),
+            store=tmp_path / "small.zarr",
+            scheduler="tcp://127.0.0.1:9",
+            progress=False,
+        )
     assert list(tmp_path.iterdir()) == []
     assert dask.config.get("scheduler", None) is None  # what is read later is read without it

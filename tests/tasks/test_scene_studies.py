@@ -8,35 +8,43 @@ import sys
 import numpy as np
 import pytest
 import xarray as xr
-from small import evaluated, logged, quiet, receipts, tree
-from small_flights import SCENE, small_scene
+from small_flights import SCENE_MAPPING, small_scene_spec
+from small_studies import (
+    file_digests,
+    logged_blocks,
+    make_logging_evaluate,
+    receipt_blocks,
+    run_serially,
+)
 from test_driver import StopAfter
 
 from sweep.model.geometry.rays import Caster
 from sweep.model.outputs import CYCLES, NAVIGATION, POINTS, SHOTS, SIMULATED, STATISTICS
 from sweep.storage.locations import eyepoints_path
-from sweep.tasks import eyepoint_study
 from sweep.tasks.driver import resume, run
-from sweep.tasks.eyepoint_study import EyepointStudy
-from sweep.tasks.flight_study import FlightStudy
-from sweep.tasks.journal import Lock
-from sweep.tasks.plan import plan
-from sweep.tasks.progress import Progress, StoreError
-from sweep.tasks.store import create
-from sweep.tasks.summary import scene_summary, status
+from sweep.tasks.engine.journal import StoreLock
+from sweep.tasks.engine.progress import Progress, StoreError
+from sweep.tasks.engine.study_store import create_store
+from sweep.tasks.studies import eyepoint_study
+from sweep.tasks.studies.eyepoint_study import EyepointStudy
+from sweep.tasks.studies.flight_study import FlightStudy
+from sweep.tasks.studies.store_summary import scene_summary, status
+from sweep.tasks.studies.study_plan import plan_study
 
 
 @pytest.fixture(autouse=True)
 def small_eyepoint_blocks(monkeypatch):
     """Several blocks of eyepoints a scanner, where the study itself is small."""
-    monkeypatch.setattr(eyepoint_study, "BLOCK_SHOTS", 96)
+    monkeypatch.setattr(eyepoint_study, "BLOCK_SHOTS_MAX", 96)
 
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(eyepoint_study, "BLOCK_SHOTS", 96)
-        outcome = quiet(small_scene(), tmp_path_factory.mktemp("undisturbed") / "scene.zarr")
+        patch.setattr(eyepoint_study, "BLOCK_SHOTS_MAX", 96)
+        outcome = run_serially(
+            small_scene_spec(), tmp_path_factory.mktemp("undisturbed") / "scene.zarr"
+        )
     assert outcome.complete
     return outcome
 
@@ -75,10 +83,10 @@ def test_a_study_holds_every_array_that_the_model_names(undisturbed):
 
 def test_rays_are_counted_as_they_are_cast(undisturbed):
     assert undisturbed.rays == {"three": 222 * 7 + 74, "line": 148 * 7 + 148}
-    plain = FlightStudy(small_scene(), undisturbed.store)
+    plain = FlightStudy(small_scene_spec(), undisturbed.store)
     for eyepoints in plain.eyepoint_studies():
         store = eyepoints_path(undisturbed.store, eyepoints.id)
-        assert sorted(receipts(store)) == list(range(eyepoints.n_blocks))
+        assert sorted(receipt_blocks(store)) == list(range(eyepoints.n_blocks))
         assert eyepoints.n_blocks > 1
 
 
@@ -89,18 +97,18 @@ def test_rays_are_counted_as_they_are_cast(undisturbed):
 def test_workers_make_the_same_bytes_as_a_plain_loop(undisturbed, tmp_path, monkeypatch, place):
     if place.get("processes", True):  # worker processes cut eyepoints as they are installed
         monkeypatch.undo()
-    outcome = quiet(small_scene(), tmp_path / "scene.zarr", **place)
-    assert outcome.complete and tree(outcome.store) == tree(undisturbed.store)
+    outcome = run_serially(small_scene_spec(), tmp_path / "scene.zarr", **place)
+    assert outcome.complete and file_digests(outcome.store) == file_digests(undisturbed.store)
     if not place.get("processes", True):
         there, here = (path.parent / "eyepoints" for path in (undisturbed.store, outcome.store))
-        assert tree(here) == tree(there)
+        assert file_digests(here) == file_digests(there)
 
 
 @pytest.mark.slow
 def test_bits_do_not_depend_on_the_number_of_threads_of_the_libraries(undisturbed, tmp_path):
     script = (
-        "from small_flights import small_scene; from sweep.tasks.driver import run;"
-        f"run(small_scene(), store={str(tmp_path / 'one.zarr')!r}, scheduler='none',"
+        "from small_flights import small_scene_spec; from sweep.tasks.driver import run;"
+        f"run(small_scene_spec(), store={str(tmp_path / 'one.zarr')!r}, scheduler='none',"
         " progress=False)"
     )
     names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -108,27 +116,29 @@ def test_bits_do_not_depend_on_the_number_of_threads_of_the_libraries(undisturbe
     subprocess.run(
         [sys.executable, "-c", script], check=True, env=environment | dict.fromkeys(names, "1")
     )
-    assert tree(tmp_path / "one.zarr") == tree(undisturbed.store)
+    assert file_digests(tmp_path / "one.zarr") == file_digests(undisturbed.store)
 
 
 def test_another_radiometry_of_the_same_geometry_casts_no_ray(undisturbed, tmp_path, monkeypatch):
     shutil.copytree(undisturbed.store.parent / "eyepoints", tmp_path / "eyepoints")
     objects = {
         name: thing | {"reflectance": 0.02, "reflectance_law": "lommel_seeliger"}
-        for name, thing in SCENE["scene"]["objects"].items()
+        for name, thing in SCENE_MAPPING["scene"]["objects"].items()
     }
-    other = small_scene(
-        scene=SCENE["scene"] | {"objects": objects},
+    other = small_scene_spec(
+        scene=SCENE_MAPPING["scene"] | {"objects": objects},
         draws={"number": 2},
-        instrument=SCENE["instrument"]
+        instrument=SCENE_MAPPING["instrument"]
         | {"telescope": {"aperture": "20 mm", "coupling": "aperture"}},
         title="Darker",
     )
     looks = []
     # Warnings are of a few rays, before the geometry is looked for.
-    monkeypatch.setattr("sweep.tasks.doubts.tell_doubts", lambda study, say: None)
+    monkeypatch.setattr(
+        "sweep.tasks.studies.study_warnings.issue_study_warnings", lambda study, say: None
+    )
     monkeypatch.setattr("sweep.model.eyepoints.observe", lambda *a, **k: looks.append(a))
-    outcome = quiet(other, tmp_path / "darker.zarr")
+    outcome = run_serially(other, tmp_path / "darker.zarr")
     assert outcome.complete and outcome.rays == {"three": 0, "line": 0} and not looks
     dark, bright = opened(outcome.store)["three"], opened(undisturbed.store)["three"]
     assert (dark.snr_up.isel(power=1) < bright.snr_up.isel(power=1)).all()
@@ -136,16 +146,16 @@ def test_another_radiometry_of_the_same_geometry_casts_no_ray(undisturbed, tmp_p
 
 
 def test_another_geometry_is_cast_anew(undisturbed, tmp_path):
-    first = small_scene()
+    first = small_scene_spec()
     for changes in (
         {"footprint": {"beamlets": 8, "speckle": "none"}},
-        {"platform": SCENE["platform"] | {"jitter": "10 urad"}},
-        {"platform": SCENE["platform"] | {"lever_arm": ["0 m", "0 m", "1 m"]}},
+        {"platform": SCENE_MAPPING["platform"] | {"jitter": "10 urad"}},
+        {"platform": SCENE_MAPPING["platform"] | {"lever_arm": ["0 m", "0 m", "1 m"]}},
     ):
-        assert small_scene(**changes).geometry_id("three") != first.geometry_id("three")
-    assert small_scene(seed=9).geometry_id("three") == first.geometry_id("three")
-    renamed = {"tripod": SCENE["scanners"]["three"]}
-    assert small_scene(scanners=renamed).geometry_id("tripod") == first.geometry_id("three")
+        assert small_scene_spec(**changes).geometry_id("three") != first.geometry_id("three")
+    assert small_scene_spec(seed=9).geometry_id("three") == first.geometry_id("three")
+    renamed = {"tripod": SCENE_MAPPING["scanners"]["three"]}
+    assert small_scene_spec(scanners=renamed).geometry_id("tripod") == first.geometry_id("three")
 
 
 @pytest.mark.parametrize("points", [60, 500])
@@ -153,17 +163,19 @@ def test_an_interrupted_study_resumes_to_the_same_bytes(undisturbed, tmp_path, p
     """After 60 shots rays are still being cast; after 500 the cloud is being made."""
     path, log = tmp_path / "scene.zarr", tmp_path / "log"
     outcome = run(
-        small_scene(), store=path, scheduler="none", progress=StopUnder(points),
-        evaluate=logged(log),
+        small_scene_spec(), store=path, scheduler="none", progress=StopUnder(points),
+        evaluate=make_logging_evaluate(log),
     )  # fmt: skip
     assert not outcome.complete and outcome.stopped
     assert ("eyepoints" in outcome.stopped) == (points == 60)
     assert status(path).blocks_done == outcome.blocks_done
-    assert resume(path, progress=False, scheduler="none", evaluate=logged(log)).complete
-    eyepoints = [EyepointStudy(small_scene(), name) for name in ("three", "line")]
+    assert resume(
+        path, progress=False, scheduler="none", evaluate=make_logging_evaluate(log)
+    ).complete
+    eyepoints = [EyepointStudy(small_scene_spec(), name) for name in ("three", "line")]
     blocks = sum(study.n_blocks for study in eyepoints) + outcome.blocks
-    assert len(evaluated(log)) == blocks  # none was computed twice
-    assert tree(path) == tree(undisturbed.store)
+    assert len(logged_blocks(log)) == blocks  # none was computed twice
+    assert file_digests(path) == file_digests(undisturbed.store)
 
 
 class StopUnder(StopAfter):
@@ -179,22 +191,22 @@ def test_lost_chunks_of_either_store_are_computed_again(undisturbed, tmp_path):
     shutil.copytree(undisturbed.store.parent, tmp_path / "copy")
     path = tmp_path / "copy" / "scene.zarr"
     (path / "three" / "flags" / "c" / "1" / "1" / "0" / "0").unlink()
-    eyepoints = eyepoints_path(path, small_scene().geometry_id("three"))
+    eyepoints = eyepoints_path(path, small_scene_spec().geometry_id("three"))
     (eyepoints / "offset" / "c" / "1" / "0").unlink()
     outcome = resume(path, progress=False, scheduler="none")
     assert outcome.complete and outcome.blocks_computed == 1
     assert outcome.rays == {"three": 96 * 7 + 32, "line": 0}
-    assert tree(tmp_path / "copy") == tree(undisturbed.store.parent)
+    assert file_digests(tmp_path / "copy") == file_digests(undisturbed.store.parent)
 
 
 def test_eyepoints_under_a_wrong_name_or_of_other_software_are_refused(undisturbed, tmp_path):
     shutil.copytree(undisturbed.store.parent / "eyepoints", tmp_path / "eyepoints")
-    spec = small_scene()
+    spec = small_scene_spec()
     one, other = (eyepoints_path(tmp_path / "x.zarr", spec.geometry_id(n)) for n in spec.scanners)
     shutil.rmtree(one)
     os.rename(other, one)
     with pytest.raises(StoreError, match="holds other eyepoints than its name says"):
-        quiet(spec, tmp_path / "x.zarr")
+        run_serially(spec, tmp_path / "x.zarr")
     with pytest.raises(StoreError, match="holds eyepoints"):
         resume(one, progress=False, scheduler="none")
 
@@ -206,9 +218,9 @@ def test_eyepoints_under_a_wrong_name_or_of_other_software_are_refused(undisturb
 )
 def test_rays_that_another_run_casts_are_waited_for_and_used(undisturbed, tmp_path, whole):
     path = tmp_path / "scene.zarr"
-    study = EyepointStudy(small_scene(), "three")
+    study = EyepointStudy(small_scene_spec(), "three")
     theirs = eyepoints_path(path, study.id)
-    lock = Lock(create(theirs, study))
+    lock = StoreLock(create_store(theirs, study))
 
     class Other(Progress):
         """The other run, which goes on when this one waits."""
@@ -220,42 +232,51 @@ def test_rays_that_another_run_casts_are_waited_for_and_used(undisturbed, tmp_pa
                     shutil.copytree(cast, theirs, dirs_exist_ok=True)
                 lock.release()
 
-    outcome = run(small_scene(), store=path, scheduler="none", progress=Other())
+    outcome = run(small_scene_spec(), store=path, scheduler="none", progress=Other())
     assert outcome.complete
     assert outcome.rays == undisturbed.rays | ({"three": 0} if whole else {})
-    assert tree(tmp_path) == tree(undisturbed.store.parent)
+    assert file_digests(tmp_path) == file_digests(undisturbed.store.parent)
 
 
 def test_a_plan_counts_what_the_run_makes(undisturbed, tmp_path):
-    found = plan(small_scene(), store=tmp_path / "none.zarr", workers=2)
-    assert {s.name: s.rays for s in found.scanners} == undisturbed.rays
-    assert found.blocks == undisturbed.blocks and not found.scanners[0].is_cast
+    found = plan_study(small_scene_spec(), store_path=tmp_path / "none.zarr", n_workers=2)
+    assert {s.name: s.n_rays for s in found.scanners} == undisturbed.rays
+    assert found.n_blocks == undisturbed.blocks and not found.scanners[0].is_cast
     chunks = [p for p in undisturbed.store.rglob("c/**/*") if p.is_file()]
     known = [p for p in chunks if "scene_map" in str(p) or "power" in str(p)]
-    assert found.chunks == len(chunks) - len(known)
-    assert found.bytes == sum(
+    assert found.n_chunks == len(chunks) - len(known)
+    assert found.nbytes == sum(
         array.nbytes for group, child in opened(undisturbed.store).children.items()
         for array in child.data_vars.values() if group != "scene_map"
     )  # fmt: skip
-    assert plan(small_scene(), store=undisturbed.store).scanners[0].is_cast
+    assert plan_study(small_scene_spec(), store_path=undisturbed.store).scanners[0].is_cast
 
 
 def test_the_summary_counts_what_the_arrays_hold(undisturbed):
     found = opened(undisturbed.store)
-    rows = {row.part: row for row in scene_summary(undisturbed.store)}
+    rows = {row.label: row for row in scene_summary(undisturbed.store)}
     assert len(rows) == 4
     weak = rows["three, power 0.01 W"]
     flags = found["three"].flags.values[0]
-    assert weak.shots == 222 * 5 and weak.true == ((flags & 1) > 0).any(axis=-1).sum()
-    assert weak.false == ((flags > 0) & (flags & 1 == 0)).sum()
-    assert weak.pd == pytest.approx(float(found["three"].pd_shot[0].mean()), rel=1e-12)
-    assert weak.cycles == 74 * 5
-    assert weak.solved == (found["three"].velocity_status.values[0] <= 1).sum()
+    assert (
+        weak.n_shots == 222 * 5
+        and weak.shots_with_true_return == ((flags & 1) > 0).any(axis=-1).sum()
+    )
+    assert weak.false_points == ((flags > 0) & (flags & 1 == 0)).sum()
+    assert weak.mean_pd == pytest.approx(float(found["three"].pd_shot[0].mean()), rel=1e-12)
+    assert weak.n_cycles == 74 * 5
+    assert weak.solved_cycles == (found["three"].velocity_status.values[0] <= 1).sum()
     strong = rows["three, power 1 W"]
-    assert strong.true == ((found["three"].flags.values[1] & 1) > 0).any(axis=-1).sum()
+    assert (
+        strong.shots_with_true_return
+        == ((found["three"].flags.values[1] & 1) > 0).any(axis=-1).sum()
+    )
     # In one draw of a hundred a leaked peak pairs with the echo; whole spectra have it too.
-    assert weak.true < strong.true and 0.98 * 222 * 5 < strong.true <= strong.shots == 222 * 5
-    assert rows["line, power 1 W"].cycles == 0
+    assert (
+        weak.shots_with_true_return < strong.shots_with_true_return
+        and 0.98 * 222 * 5 < strong.shots_with_true_return <= strong.n_shots == 222 * 5
+    )
+    assert rows["line, power 1 W"].n_cycles == 0
 
 
 def test_the_summary_of_an_incomplete_flight_counts_committed_blocks_only(undisturbed, tmp_path):
@@ -267,23 +288,29 @@ def test_the_summary_of_an_incomplete_flight_counts_committed_blocks_only(undist
     for chunk in (store / "three" / "velocity_status" / "c").rglob("*"):
         if chunk.is_file() and chunk.parts[-3:] != ("0", "0", "0"):
             chunk.unlink()
-    rows = {row.part: row for row in scene_summary(store)}
+    rows = {row.label: row for row in scene_summary(store)}
     weak, strong = rows["three, power 0.01 W"], rows["three, power 1 W"]
-    assert (weak.shots, weak.cycles) == (120 * 3, 40 * 3)
+    assert (weak.n_shots, weak.n_cycles) == (120 * 3, 40 * 3)
     status = opened(undisturbed.store)["three"].velocity_status.values[0, :40, :3]
-    assert weak.solved == (status <= 1).sum()
-    assert strong.shots == strong.cycles == strong.solved == rows["line, power 1 W"].shots == 0
+    assert weak.solved_cycles == (status <= 1).sum()
+    assert (
+        strong.n_shots
+        == strong.n_cycles
+        == strong.solved_cycles
+        == rows["line, power 1 W"].n_shots
+        == 0
+    )
 
 
 def test_a_beam_that_sees_nothing_has_no_chance_and_its_study_runs(tmp_path):
     """A plane of 300 m under beams at 22.5 deg, which see it from below 360 m alone."""
     objects = {"ground": {"kind": "plane", "size": "300 m", "reflectance": 0.1}}
-    spec = small_scene(
+    spec = small_scene_spec(
         scene={"origin": "ground", "objects": objects},
-        scanners={"three": SCENE["scanners"]["three"]},
+        scanners={"three": SCENE_MAPPING["scanners"]["three"]},
         axes={},
     )
-    found = opened(quiet(spec, tmp_path / "scene.zarr").store)["three"]
+    found = opened(run_serially(spec, tmp_path / "scene.zarr").store)["three"]
     unseen = ~np.isfinite(found.beam_range.values)
     assert 0.5 < unseen.mean() < 1 and np.isfinite(found.true_altitude.values).all()
     assert np.isnan(found.pd_shot.values[unseen]).all()

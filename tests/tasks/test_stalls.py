@@ -5,11 +5,11 @@ import re
 import threading
 
 import pytest
-from small import small, threads, tree
+from small_studies import file_digests, small_spec, thread_cluster_client
 from test_absence import Told
 
-from sweep.tasks import scheduler
 from sweep.tasks.driver import run
+from sweep.tasks.engine import dispatcher
 
 RELEASED = threading.Event()
 
@@ -25,9 +25,9 @@ def blocked_at_block_3(study, block):
 def impatient(monkeypatch):
     """A client of one worker, whose stalls are told after half a second."""
     RELEASED.clear()
-    monkeypatch.setattr(scheduler, "TICK", 0.05)
-    monkeypatch.setattr(scheduler, "STALL_SECONDS", 0.5)
-    with threads(1) as client:
+    monkeypatch.setattr(dispatcher, "IDLE_POLL_SECONDS", 0.05)
+    monkeypatch.setattr(dispatcher, "STALL_SECONDS", 0.5)
+    with thread_cluster_client(1) as client:
         yield client
 
 
@@ -43,10 +43,10 @@ def test_a_run_that_stalls_shows_its_tasks_and_workers_and_then_goes_on(
     told = Releasing(lambda: None)
     with caplog.at_level(logging.INFO, logger="sweep"):
         outcome = run(
-            small(), store=tmp_path / "s.zarr", client=impatient, progress=told,
+            small_spec(), store=tmp_path / "s.zarr", client=impatient, progress=told,
             evaluate=blocked_at_block_3,
         )  # fmt: skip
-    assert outcome.complete and tree(outcome.store) == tree(undisturbed)
+    assert outcome.complete and file_digests(outcome.store) == file_digests(undisturbed)
     first, second = (line for line in told.lines if line.startswith("no block has come back for "))
     (address,) = impatient.nthreads()
     assert re.search(r"task of block [0-3] and \d+ more: sent .* ago, .*pending", first)
@@ -56,11 +56,11 @@ def test_a_run_that_stalls_shows_its_tasks_and_workers_and_then_goes_on(
 
 
 def test_a_run_is_quiet_by_default_and_logs_its_steps_where_asked(tmp_path, caplog, capfd):
-    run(small(), store=tmp_path / "quiet.zarr", scheduler="none", progress=False)
+    run(small_spec(), store=tmp_path / "quiet.zarr", scheduler="none", progress=False)
     assert capfd.readouterr() == ("", "")
     caplog.clear()
     with caplog.at_level(logging.DEBUG, logger="sweep"):
-        run(small(), store=tmp_path / "s.zarr", scheduler="none", progress=False)
+        run(small_spec(), store=tmp_path / "s.zarr", scheduler="none", progress=False)
     words = [record.message for record in caplog.records if record.name == "sweep.session"]
     assert f"{tmp_path / 's.zarr'}: study " in words[0] and " of 12 blocks, 0 done" in words[0]
     assert "blocks are computed in this process, one after the other" in words

@@ -5,17 +5,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from small import everything, quiet, small
+from small_studies import file_contents, run_serially, small_spec
 
-from sweep.storage import opening
-from sweep.tasks import store
-from sweep.tasks.grid_study import GridStudy
-from sweep.tasks.progress import StoreError
+from sweep.storage import store_format
+from sweep.tasks.engine import study_store
+from sweep.tasks.engine.progress import StoreError
+from sweep.tasks.studies.grid_study import GridStudy
 
 
 @pytest.fixture
 def spec():
-    return small()
+    return small_spec()
 
 
 @pytest.fixture
@@ -25,7 +25,7 @@ def study(spec):
 
 @pytest.fixture
 def path(tmp_path, study):
-    return store.create(tmp_path / "new" / "small.zarr", study)
+    return study_store.create_store(tmp_path / "new" / "small.zarr", study)
 
 
 def is_whole(path, objects):
@@ -59,8 +59,8 @@ def test_members_of_a_zipped_axis_and_words_open_as_coordinates(tmp_path):
         "cut": {"zip": [{"target.range": ["1 km", "2 km"], "target.grazing_angle": "15 deg"}]},
         "instrument.processing.window": ["hamming", "hann"],
     }
-    spec = small(axes=axes)
-    path = store.create(tmp_path / "cut.zarr", GridStudy(spec))
+    spec = small_spec(axes=axes)
+    path = study_store.create_store(tmp_path / "cut.zarr", GridStudy(spec))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         dataset = xr.open_zarr(path)
@@ -71,32 +71,34 @@ def test_members_of_a_zipped_axis_and_words_open_as_coordinates(tmp_path):
 
 def test_a_written_block_reads_back_bit_for_bit_and_fills_its_chunks(path, study):
     results = study.evaluate(3)
-    arrays = store.Arrays(path, study)
-    objects = store.block_objects(study, 3)
+    arrays = study_store.BlockWriter(path, study)
+    objects = study_store.chunk_names_of_block(study, 3)
     assert not is_whole(path, objects)
     written = arrays.write(3, results)
     assert is_whole(path, objects)
-    assert written.digest == opening.digest(path, objects)
-    assert written.bytes == sum((path / name).stat().st_size for name in objects)
+    assert written.digest == store_format.stored_objects_digest(path, objects)
+    assert written.n_bytes == sum((path / name).stat().st_size for name in objects)
     dataset = xr.open_zarr(path)
     for name, values in results.items():
-        stored = dataset[name].values[study.grid.block(3)]
+        stored = dataset[name].values[study.grid.block_slices(3)]
         assert stored.tobytes() == np.ascontiguousarray(values).tobytes()
     assert int(dataset.pd_shot.notnull().sum()) == study.block_size(3)
 
 
 def test_a_block_of_nothing_but_the_fill_value_is_written_all_the_same(path, study):
-    layouts = {layout.name: layout for layout in study.arrays()}
+    layouts = {layout.name: layout for layout in study.array_layouts()}
     results = {
-        name: np.full(study.grid.extent(1), layouts[name].fill, dtype=layouts[name].dtype)
-        for name in study.chunks(1)
+        name: np.full(
+            study.grid.block_extent(1), layouts[name].fill_value, dtype=layouts[name].dtype
+        )
+        for name in study.chunk_positions(1)
     }
-    store.Arrays(path, study).write(1, results)
-    assert is_whole(path, store.block_objects(study, 1))
+    study_store.BlockWriter(path, study).write(1, results)
+    assert is_whole(path, study_store.chunk_names_of_block(study, 1))
 
 
 def test_part_of_a_chunk_and_wrong_names_are_refused(path, study):
-    arrays = store.Arrays(path, study)
+    arrays = study_store.BlockWriter(path, study)
     results = study.evaluate(0)
     with pytest.raises(ValueError, match="whole chunks only"):
         arrays.write(0, {**results, "pd_shot": results["pd_shot"][:1]})
@@ -105,11 +107,11 @@ def test_part_of_a_chunk_and_wrong_names_are_refused(path, study):
 
 
 def test_a_study_without_axes_and_one_with_draws_store_their_chunks(tmp_path):
-    spec = small(axes={}, draws={"number": 250, "batch": 100})
+    spec = small_spec(axes={}, draws={"number": 250, "batch": 100})
     study = GridStudy(spec)
-    path = store.create(tmp_path / "draws.zarr", study)
-    store.Arrays(path, study).write(0, study.evaluate(0))
-    assert is_whole(path, store.block_objects(study, 0))
+    path = study_store.create_store(tmp_path / "draws.zarr", study)
+    study_store.BlockWriter(path, study).write(0, study.evaluate(0))
+    assert is_whole(path, study_store.chunk_names_of_block(study, 0))
     dataset = xr.open_zarr(path)
     assert dataset.pd_shot.dims == ()
     assert dataset.n_detected_up.dims == ("batch",)
@@ -120,22 +122,22 @@ def test_a_study_without_axes_and_one_with_draws_store_their_chunks(tmp_path):
 
 
 def test_a_store_is_never_made_in_the_place_of_something_else(path, study):
-    before = everything(path)
+    before = file_contents(path)
     with pytest.raises(StoreError, match="is there already"):
-        store.create(path, study)
-    assert everything(path) == before
+        study_store.create_store(path, study)
+    assert file_contents(path) == before
     assert [child.name for child in path.parent.iterdir()] == [path.name]
 
 
 def test_a_creation_cut_short_leaves_no_store(tmp_path, study, monkeypatch):
     monkeypatch.setattr(
-        store, "_consolidate", lambda path: (_ for _ in ()).throw(KeyboardInterrupt)
+        study_store, "_consolidate_metadata", lambda path: (_ for _ in ()).throw(KeyboardInterrupt)
     )
     with pytest.raises(KeyboardInterrupt):
-        store.create(tmp_path / "small.zarr", study)
+        study_store.create_store(tmp_path / "small.zarr", study)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_place_where_no_folder_can_be_made_is_told_with_a_remedy():
     with pytest.raises(StoreError, match=r"/proc/x.zarr can't be made: .*; name another place, st"):
-        quiet(small(), Path("/proc/x.zarr"))
+        run_serially(small_spec(), Path("/proc/x.zarr"))

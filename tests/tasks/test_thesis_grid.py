@@ -8,7 +8,7 @@ import pytest
 
 from sweep.model import segments, truth
 from sweep.model.shot import evaluate, find, prepare
-from sweep.tasks.accuracy import bench
+from sweep.tasks.accuracy import study_sample
 
 WITHOUT_LEAKAGE = ("footprint", "footprint_phase", "doppler", "signal_shot_noise", "image")
 
@@ -41,8 +41,8 @@ def drawn(table_4_1, number=12, **changes):
 
 def spectrum(shots, i, segment, *, degree=0, real=False, folded=False):
     """Bins around a point's lines, and |X| there, without noise."""
-    (cells,) = bench.grid_sizes(shots)[[i]].tolist()
-    low, magnitude = bench.magnitudes(
+    (cells,) = study_sample.cells_per_point(shots)[[i]].tolist()
+    low, magnitude = study_sample.grid_magnitudes(
         shots, shots.point_table(), np.array([i]), segment, cells, (degree, real, folded)
     )
     bins = low[0] + np.arange(magnitude.shape[1])
@@ -122,7 +122,9 @@ def test_the_same_detections_come_of_it(table_4_1):
         range=rng.uniform(200.0, 9000.0, 40), grazing_angle=np.radians(rng.uniform(5.0, 90.0, 40))
     )
     exact = evaluate(scene, WITHOUT_LEAKAGE, look=find)
-    found = evaluate(scene, WITHOUT_LEAKAGE, look=lambda s: bench.find_on_grid(s, degree=9))
+    found = evaluate(
+        scene, WITHOUT_LEAKAGE, look=lambda s: study_sample.find_peaks_on_grid(s, degree=9)
+    )
     for name in ("pd_up", "pd_doppler", "pd_shot", "snr_up", "range_error", "noise_variance"):
         # Images beyond the grid are left out: 1e-4 of a line at the very most.
         assert found[name] == pytest.approx(exact[name], rel=2e-3, abs=1e-3), name
@@ -132,8 +134,8 @@ def test_the_same_detections_come_of_it(table_4_1):
 def test_a_spread_footprint_gets_a_larger_grid(table_4_1):
     wide = prepare(table_4_1(range=9e3, grazing_angle=np.radians([0.5, 60.0])), WITHOUT_LEAKAGE)
     ((_, shots),) = wide
-    assert list(bench.grid_sizes(shots)) == [2**13, 2**12]
-    assert list(bench.grid_sizes(shots, 2**11)) == [2**13, 2**11]
+    assert list(study_sample.cells_per_point(shots)) == [2**13, 2**12]
+    assert list(study_sample.cells_per_point(shots, 2**11)) == [2**13, 2**11]
     bins, found = spectrum(shots, 0, 0, degree=9)
     _, exact = segments.spectrum(shots, 0, 0)
     assert np.abs(found - exact[bins]).max() < 1e-3 * exact.max()
@@ -152,6 +154,6 @@ def test_detections_in_the_time_domain_are_those_of_the_closed_form(table_4_1):
 
 def test_direct_detection_has_no_doppler_segment(table_4_1):
     scene = table_4_1(architecture="direct", range=np.array([20.0, 30.0]), radial_velocity=0.0)
-    for look in (bench.find_on_grid, truth.find):
+    for look in (study_sample.find_peaks_on_grid, truth.find):
         found = evaluate(scene | {"instrument.processing.fft_size": 4096}, ("image",), look=look)
         assert np.isnan(found["pd_doppler"]).all() and (found["pd_up"] > 0).all()

@@ -8,14 +8,14 @@ import yaml
 from click.testing import CliRunner
 
 import sweep
-from sweep.analysis.consistency import consistency
+from sweep.analysis.scene_results.consistency import check_consistency
 from sweep.cli import main
-from sweep.report.writing import write
-from sweep.spec import Spec, SpecError
-from sweep.spec.reading import library
-from sweep.spec.study import SceneSpec
+from sweep.report.study_report import write_report
+from sweep.spec import GridSpec, SpecError
+from sweep.spec.specs import SceneSpec
+from sweep.spec.yaml_document import library_instruments
 from sweep.tasks import driver
-from sweep.tasks.studies import study_of
+from sweep.tasks.studies.study_loading import make_study
 
 SLOPE = {"kind": "plane", "size": "6 km", "slope": "11 deg", "uphill": "30 deg", "reflectance": 0.1}
 CRATERED = SLOPE | {"spacing": "20 m", "craters": {"smallest": "60 m", "largest": "300 m"}}
@@ -66,7 +66,7 @@ def spec_of(**changes):
      [FLOOR_NOTE]),
 ])  # fmt: skip
 def test_errors_of_navigation_that_are_not_stated_are_named(changes, notes):
-    sentences = spec_of(**changes).unstated_errors()
+    sentences = spec_of(**changes).unstated_error_sentences()
     assert len(sentences) == len(notes)
     assert all(words in sentence for words, sentence in zip(notes, sentences, strict=True))
 
@@ -84,7 +84,7 @@ def test_braking_that_drifts_speckled_lines_over_bins_is_named(speed, speckle, b
         instrument="lander_ndl", platform={"path": path},
         error_floor=STATED | {"range_noise": "1 m"},
         footprint={"beamlets": 19, "speckle": speckle},
-    ).unstated_errors()  # fmt: skip
+    ).unstated_error_sentences()  # fmt: skip
     assert len(sentences) == bool(bins)
     assert not bins or f"drifts lines by up to {bins} bins" in sentences[0]
 
@@ -101,7 +101,7 @@ def test_plan_run_and_report_say_that_a_flight_has_no_floor(tmp_path):
             ran = CliRunner().invoke(main, command)
             assert ran.exit_code == 0
             assert " ".join(ran.stderr.split()).count(f"note: n{FLOOR_NOTE}") == number
-        page = write(store, tmp_path / f"{name}.html").read_text()
+        page = write_report(store, tmp_path / f"{name}.html").read_text()
         assert (FLOOR_NOTE in page) == bool(number)
         assert ("rrors that no echo lowers: " in page) != bool(number)
 
@@ -130,7 +130,7 @@ def test_a_floor_that_is_stated_as_zero_is_off():
         instrument="lander_ndl", error_floor={"range_noise": "0 m", "vibration": "0 m/s"}
     )
     assert not any(value for _, value in spec.error_floor)
-    assert not any(study_of(spec, Path("nowhere.zarr")).error_floor)
+    assert not any(make_study(spec, Path("nowhere.zarr")).error_floor)
 
 
 @pytest.mark.parametrize("command", ["plan", "run"])
@@ -153,14 +153,14 @@ def test_plan_and_run_tell_of_the_floor_that_an_instrument_brings(command, tmp_p
     ],
 )
 def test_a_file_of_an_instrument_may_have_a_floor(text, floor, tmp_path):
-    fields = yaml.safe_load(library()["lander_ndl"].read_text())["instrument"]
+    fields = yaml.safe_load(library_instruments()["lander_ndl"].read_text())["instrument"]
     root = yaml.safe_dump(fields)
     indented = "".join(f"  {line}\n" for line in root.splitlines())
     (tmp_path / "own.yaml").write_text(text.replace("{fields}", indented).replace("{root}", root))
     spec = SceneSpec.from_mapping(descent({"file": "own.yaml"}), base=tmp_path)
     assert {name: value for name, value in spec.error_floor if value} == floor
     assert spec.instrument == spec_of(instrument="lander_ndl").instrument
-    brought = [s for s in spec.unstated_errors() if "brings" in s]
+    brought = [s for s in spec.unstated_error_sentences() if "brings" in s]
     assert len(brought) == len(floor) and all("own.yaml brings" in s for s in brought)
 
 
@@ -175,7 +175,7 @@ def test_a_file_of_an_instrument_may_have_a_floor(text, floor, tmp_path):
     ],
 )
 def test_mistakes_in_the_floor_of_a_file_are_told_where_they_stand(written, told, tmp_path):
-    fields = yaml.safe_load(library()["lander_ndl"].read_text())["instrument"]
+    fields = yaml.safe_load(library_instruments()["lander_ndl"].read_text())["instrument"]
     text = f"{written}\n{yaml.safe_dump({'instrument': fields})}"
     (tmp_path / "own.yaml").write_text(text)
     with pytest.raises(SpecError) as refused:
@@ -193,7 +193,7 @@ def test_a_file_whose_instrument_is_no_mapping_is_refused(own, tmp_path):
 def test_a_grid_of_an_instrument_with_a_floor_has_none():
     target = {"range": "1 km", "grazing_angle": "60 deg", "reflectance": 0.1}
     written = {"title": "Grid", "instrument": "lander_ndl", "target": target}
-    assert "error_floor" not in Spec.from_mapping(written).to_yaml_mapping()
+    assert "error_floor" not in GridSpec.from_mapping(written).to_yaml_mapping()
 
 
 @pytest.mark.parametrize(("instrument", "velocity", "far"), [
@@ -209,9 +209,9 @@ def test_a_descent_onto_a_slope_is_as_good_as_it_says(tmp_path, instrument, velo
     for name, least in (("radial_velocity", velocity), ("range", far)):
         stated = four[f"{name}_interpolated_standard_error"].to_numpy()
         assert np.nanmin(stated) >= least
-    for each in consistency(tree):
-        assert each.is_consistent, each.words
+    for each in check_consistency(tree):
+        assert each.is_consistent, each.message
     if instrument == "lander_ndl":
-        solved = {each.quantity: each.ratio for each in consistency(tree)}
+        solved = {each.quantity: each.error_ratio for each in check_consistency(tree)}
         assert solved["velocity"] == pytest.approx(1, abs=0.2)
         assert solved["altitude"] == pytest.approx(1, abs=0.2)

@@ -12,15 +12,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from small import Said, quiet, small
-from small_flights import SCENE, small_scene
+from small_flights import SCENE_MAPPING, small_scene_spec
+from small_studies import RecordingProgress, run_serially, small_spec
 
 import sweep
-from sweep.spec.axes import without_fields_on_axes
-from sweep.tasks import plan as planned
-from sweep.tasks import user_code
-from sweep.tasks.plan import plan
-from sweep.tasks.progress import CodeError, TaskError
+from sweep.spec.axes import remove_fields_on_axes
+from sweep.tasks.engine.progress import CodeError, TaskError
+from sweep.tasks.studies import study_plan as planned
+from sweep.tasks.studies import user_functions
+from sweep.tasks.studies.study_plan import plan_study
 
 CODE = """
     import numpy as np
@@ -64,12 +64,12 @@ def mine(tmp_path, monkeypatch):
     name = f"mine_{tmp_path.name}".replace("-", "_")
     (tmp_path / f"{name}.py").write_text(textwrap.dedent(CODE))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv(user_code.ALLOWED, "")
+    monkeypatch.setenv(user_functions.ALLOWED_MODULES_VARIABLE, "")
     monkeypatch.setattr(sys, "path", [*sys.path])
-    user_code.guarded.cache_clear()
+    user_functions.checked_function.cache_clear()
     yield name
     sys.modules.pop(name, None)
-    user_code.guarded.cache_clear()
+    user_functions.checked_function.cache_clear()
 
 
 SHORT = {"fft_size": "2^9", "acquisition_delay": "34 us"}
@@ -79,12 +79,12 @@ SHORT = {"fft_size": "2^9", "acquisition_delay": "34 us"}
 def study(detector="fixed", estimator="peak_bin", **changes):
     processing = {"sample_rate": "600 MHz", "tnr": 4} | SHORT
     processing |= {"detector": {"kind": detector}, "estimator": {"kind": estimator}}
-    given = small(draws={"method": "spectra", "number": 3}, axes={})
+    given = small_spec(draws={"method": "spectra", "number": 3}, axes={})
     mapping = given.to_yaml_mapping()
     mapping["instrument"]["processing"] |= processing
     mapping["axes"] = {"target.range": {"linear": ["500 m", "4 km"], "number": 3}} | changes
     return type(given).from_mapping(
-        without_fields_on_axes(mapping | {"storage": {"block_points": 2}})
+        remove_fields_on_axes(mapping | {"storage": {"block_points": 2}})
     )
 
 
@@ -95,13 +95,13 @@ def runs(name, tmp_path):
 
 def test_code_runs_only_where_its_module_is_allowed(mine, tmp_path):
     spec = study(f"{mine}:detect", f"{mine}:estimate")
-    for ask in (lambda: quiet(spec, tmp_path / "a.zarr"), lambda: plan(spec)):
+    for ask in (lambda: run_serially(spec, tmp_path / "a.zarr"), lambda: plan_study(spec)):
         with pytest.raises(CodeError, match=rf"allow_code=\['{mine}'\]"):
             ask()
     assert not (tmp_path / "a.zarr").exists() and not runs(mine, tmp_path)
-    user_code.allow([mine])
-    assert quiet(spec, tmp_path / "a.zarr").complete
-    assert quiet(study(), tmp_path / "b.zarr").complete
+    user_functions.allow_modules([mine])
+    assert run_serially(spec, tmp_path / "a.zarr").complete
+    assert run_serially(study(), tmp_path / "b.zarr").complete
     own, built_in = (sweep.open(tmp_path / f"{n}.zarr") for n in "ab")
     np.testing.assert_array_equal(own.pd_shot, built_in.pd_shot)
     np.testing.assert_array_equal(own.range_rmse, built_in.range_rmse)
@@ -110,18 +110,18 @@ def test_code_runs_only_where_its_module_is_allowed(mine, tmp_path):
 def test_a_flight_runs_allowed_functions_and_finds_what_built_in_ones_find(mine, tmp_path):
     def flown(detector, estimator):
         processing = {"detector": {"kind": detector}, "estimator": {"kind": estimator}}
-        instrument = copy.deepcopy(SCENE["instrument"])
+        instrument = copy.deepcopy(SCENE_MAPPING["instrument"])
         instrument["processing"] |= SHORT | processing
         draws = {"method": "spectra", "number": 2, "returns": 2}
-        scanners = {"three": SCENE["scanners"]["three"] | {"rate": "0.5 Hz"}}
-        return small_scene(instrument=instrument, draws=draws, scanners=scanners, axes={})
+        scanners = {"three": SCENE_MAPPING["scanners"]["three"] | {"rate": "0.5 Hz"}}
+        return small_scene_spec(instrument=instrument, draws=draws, scanners=scanners, axes={})
 
     spec = flown(f"{mine}:detect", f"{mine}:estimate")
     with pytest.raises(CodeError, match=rf"allow_code=\['{mine}'\]"):
-        quiet(spec, tmp_path / "a.zarr")
-    user_code.allow([mine])
-    assert quiet(spec, tmp_path / "a.zarr").complete
-    assert quiet(flown("fixed", "peak_bin"), tmp_path / "b.zarr").complete
+        run_serially(spec, tmp_path / "a.zarr")
+    user_functions.allow_modules([mine])
+    assert run_serially(spec, tmp_path / "a.zarr").complete
+    assert run_serially(flown("fixed", "peak_bin"), tmp_path / "b.zarr").complete
     own, built_in = (sweep.open_scene(tmp_path / f"{n}.zarr")["three"] for n in "ab")
     assert (built_in.flags > 0).any()
     np.testing.assert_array_equal(own.range_interpolated, built_in.range_interpolated)
@@ -130,31 +130,31 @@ def test_a_flight_runs_allowed_functions_and_finds_what_built_in_ones_find(mine,
 
 
 def test_opening_a_store_runs_nothing(mine, tmp_path):
-    user_code.allow([mine])
-    assert quiet(study(f"{mine}:detect"), tmp_path / "a.zarr").complete
-    del os.environ[user_code.ALLOWED], sys.modules[mine]
+    user_functions.allow_modules([mine])
+    assert run_serially(study(f"{mine}:detect"), tmp_path / "a.zarr").complete
+    del os.environ[user_functions.ALLOWED_MODULES_VARIABLE], sys.modules[mine]
     ran = runs(mine, tmp_path)
     sweep.open(tmp_path / "a.zarr")
-    from sweep.tasks.studies import read
-    from sweep.tasks.summary import status
+    from sweep.tasks.studies.store_summary import status
+    from sweep.tasks.studies.study_loading import read_study
 
     assert status(tmp_path / "a.zarr").complete
-    assert read(tmp_path / "a.zarr")[1].spec.id == study(f"{mine}:detect").id
+    assert read_study(tmp_path / "a.zarr")[1].spec.id == study(f"{mine}:detect").id
     assert runs(mine, tmp_path) == ran and mine not in sys.modules
-    user_code.guarded.cache_clear()
+    user_functions.checked_function.cache_clear()
     with pytest.raises(CodeError, match="not allowed"):
         sweep.resume(tmp_path / "a.zarr", progress=False)
 
 
 @pytest.mark.parametrize("extended", [False, True])
 def test_a_module_that_changed_since_a_store_was_begun_is_told_each_time(mine, tmp_path, extended):
-    user_code.allow([mine])
+    user_functions.allow_modules([mine])
     store, larger = tmp_path / "a.zarr", {"target.range": ["500 m", "2250 m", "4 km", "5 km"]}
-    assert quiet(study(f"{mine}:detect"), store).complete
+    assert run_serially(study(f"{mine}:detect"), store).complete
 
     def told():
         sys.modules.pop(mine, None)
-        progress, place = Said(), {"scheduler": "none", "overwrite": True}
+        progress, place = RecordingProgress(), {"scheduler": "none", "overwrite": True}
         if extended:
             spec = study(f"{mine}:detect", **larger)
             sweep.extend(store, spec, to=tmp_path / "b.zarr", progress=progress, **place)
@@ -184,16 +184,16 @@ def test_a_module_that_changed_since_a_store_was_begun_is_told_each_time(mine, t
     ],
 )  # fmt: skip
 def test_a_function_is_held_to_its_word_before_anything_runs(mine, tmp_path, role, function, words):
-    user_code.allow([mine])
+    user_functions.allow_modules([mine])
     with pytest.raises(CodeError, match=words):
-        quiet(study(**{role: f"{mine}:{function}"}), tmp_path / "a.zarr")
+        run_serially(study(**{role: f"{mine}:{function}"}), tmp_path / "a.zarr")
     assert not (tmp_path / "a.zarr").exists()
 
 
 def test_a_module_that_is_not_there_is_named(mine, tmp_path):
-    user_code.allow(["no_such_module"])
+    user_functions.allow_modules(["no_such_module"])
     with pytest.raises(CodeError, match=r"no module no_such_module on .*put no_such_module\.py"):
-        user_code.check(study("no_such_module:f"))
+        user_functions.check_user_functions(study("no_such_module:f"))
 
 
 @pytest.mark.parametrize(
@@ -209,7 +209,7 @@ def test_a_module_that_can_not_be_imported_is_told_with_its_line(mine, tmp_path,
     name = f"bad_{len(content)}"
     (tmp_path / f"{name}.py").write_text(content)
     with pytest.raises(CodeError, match=f"the module {name} can't be imported on .*{words}"):
-        quiet(study(f"{name}:f"), tmp_path / "a.zarr", scheduler="none", allow_code=[name])
+        run_serially(study(f"{name}:f"), tmp_path / "a.zarr", scheduler="none", allow_code=[name])
 
 
 FAILS_LATER = """
@@ -226,7 +226,7 @@ FAILS_LATER = """
 def test_code_that_fails_in_a_block_is_told_with_its_file_line_and_name(mine, tmp_path):
     (tmp_path / f"{mine}.py").write_text(textwrap.dedent(FAILS_LATER))
     spec = study(f"{mine}:detect")
-    outcome = quiet(spec, tmp_path / "a.zarr", scheduler="none", allow_code=[mine])
+    outcome = run_serially(spec, tmp_path / "a.zarr", scheduler="none", allow_code=[mine])
     assert not outcome.stopped and outcome.failures  # the disk has room
     for failure in outcome.failures:
         assert f"{mine}:detect fails with OSError: [Errno 28]" in failure.error
@@ -239,24 +239,27 @@ def elsewhere(function, *arguments):
 
     call = "import pickle, sys; f, a = pickle.load(sys.stdin.buffer); print(f(*a))"
     return subprocess.run(
-        [sys.executable, "-c", call], input=pickle.dumps((function, arguments)),
-        capture_output=True, check=False, env=os.environ | {user_code.ALLOWED: ""},
-    )  # fmt: skip
+        [sys.executable, "-c", call],
+        input=pickle.dumps((function, arguments)),
+        capture_output=True,
+        check=False,
+        env=os.environ | {user_functions.ALLOWED_MODULES_VARIABLE: ""},
+    )
 
 
 def test_what_a_run_allows_its_workers_allow_too_if_they_have_the_same_file(mine, tmp_path):
     spec = study(f"{mine}:detect")
-    user_code.allow([mine])
-    ((module, digest),) = user_code.allowed_code(spec).items()
+    user_functions.allow_modules([mine])
+    ((module, digest),) = user_functions.allowed_module_digests(spec).items()
     assert module == mine and len(digest) == 32
-    refused = elsewhere(user_code.check, spec)
+    refused = elsewhere(user_functions.check_user_functions, spec)
     assert refused.returncode and b"its module is not allowed" in refused.stderr
-    assert elsewhere(user_code.admit, module, digest).returncode == 0
+    assert elsewhere(user_functions.allow_same_module, module, digest).returncode == 0
     (tmp_path / f"{mine}.py").write_text("detect = 3")
-    other = elsewhere(user_code.admit, module, digest)
+    other = elsewhere(user_functions.allow_same_module, module, digest)
     assert other.returncode and b"is not the same file on" in other.stderr
     (tmp_path / f"{mine}.py").unlink()
-    lost = elsewhere(user_code.admit, module, digest)
+    lost = elsewhere(user_functions.allow_same_module, module, digest)
     assert lost.returncode and f"put {mine}.py into the folder".encode() in lost.stderr
 
 
@@ -268,11 +271,11 @@ def test_workers_that_are_there_already_run_what_the_run_allows(mine, tmp_path):
     with LocalCluster(
         n_workers=1, threads_per_worker=1, dashboard_address=None, host="127.0.0.1"
     ) as cluster:
-        outcome = quiet(
+        outcome = run_serially(
             spec, tmp_path / "a.zarr", scheduler=cluster.scheduler_address, allow_code=[mine]
         )
     assert outcome.complete
-    assert quiet(spec, tmp_path / "b.zarr", scheduler="none").complete
+    assert run_serially(spec, tmp_path / "b.zarr", scheduler="none").complete
     own, same = (sweep.open(tmp_path / f"{n}.zarr") for n in "ab")
     np.testing.assert_array_equal(own.pd_shot, same.pd_shot)
 
@@ -286,8 +289,8 @@ def test_stores_of_whole_spectra_hold_the_same_whatever_the_blocks(tmp_path):
     mapping = study(**axes).to_yaml_mapping()
     stores = []
     for points in (3, 64):
-        spec = small().from_mapping(mapping | {"storage": {"block_points": points}})
-        quiet(spec, tmp_path / f"{points}.zarr")
+        spec = small_spec().from_mapping(mapping | {"storage": {"block_points": points}})
+        run_serially(spec, tmp_path / f"{points}.zarr")
         stores.append(sweep.open(tmp_path / f"{points}.zarr").load())
     for name, values in stores[0].data_vars.items():
         np.testing.assert_array_equal(values, stores[1][name], err_msg=name)
@@ -296,17 +299,17 @@ def test_stores_of_whole_spectra_hold_the_same_whatever_the_blocks(tmp_path):
 
 
 def test_what_accuracy_costs_is_not_asked_of_whole_spectra(tmp_path):
-    from sweep.tasks.accuracy.measure import measure
+    from sweep.tasks.accuracy.measurement import measure_accuracy
 
     with pytest.raises(TaskError, match="draws whole spectra"):
-        measure(study(), store_path=tmp_path / "a.zarr")
+        measure_accuracy(study(), store_path=tmp_path / "a.zarr")
 
 
 def test_a_page_of_whole_spectra_shows_what_is_stored(tmp_path):
-    from sweep.report.writing import write
+    from sweep.report.study_report import write_report
 
-    quiet(study(), tmp_path / "a.zarr")
-    text = write(tmp_path / "a.zarr", tmp_path / "page.html").read_text(encoding="utf-8")
+    run_serially(study(), tmp_path / "a.zarr")
+    text = write_report(tmp_path / "a.zarr", tmp_path / "page.html").read_text(encoding="utf-8")
     for packed in re.findall(r'type="application/gzip"[^>]*>([^<]*)<', text):
         text += gzip.decompress(base64.b64decode(packed)).decode()
     assert "false_alarms" in text and "Noise by source" in text and "pfa_segment" not in text
@@ -329,5 +332,5 @@ def test_a_plan_measures_what_draws_take(monkeypatch):
     few, many = (study() for _ in range(2))
     many = many.model_copy(update={"draws": many.draws.model_copy(update={"number": 10_000})})
     assert few.draws.number == 3
-    assert plan(few).seconds_a_point == 11 + 13
-    assert plan(many).seconds_a_point == 11 + (10 + 10_000) + 11
+    assert plan_study(few).seconds_per_point == 11 + 13
+    assert plan_study(many).seconds_per_point == 11 + (10 + 10_000) + 11

@@ -6,31 +6,32 @@ from pathlib import Path
 import pytest
 import yaml
 from click.testing import CliRunner
-from engine import every
-from small import (
-    STUDY,
-    copied,
-    evaluated,
-    everything,
-    failing,
-    logged,
-    quiet,
-    small,
-    small_file,
-    tree,
+from shot_helpers import parametrize_product
+from small_flights import small_scene_spec
+from small_studies import (
+    STUDY_MAPPING,
+    copy_store,
+    file_contents,
+    file_digests,
+    logged_blocks,
+    make_failing_evaluate,
+    make_logging_evaluate,
+    run_serially,
+    small_mapping,
+    small_spec,
 )
-from small_flights import small_scene
 
 import sweep
-from sweep.analysis.opening import NotAStoreError
+from sweep.analysis.datasets import NotAStoreError
 from sweep.cli import main
 from sweep.spec import load
 from sweep.storage.locations import eyepoints_path
-from sweep.tasks import journal, studies
 from sweep.tasks.driver import resume, run
-from sweep.tasks.journal import Lock
-from sweep.tasks.progress import Progress, StoreError
-from sweep.tasks.verify import verify
+from sweep.tasks.engine import journal
+from sweep.tasks.engine.journal import StoreLock
+from sweep.tasks.engine.progress import Progress, StoreError
+from sweep.tasks.studies import study_loading
+from sweep.tasks.studies.store_verification import verify
 
 TINY = {"axes": {"target.range": ["1 km", "2 km"]}, "storage": {"block_points": 1}}
 
@@ -40,7 +41,12 @@ def tiny(tmp_path_factory):
     """A store of two points in two blocks, with a failure in its past; not to be changed."""
     directory = tmp_path_factory.mktemp("tiny")
     path = directory / "tiny.zarr"
-    quiet(small(**TINY), path, scheduler="none", evaluate=failing({1}, directory / "log"))
+    run_serially(
+        small_spec(**TINY),
+        path,
+        scheduler="none",
+        evaluate=make_failing_evaluate({1}, directory / "log"),
+    )
     assert resume(path, progress=False, scheduler="none", retry_failed=True).complete
     return path
 
@@ -76,9 +82,14 @@ def found_where(store: Path, file: Path) -> bool:
 
 def look_only(store: Path, monkeypatch) -> None:
     """Have the one store verified quickly, without withdrawing anything."""
-    _, study = studies.read(store)
-    monkeypatch.setattr("sweep.tasks.verify._study", lambda path, spec: study)
-    monkeypatch.setattr("sweep.tasks.verify._mark", lambda path, blocks, shown: "only looking")
+    _, study = study_loading.read_study(store)
+    monkeypatch.setattr(
+        "sweep.tasks.studies.store_verification._study_of_store", lambda path, spec: study
+    )
+    monkeypatch.setattr(
+        "sweep.tasks.studies.store_verification._withdraw_receipts",
+        lambda path, blocks, shown: "only looking",
+    )
 
 
 def unmarked(store: Path) -> list[str]:
@@ -91,7 +102,7 @@ def unmarked(store: Path) -> list[str]:
     "step", [pytest.param(1, marks=pytest.mark.slow), 397], ids=["every byte", "a sample"]
 )
 def test_a_flipped_bit_in_any_byte_of_a_small_store_is_found(tiny, tmp_path, monkeypatch, step):
-    store = copied(tiny, tmp_path)
+    store = copy_store(tiny, tmp_path)
     look_only(store, monkeypatch)
     assert unmarked(store) == []
     number = 0
@@ -112,7 +123,7 @@ def place_of(content: bytes, step: int) -> int:
 @pytest.mark.parametrize("step", [pytest.param(1, marks=pytest.mark.slow), 7])
 def test_bytes_cut_off_or_added_anywhere_are_found(tiny, tmp_path, monkeypatch, step):
     """Of all files, or of the root's, the journal's and some arrays'."""
-    store = copied(tiny, tmp_path)
+    store = copy_store(tiny, tmp_path)
     look_only(store, monkeypatch)
     arrays = [file for file in files(store) if ".sweep" not in file.parts and file.parent != store]
     for file in set(files(store)) - set(arrays) | set(arrays[::step]):
@@ -122,12 +133,12 @@ def test_bytes_cut_off_or_added_anywhere_are_found(tiny, tmp_path, monkeypatch, 
             file.write_bytes(wrong)
             assert found_where(store, file), file
         file.unlink()
-        assert file.name in journal.LOGS or found_where(store, file), file
+        assert file.name in journal.LOG_NAMES or found_where(store, file), file
         file.write_bytes(content)
 
 
 def test_whole_lines_cut_off_the_receipts_leave_their_blocks_to_be_done(tiny, tmp_path):
-    store = copied(tiny, tmp_path)
+    store = copy_store(tiny, tmp_path)
     receipts = store / ".sweep" / "receipts.jsonl"
     receipts.write_bytes(receipts.read_bytes().splitlines(keepends=True)[0])
     (report,) = verify(store, progress=False)
@@ -138,7 +149,7 @@ def test_whole_lines_cut_off_the_receipts_leave_their_blocks_to_be_done(tiny, tm
 
 
 def test_damaged_blocks_are_named_and_just_they_are_computed_again(undisturbed, tmp_path):
-    store, log = copied(undisturbed, tmp_path), tmp_path / "log"
+    store, log = copy_store(undisturbed, tmp_path), tmp_path / "log"
     flip(store / "pd_up" / "c" / "0" / "5" / "0")
     flip(store / "pd_shot" / "c" / "0" / "6" / "0")
     (store / "pd_shot" / "c" / "0" / "2" / "0").unlink()
@@ -153,9 +164,11 @@ def test_damaged_blocks_are_named_and_just_they_are_computed_again(undisturbed, 
     assert (report.whole, report.blocks, report.unmarked) == (9, 12, "")
     (again,) = verify(store, progress=False)
     assert again.sound and again.whole == 9
-    assert resume(store, progress=False, scheduler="none", evaluate=logged(log)).complete
-    assert evaluated(log) == [2, 5, 6]
-    assert tree(store) == tree(undisturbed)
+    assert resume(
+        store, progress=False, scheduler="none", evaluate=make_logging_evaluate(log)
+    ).complete
+    assert logged_blocks(log) == [2, 5, 6]
+    assert file_digests(store) == file_digests(undisturbed)
     (mended,) = verify(store, progress=False)
     assert mended.sound and mended.complete
 
@@ -174,17 +187,19 @@ def put_directory(file: Path) -> None:
 
 
 def test_a_directory_in_the_place_of_a_chunk_or_a_log_is_healed(undisturbed, tmp_path):
-    store, log = copied(undisturbed, tmp_path), tmp_path / "log"
+    store, log = copy_store(undisturbed, tmp_path), tmp_path / "log"
     put_directory(store / "pd_up" / "c" / "0" / "5" / "0")
     put_directory(store / ".sweep" / "failures.jsonl")
-    assert resume(store, progress=False, scheduler="none", evaluate=logged(log)).complete
-    assert evaluated(log) == [5] and damages(store) == []
-    assert tree(store) == tree(undisturbed)
+    assert resume(
+        store, progress=False, scheduler="none", evaluate=make_logging_evaluate(log)
+    ).complete
+    assert logged_blocks(log) == [5] and damages(store) == []
+    assert file_digests(store) == file_digests(undisturbed)
 
 
 @pytest.mark.parametrize("how", ["missing", "a directory", "flipped"])
 def test_a_store_without_a_coordinate_is_not_opened(undisturbed, tmp_path, how):
-    store = copied(undisturbed, tmp_path)
+    store = copy_store(undisturbed, tmp_path)
     chunk = store / "range" / "c" / "0"
     flip(chunk) if how == "flipped" else chunk.unlink()
     if how == "a directory":
@@ -205,7 +220,7 @@ def test_a_flight_without_a_coordinate_is_not_opened(flight, tmp_path):
 
 
 def test_a_chunk_that_is_whole_but_another_blocks_is_found(undisturbed, tmp_path):
-    store = copied(undisturbed, tmp_path)
+    store = copy_store(undisturbed, tmp_path)
     chunks = store / "pd_shot" / "c" / "0"
     shutil.copy(chunks / "2" / "0", chunks / "5" / "0")
     (report,) = verify(store, progress=False)
@@ -214,26 +229,28 @@ def test_a_chunk_that_is_whole_but_another_blocks_is_found(undisturbed, tmp_path
 
 
 def test_a_receipt_that_is_damaged_costs_its_block_and_no_other(undisturbed, tmp_path):
-    store, log = copied(undisturbed, tmp_path), tmp_path / "log"
+    store, log = copy_store(undisturbed, tmp_path), tmp_path / "log"
     receipts = store / ".sweep" / "receipts.jsonl"
     receipts.write_bytes(receipts.read_bytes().replace(b'"block":7,', b'"block":8,'))
     assert damages(store) == [".sweep/receipts.jsonl line 8"]
-    assert resume(store, progress=False, scheduler="none", evaluate=logged(log)).complete
-    assert evaluated(log) == [7]
-    assert damages(store) == [] and tree(store) == tree(undisturbed)
+    assert resume(
+        store, progress=False, scheduler="none", evaluate=make_logging_evaluate(log)
+    ).complete
+    assert logged_blocks(log) == [7]
+    assert damages(store) == [] and file_digests(store) == file_digests(undisturbed)
 
 
 @pytest.mark.parametrize(
     "name, damage",
-    every(
+    parametrize_product(
         2,
         ["zarr.json", "pd_shot/zarr.json", "range/zarr.json", "range/c/0", ".sweep/template.jsonl"],
         ["flipped", "missing", "a directory"],
     ),
 )
 def test_a_template_is_put_back_as_it_was_made(undisturbed, tmp_path, name, damage):
-    store = copied(undisturbed, tmp_path)
-    before = everything(store)
+    store = copy_store(undisturbed, tmp_path)
+    before = file_contents(store)
     flip(store / name) if damage == "flipped" else (store / name).unlink()
     if damage == "a directory":
         put_directory(store / name)
@@ -241,7 +258,7 @@ def test_a_template_is_put_back_as_it_was_made(undisturbed, tmp_path, name, dama
         resume(store, progress=False, scheduler="none")
     (report,) = verify(store, progress=False, repair=True)
     assert report.sound and report.complete and list(report.restored) == [name]
-    assert everything(store) == before
+    assert file_contents(store) == before
     assert [child.name for child in tmp_path.iterdir()] == ["copy.zarr"]
 
 
@@ -267,31 +284,31 @@ def lose_what_it_holds(store: Path, how: str) -> None:
 def test_a_store_that_no_longer_says_what_it_holds_is_mended_with_the_spec(
     undisturbed, tmp_path, how
 ):
-    store = copied(undisturbed, tmp_path)
-    before = everything(store)
+    store = copy_store(undisturbed, tmp_path)
+    before = file_contents(store)
     lose_what_it_holds(store, how)
-    after = everything(store)
+    after = file_contents(store)
     with pytest.raises(StoreError, match=r"repair=True, spec=spec"):
         verify(store, progress=False, repair=True)
     power = ["1 W", "3 W", "4 W"]  # as larger studies have it: the first blocks are the same
-    axes = {**STUDY["axes"], "instrument.laser.power": power}
+    axes = {**STUDY_MAPPING["axes"], "instrument.laser.power": power}
     for other in ({"footprint": {"beamlets": 11, "speckle": "none"}}, {"axes": axes}):
         with pytest.raises(StoreError, match=r"from this spec|holds another study"):
-            verify(store, progress=False, repair=True, spec=small(**other))
-    assert everything(store) == after
-    (report,) = verify(store, progress=False, repair=True, spec=small())
+            verify(store, progress=False, repair=True, spec=small_spec(**other))
+    assert file_contents(store) == after
+    (report,) = verify(store, progress=False, repair=True, spec=small_spec())
     assert report.sound and report.complete
-    assert everything(store) == before
+    assert file_contents(store) == before
 
 
 @pytest.mark.parametrize(
     "how", ["JSON", *(pytest.param(how, marks=pytest.mark.slow) for how in ("no JSON", "gone"))]
 )
 def test_a_damaged_store_is_known_for_ours_and_written_over(undisturbed, tmp_path, how):
-    store = copied(undisturbed, tmp_path)
+    store = copy_store(undisturbed, tmp_path)
     lose_what_it_holds(store, how)
-    assert run(small(), store=store, overwrite=True, progress=False, scheduler="none").complete
-    assert tree(store) == tree(undisturbed) and damages(store) == []
+    assert run(small_spec(), store=store, overwrite=True, progress=False, scheduler="none").complete
+    assert file_digests(store) == file_digests(undisturbed) and damages(store) == []
 
 
 @pytest.mark.parametrize("content", ['{"attributes": {}}', "no JSON"])
@@ -300,22 +317,22 @@ def test_a_directory_that_sweep_did_not_make_is_not_written_over(tmp_path, conte
     (store / ".sweep").mkdir(parents=True)
     (store / "zarr.json").write_text(content)
     (store / ".sweep" / "sessions.jsonl").write_text('{"event":"begun"}\n')
-    before = everything(store)
+    before = file_contents(store)
     with pytest.raises(StoreError, match=r"not a Zarr store of sweep's|not one that sweep made"):
-        run(small(), store=store, overwrite=True, progress=False, scheduler="none")
-    assert everything(store) == before
+        run(small_spec(), store=store, overwrite=True, progress=False, scheduler="none")
+    assert file_contents(store) == before
 
 
 def test_eyepoints_that_no_longer_say_what_they_are_are_mended_by_the_flight(flight, tmp_path):
     directory = shutil.copytree(flight.parent, tmp_path / "copy")
     store = directory / flight.name
-    lose_what_it_holds(eyepoints_path(store, small_scene().geometry_id("line")), "gone")
+    lose_what_it_holds(eyepoints_path(store, small_scene_spec().geometry_id("line")), "gone")
     assert all(report.sound for report in verify(store, progress=False, repair=True))
-    assert tree(directory) == tree(flight.parent)
+    assert file_digests(directory) == file_digests(flight.parent)
 
 
 def test_chunks_that_are_no_part_of_a_store_are_named(undisturbed, tmp_path):
-    store = copied(undisturbed, tmp_path)
+    store = copy_store(undisturbed, tmp_path)
     surplus = ["pd_up/c/0/12/0", "range/c/1"]
     for name in surplus:
         (store / name).parent.mkdir(parents=True, exist_ok=True)
@@ -332,34 +349,34 @@ def test_chunks_that_are_no_part_of_a_store_are_named(undisturbed, tmp_path):
 def test_a_template_that_cannot_be_made_again_here_is_left_as_it_is(
     undisturbed, tmp_path, monkeypatch
 ):
-    store = copied(undisturbed, tmp_path)
+    store = copy_store(undisturbed, tmp_path)
     flip(store / "range" / "c" / "0")
-    before = everything(store)
-    monkeypatch.setattr("sweep.tasks.store.CODECS", "auto")
+    before = file_contents(store)
+    monkeypatch.setattr("sweep.tasks.engine.study_store.CODECS", "auto")
     with pytest.raises(StoreError, match="can't be made again as it was on this machine"):
         verify(store, progress=False, repair=True)
-    assert everything(store) == before
+    assert file_contents(store) == before
 
 
 def test_a_store_that_is_being_written_is_looked_at_and_not_touched(undisturbed, tmp_path):
-    store = copied(undisturbed, tmp_path)
+    store = copy_store(undisturbed, tmp_path)
     flip(store / "pd_up" / "c" / "0" / "5" / "0")
     receipts = store / ".sweep" / "receipts.jsonl"
     receipts.write_bytes(receipts.read_bytes() + b'{"block":3,')  # about to be written
-    held = Lock(store)
-    before = everything(store)
+    held = StoreLock(store)
+    before = file_contents(store)
     (report,) = verify(store, progress=False)
     held.release()
     assert [damage.block for damage in report.damages] == [5]
     assert "is being written by process" in report.unmarked
-    assert everything(store).items() <= before.items()
+    assert file_contents(store).items() <= before.items()
 
 
 @pytest.mark.parametrize("whose", ["the flight's", "its eyepoints'"])
 def test_a_flights_store_and_its_eyepoints_are_verified_and_mended(flight, tmp_path, whose):
     directory = shutil.copytree(flight.parent, tmp_path / "copy")
     store = directory / flight.name
-    eyepoints = eyepoints_path(store, small_scene().geometry_id("line"))
+    eyepoints = eyepoints_path(store, small_scene_spec().geometry_id("line"))
     damaged = store if whose == "the flight's" else eyepoints
     assert [report.sound for report in verify(store, progress=False)] == [True] * 3
     chunk = next(file for file in files(damaged) if file.parent.parent.name == "c")
@@ -372,10 +389,10 @@ def test_a_flights_store_and_its_eyepoints_are_verified_and_mended(flight, tmp_p
         "zarr.json", ".sweep/recipe.json line 1", str(chunk.relative_to(damaged)),
     }  # fmt: skip
     verify(store, progress=False, repair=True)
-    outcome = resume(store, spec=small_scene(), progress=False, scheduler="none")
+    outcome = resume(store, spec=small_scene_spec(), progress=False, scheduler="none")
     assert (outcome.complete and sum(outcome.rays.values()) > 0) or damaged == store
     assert all(r.sound and r.complete for r in verify(store, progress=False))
-    assert tree(directory) == tree(flight.parent)
+    assert file_digests(directory) == file_digests(flight.parent)
 
 
 def test_where_a_flight_s_files_are_is_not_guessed(flight, tmp_path):
@@ -387,7 +404,7 @@ def test_where_a_flight_s_files_are_is_not_guessed(flight, tmp_path):
 
 def test_the_command_tells_what_is_wrong_and_what_to_do(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    Path("small.yaml").write_text(yaml.safe_dump(small_file(), sort_keys=False))
+    Path("small.yaml").write_text(yaml.safe_dump(small_mapping(), sort_keys=False))
     run(load("small.yaml"), store="copy.zarr", scheduler="none", progress=False)
     command = CliRunner()
     whole = command.invoke(main, ["verify", "copy.zarr"])
@@ -430,6 +447,6 @@ def test_what_takes_long_shows_how_far_it_is(undisturbed, monkeypatch):
 
     verify(undisturbed, progress=Watching())
     assert told == []
-    monkeypatch.setattr("sweep.tasks.verify.BATCH", 5)
+    monkeypatch.setattr("sweep.tasks.studies.store_verification.BLOCKS_PER_BATCH", 5)
     verify(undisturbed, progress=Watching())
     assert told == [(12, 0, "blocks"), 5, 5, 2, "end"]

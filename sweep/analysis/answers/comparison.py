@@ -11,19 +11,25 @@ import xarray as xr
 
 from sweep.analysis import labels
 from sweep.analysis.answers import provenance
-from sweep.analysis.answers.physical import STUDY_ID, markers, parameter, si, study_of
-from sweep.analysis.charts import LOG, Axis, Chart, Line, Panel
+from sweep.analysis.answers.dataset_lookup import (
+    STUDY_ID,
+    marker_names,
+    parameter_in_si,
+    spec_of_dataset,
+    to_si,
+)
+from sweep.analysis.charts import LOG, Chart, ChartAxis, ChartLine, Panel
 from sweep.model.accuracy import clopper_pearson
-from sweep.model.accuracy import half_width as half_width_of
+from sweep.model.accuracy import half_width as interval_half_width
 from sweep.model.outputs import OUTPUTS, PROMISED, SPECTRA_OUTPUTS, STATISTICS
 from sweep.model.pairing import TRUE
 
-ROUNDING = 1e-12
+PD_ROUNDING_MAX = 1e-12
 """Change of a probability by another processor's last digits, at the most."""
 
-_DIGITS = 12
+_SIGNIFICANT_DIGITS = 12
 
-ONE_OF_EACH = "a grid of points and a flight have nothing to match: compare two of a kind"
+MIXED_KINDS_MESSAGE = "a grid of points and a flight have nothing to match: compare two of a kind"
 
 
 def compare(ours: xr.Dataset, other: xr.Dataset) -> xr.Dataset:
@@ -51,124 +57,147 @@ def compare(ours: xr.Dataset, other: xr.Dataset) -> xr.Dataset:
         No point is in both, or the other is a flight.
     """
     if not isinstance(other, xr.Dataset):
-        raise ValueError(ONE_OF_EACH)
-    ours, other = (provenance.proven(dataset, every_axis=True) for dataset in (ours, other))
-    names = [n for n in {**OUTPUTS, **SPECTRA_OUTPUTS} if n in ours and n in other]
-    return differences(ours, other, names, bounded=PROMISED)
+        raise ValueError(MIXED_KINDS_MESSAGE)
+    ours, other = (
+        provenance.check_single_study(dataset, require_axes=True) for dataset in (ours, other)
+    )
+    variables = [n for n in {**OUTPUTS, **SPECTRA_OUTPUTS} if n in ours and n in other]
+    return compute_differences(ours, other, variables, bounded_variables=PROMISED)
 
 
-def differences(
-    ours: xr.Dataset, other: xr.Dataset, names: Sequence[str], *, bounded: Sequence[str]
+def compute_differences(
+    ours: xr.Dataset,
+    other: xr.Dataset,
+    variables: Sequence[str],
+    *,
+    bounded_variables: Sequence[str],
 ) -> xr.Dataset:
     """Differences of variables where they meet; of those that are bounded, whether they agree."""
-    left, right = _matched(ours, other)
-    result = xr.Dataset(attrs={"ours": titled(ours), "other": titled(other)})
-    for name in names:
-        result[name] = (right[name] - left[name]).assign_attrs(
-            left[name].attrs, long_name=f"difference of {left[name].attrs.get('long_name', name)}"
+    matched_ours, matched_other = _match_points(ours, other)
+    result = xr.Dataset(attrs={"ours": title_with_id(ours), "other": title_with_id(other)})
+    for name in variables:
+        result[name] = (matched_other[name] - matched_ours[name]).assign_attrs(
+            matched_ours[name].attrs,
+            long_name=f"difference of {matched_ours[name].attrs.get('long_name', name)}",
         )
-    for name in (name for name in bounded if name in names):
-        allowed = _unknown(left, name) + _unknown(right, name) + ROUNDING
-        result[f"{name}_allowed"] = allowed.assign_attrs(
+    for name in (name for name in bounded_variables if name in variables):
+        allowed_difference = (
+            _pd_error_bound(matched_ours, name)
+            + _pd_error_bound(matched_other, name)
+            + PD_ROUNDING_MAX
+        )
+        result[f"{name}_allowed"] = allowed_difference.assign_attrs(
             units="1", long_name=f"largest difference of {name} within what is known of both"
         )
-        result[f"{name}_agrees"] = (abs(result[name]) <= allowed).assign_attrs(
+        result[f"{name}_agrees"] = (abs(result[name]) <= allowed_difference).assign_attrs(
             units="1", long_name=f"whether {name} agrees within what is known of both"
         )
     return result
 
 
-def titled(store: xr.Dataset | xr.DataTree) -> str:
+def title_with_id(opened_store: xr.Dataset | xr.DataTree) -> str:
     """Title and number of a study."""
-    return f"{store.attrs.get('title', '')} ({str(store.attrs.get('study_id', ''))[:8]})"
+    return (
+        f"{opened_store.attrs.get('title', '')} ({str(opened_store.attrs.get('study_id', ''))[:8]})"
+    )
 
 
-def _unknown(dataset: xr.Dataset, name: str) -> xr.DataArray:
+def _pd_error_bound(dataset: xr.Dataset, name: str) -> xr.DataArray:
     """Known bound on the error of a probability."""
-    parts = [dataset[n] for n in (f"{name}_half_width", "effects_error", "beamlets_error")
+    error_bounds = [dataset[n] for n in (f"{name}_half_width", "effects_error", "beamlets_error")
              if n in dataset]  # fmt: skip
-    return sum((part.fillna(0.0) for part in parts), xr.zeros_like(dataset[name]))
+    return sum(
+        (error_bound.fillna(0.0) for error_bound in error_bounds), xr.zeros_like(dataset[name])
+    )
 
 
-def _matched(ours: xr.Dataset, other: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
+def _match_points(ours: xr.Dataset, other: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
     """Both datasets at the points that they share, along dimensions of the same names."""
-    other = _at_fixed(other, ours)
-    ours = _at_fixed(ours, other)
+    other = _select_fixed_parameters(other, ours)
+    ours = _select_fixed_parameters(ours, other)
     for dim in [d for d in ours.dims if d in other.dims]:
-        left, right = _places(ours, str(dim)), _places(other, str(dim))
-        shared = left.intersection(right, sort=False)
-        if not shared.size:
+        our_index, other_index = _dim_index(ours, str(dim)), _dim_index(other, str(dim))
+        common_index = our_index.intersection(other_index, sort=False)
+        if not common_index.size:
             raise ValueError(f"along {dim} the two studies have no value in common")
-        ours = ours.isel({dim: left.get_indexer(shared)})
-        other = other.isel({dim: right.get_indexer(shared)})
+        ours = ours.isel({dim: our_index.get_indexer(common_index)})
+        other = other.isel({dim: other_index.get_indexer(common_index)})
         # the coordinates of ours stand for both, so that xarray takes no offence at last digits
         other = other.drop_vars([n for n, c in other.coords.items() if dim in c.dims])
         other = other.assign_coords({n: c for n, c in ours.coords.items() if c.dims == (dim,)})
-    scalars = [n for n, c in other.coords.items() if not c.dims]
-    ours = ours.drop_vars([STUDY_ID, *markers(ours)], errors="ignore")
-    return ours, other.drop_vars(scalars)
+    scalar_names = [n for n, c in other.coords.items() if not c.dims]
+    ours = ours.drop_vars([STUDY_ID, *marker_names(ours)], errors="ignore")
+    return ours, other.drop_vars(scalar_names)
 
 
-def _at_fixed(dataset: xr.Dataset, reference: xr.Dataset) -> xr.Dataset:
+def _select_fixed_parameters(dataset: xr.Dataset, reference: xr.Dataset) -> xr.Dataset:
     """Return a dataset at the values of the parameters that the reference has off its axes."""
-    paths = {c.attrs.get("path") for c in reference.coords.values() if c.dims}
-    study = study_of(reference)
-    for array in list(dataset.coords.values()):
-        path = array.attrs.get("path", "")
-        if not array.dims or path in paths or array.name not in dataset.dims:
+    varying_paths = {c.attrs.get("path") for c in reference.coords.values() if c.dims}
+    spec = spec_of_dataset(reference)
+    for coord in list(dataset.coords.values()):
+        path = coord.attrs.get("path", "")
+        if not coord.dims or path in varying_paths or coord.name not in dataset.dims:
             continue
-        value = parameter(reference, path, study).values.item()
-        values = si(array).values
-        same = values == value if isinstance(value, str) else np.isclose(values, value, 1e-9, 0.0)
-        if same.any():
-            dataset = dataset.isel({array.name: int(np.argmax(same))})
+        fixed_value = parameter_in_si(reference, path, spec).values.item()
+        values = to_si(coord).values
+        matches = (
+            values == fixed_value
+            if isinstance(fixed_value, str)
+            else np.isclose(values, fixed_value, 1e-9, 0.0)
+        )
+        if matches.any():
+            dataset = dataset.isel({coord.name: int(np.argmax(matches))})
     return dataset
 
 
-def _places(dataset: xr.Dataset, dim: str) -> pandas.Index:
+def _dim_index(dataset: xr.Dataset, dim: str) -> pandas.Index:
     """SI values along a dimension, to 12 digits; of several coordinates together."""
-    arrays = [c for c in dataset.coords.values() if c.dims == (dim,)]
-    if not arrays:
+    coords = [c for c in dataset.coords.values() if c.dims == (dim,)]
+    if not coords:
         return pandas.RangeIndex(dataset.sizes[dim])
-    columns = [_rounded(np.asarray(si(c).values)) for c in
-               sorted(arrays, key=lambda c: str(c.attrs.get("path", c.name)))]  # fmt: skip
+    columns = [_round_significant(np.asarray(to_si(c).values)) for c in
+               sorted(coords, key=lambda c: str(c.attrs.get("path", c.name)))]  # fmt: skip
     index = columns[0] if len(columns) == 1 else pandas.MultiIndex.from_arrays(columns)
     index = pandas.Index(index)
     if index.has_duplicates:
         # A point that stands twice along a zipped axis is matched once, with the first of them.
-        unique = index.to_frame(index=False)
-        unique["again"] = unique.groupby(list(unique.columns)).cumcount()
-        index = pandas.MultiIndex.from_frame(unique)
+        index_frame = index.to_frame(index=False)
+        index_frame["again"] = index_frame.groupby(list(index_frame.columns)).cumcount()
+        index = pandas.MultiIndex.from_frame(index_frame)
     return index
 
 
-def _rounded(values: np.ndarray) -> np.ndarray:
+def _round_significant(values: np.ndarray) -> np.ndarray:
     """Numbers to 12 significant digits."""
     if values.dtype.kind not in "fiu":
         return values
     values = values.astype(float)
     with np.errstate(divide="ignore"):
-        scale = 10.0 ** (_DIGITS - 1 - np.floor(np.log10(np.abs(np.where(values, values, 1.0)))))
+        scale = 10.0 ** (
+            _SIGNIFICANT_DIGITS - 1 - np.floor(np.log10(np.abs(np.where(values, values, 1.0))))
+        )
     return np.rint(values * scale) / scale
 
 
-SAME_TIME = 1e-9
+SHOT_TIME_TOLERANCE = 1e-9
 """Difference [s] up to which shots of a beam are at the same time."""
 
-SAME_PLACE = 1e-6
+SHOT_POSITION_TOLERANCE = 1e-6
 """Distance [m] up to which they are from the same place."""
 
-SAME_DIRECTION = 1e-9
+BEAM_DIRECTION_TOLERANCE = 1e-9
 """Angle [rad] up to which they have the same direction."""
 
-DETECTED = "detected"
+DETECTED_VARIABLE = "detected"
 """Share of the draws in which a shot has a true point."""
 
-ERRORS = ("effects_error", "beamlets_error")
+ERROR_BOUND_VARIABLES = ("effects_error", "beamlets_error")
 """Known bounds on the errors of a shot's probabilities."""
 
-COMPARED = tuple(
-    name for name, output in STATISTICS.items() if output.dtype == "float64" and name not in ERRORS
+COMPARED_STATISTICS = tuple(
+    name
+    for name, output in STATISTICS.items()
+    if output.dtype == "float64" and name not in ERROR_BOUND_VARIABLES
 )
 
 
@@ -179,8 +208,9 @@ def compare_flights(ours: xr.DataTree, other: xr.DataTree) -> xr.DataTree:
     ----------
     ours, other
         As `sweep.open_scene` gives them. Scanners are matched by name; shots by time, beam,
-        position and direction of the beam, to :data:`SAME_TIME`, :data:`SAME_PLACE` and
-        :data:`SAME_DIRECTION`; places along axes as :func:`compare` matches points.
+        position and direction of the beam, to :data:`SHOT_TIME_TOLERANCE`,
+        :data:`SHOT_POSITION_TOLERANCE` and
+        :data:`BEAM_DIRECTION_TOLERANCE`; places along axes as :func:`compare` matches points.
 
     Returns
     -------
@@ -198,14 +228,14 @@ def compare_flights(ours: xr.DataTree, other: xr.DataTree) -> xr.DataTree:
         The flights have no scanner in common, or no shot of a scanner; the other is a grid.
     """
     if not isinstance(other, xr.DataTree):
-        raise ValueError(ONE_OF_EACH)
+        raise ValueError(MIXED_KINDS_MESSAGE)
     scanners = [name for name in scanner_names(ours) if name in scanner_names(other)]
     if not scanners:
-        has = (", ".join(scanner_names(tree)) for tree in (ours, other))
-        raise ValueError("the flights have no scanner in common: {}; and {}".format(*has))
-    parts = {name: _scanner(ours, other, name) for name in scanners}
-    whole = xr.Dataset(attrs={"ours": titled(ours), "other": titled(other)})
-    return xr.DataTree.from_dict({"/": whole, **parts})
+        scanner_lists = (", ".join(scanner_names(tree)) for tree in (ours, other))
+        raise ValueError("the flights have no scanner in common: {}; and {}".format(*scanner_lists))
+    group_by_scanner = {name: _compare_scanner(ours, other, name) for name in scanners}
+    root = xr.Dataset(attrs={"ours": title_with_id(ours), "other": title_with_id(other)})
+    return xr.DataTree.from_dict({"/": root, **group_by_scanner})
 
 
 def scanner_names(tree: xr.DataTree) -> list[str]:
@@ -214,224 +244,288 @@ def scanner_names(tree: xr.DataTree) -> list[str]:
     return [names] if isinstance(names, str) else [str(name) for name in names]
 
 
-def _scanner(ours: xr.DataTree, other: xr.DataTree, scanner: str) -> xr.Dataset:
+def _compare_scanner(ours: xr.DataTree, other: xr.DataTree, scanner: str) -> xr.Dataset:
     """Differences at the shots of a scanner."""
-    left, right = (
-        provenance.proven(
+    our_group, other_group = (
+        provenance.check_single_study(
             tree.children[scanner].to_dataset(inherit=False).assign_attrs(tree.attrs),
-            every_axis=True,
+            require_axes=True,
         )
         for tree in (ours, other)
     )
-    shots, matching = _pairs(left, right, scanner)
-    when = {name: left[name].isel(shot=shots).compute() for name in ("time", "beam")}
+    our_shots, matching_shots = _match_shots(our_group, other_group, scanner)
+    shot_coords = {
+        name: our_group[name].isel(shot=our_shots).compute() for name in ("time", "beam")
+    }
     # a store is complete where no draw is left to compute; a missing point would not tell
-    drawn = all(t.attrs["points_committed"] >= t.attrs["points"] for t in (ours, other))
-    sides = [
-        _quantities(group.isel(shot=index), tree, drawn=drawn)
-        for group, tree, index in ((left, ours, shots), (right, other, matching))
+    all_drawn = all(t.attrs["points_committed"] >= t.attrs["points"] for t in (ours, other))
+    quantities_of_both = [
+        _compared_quantities(group.isel(shot=index), tree, all_drawn=all_drawn)
+        for group, tree, index in (
+            (our_group, ours, our_shots),
+            (other_group, other, matching_shots),
+        )
     ]
-    names = [name for name in (*COMPARED, DETECTED) if all(name in side for side in sides)]
-    found = differences(sides[0], sides[1], names, bounded=(*PROMISED, DETECTED))
-    return found.assign_coords(when).assign_attrs(
-        ours=titled(ours), other=titled(other), scanner=scanner,
-        shots=left.sizes["shot"], other_shots=right.sizes["shot"],
+    variables = [
+        name
+        for name in (*COMPARED_STATISTICS, DETECTED_VARIABLE)
+        if all(name in quantities for quantities in quantities_of_both)
+    ]
+    result = compute_differences(
+        quantities_of_both[0],
+        quantities_of_both[1],
+        variables,
+        bounded_variables=(*PROMISED, DETECTED_VARIABLE),
+    )
+    return result.assign_coords(shot_coords).assign_attrs(
+        ours=title_with_id(ours), other=title_with_id(other), scanner=scanner,
+        shots=our_group.sizes["shot"], other_shots=other_group.sizes["shot"],
     )  # fmt: skip
 
 
-def _pairs(ours: xr.Dataset, other: xr.Dataset, scanner: str) -> tuple[np.ndarray, np.ndarray]:
+def _match_shots(
+    ours: xr.Dataset, other: xr.Dataset, scanner: str
+) -> tuple[np.ndarray, np.ndarray]:
     """Numbers of the shots that both groups have, those of ours rising; none are computed: none."""
-    left, right = _known(ours), _known(other)
-    if left.empty or right.empty:
+    our_frame, other_frame = _computed_shots(ours), _computed_shots(other)
+    if our_frame.empty or other_frame.empty:
         return np.empty(0, int), np.empty(0, int)
-    both = pandas.merge_asof(
-        left, right, on="time", by="beam", direction="nearest", tolerance=SAME_TIME
+    merged = pandas.merge_asof(
+        our_frame,
+        other_frame,
+        on="time",
+        by="beam",
+        direction="nearest",
+        tolerance=SHOT_TIME_TOLERANCE,
     ).dropna()
-    if both.empty:
+    if merged.empty:
         raise ValueError(
             f"scanner {scanner}: no shot of one flight is at the time of one of the other"
         )
-    shots, matching = both["number_x"].to_numpy(int), both["number_y"].to_numpy(int)
-    apart, chord = (
-        np.linalg.norm(ours[name].values[shots] - other[name].values[matching], axis=1)
+    our_shots, matching_shots = merged["number_x"].to_numpy(int), merged["number_y"].to_numpy(int)
+    distance, chord = (
+        np.linalg.norm(ours[name].values[our_shots] - other[name].values[matching_shots], axis=1)
         for name in ("platform_position", "beam_direction")
     )
-    turned = 2 * np.arcsin(np.minimum(chord / 2, 1.0))
-    same = (apart <= SAME_PLACE) & (turned <= SAME_DIRECTION)
-    if not same.any():
+    angle = 2 * np.arcsin(np.minimum(chord / 2, 1.0))
+    is_match = (distance <= SHOT_POSITION_TOLERANCE) & (angle <= BEAM_DIRECTION_TOLERANCE)
+    if not is_match.any():
         raise ValueError(
             f"scanner {scanner}: the flights look from other places, or elsewhere: at one time "
-            f"they are {apart.min():.3g} m apart at the least, their beams "
-            f"{np.degrees(turned.min()):.3g} deg; compare flights of one path, attitude and scanner"
+            f"they are {distance.min():.3g} m apart at the least, their beams "
+            f"{np.degrees(angle.min()):.3g} deg; compare flights of one path, attitude and scanner"
         )
-    order = np.argsort(shots[same])
-    return shots[same][order], matching[same][order]
+    order = np.argsort(our_shots[is_match])
+    return our_shots[is_match][order], matching_shots[is_match][order]
 
 
-def _known(group: xr.Dataset) -> pandas.DataFrame:
+def _computed_shots(group: xr.Dataset) -> pandas.DataFrame:
     """Time, beam and number of the shots that are computed, by time."""
     frame = pandas.DataFrame({name: group[name].values for name in ("time", "beam")})
     return frame.assign(number=frame.index).dropna().sort_values("time")
 
 
-def _quantities(group: xr.Dataset, tree: xr.DataTree, *, drawn: bool) -> xr.Dataset:
+def _compared_quantities(group: xr.Dataset, tree: xr.DataTree, *, all_drawn: bool) -> xr.Dataset:
     """Quantities of a group's shots that are compared, over its axes and shots."""
-    there = [name for name in (*COMPARED, *ERRORS) if name in group]
-    found = group[there].assign_attrs(tree.attrs)
-    if not drawn:
-        return found
-    confidence, draws = study_of(found).accuracy.confidence, group.sizes["draw"]
-    count = ((group["flags"] & TRUE) > 0).any("return_number").sum("draw")
+    variables = [name for name in (*COMPARED_STATISTICS, *ERROR_BOUND_VARIABLES) if name in group]
+    quantities = group[variables].assign_attrs(tree.attrs)
+    if not all_drawn:
+        return quantities
+    confidence, draws = spec_of_dataset(quantities).accuracy.confidence, group.sizes["draw"]
+    detections = ((group["flags"] & TRUE) > 0).any("return_number").sum("draw")
 
-    def reach(successes: np.ndarray) -> np.ndarray:
+    def half_width(successes: np.ndarray) -> np.ndarray:
         interval = clopper_pearson(successes=successes, trials=draws, confidence=confidence)
-        return half_width_of(successes / draws, interval)
+        return interval_half_width(successes / draws, interval)
 
-    width = xr.apply_ufunc(reach, count, dask="parallelized", output_dtypes=[float])
-    known = found["pd_shot"].notnull()
-    share = (count / draws).where(known)
-    share.attrs = {"units": "1", "long_name": "share of draws in which the shot has a true point"}
-    return found.assign({DETECTED: share, f"{DETECTED}_half_width": width.where(known)})
+    half_widths = xr.apply_ufunc(half_width, detections, dask="parallelized", output_dtypes=[float])
+    is_computed = quantities["pd_shot"].notnull()
+    detected_fraction = (detections / draws).where(is_computed)
+    detected_fraction.attrs = {
+        "units": "1",
+        "long_name": "share of draws in which the shot has a true point",
+    }
+    return quantities.assign(
+        {
+            DETECTED_VARIABLE: detected_fraction,
+            f"{DETECTED_VARIABLE}_half_width": half_widths.where(is_computed),
+        }
+    )
 
 
-COLUMNS = ("quantity", "differ", "median", "largest", "agree", "largest at")
+DIFFERENCE_COLUMNS = ("quantity", "differ", "median", "largest", "agree", "largest at")
 
-Store = xr.Dataset | xr.DataTree
+OpenedStore = xr.Dataset | xr.DataTree
 
-SHOWN = (
+TABULATED_VARIABLES = (
     *PROMISED, "log10_pfa_bin", "log10_pfa_segment", "log10_pfa_both_chirps",
     "log10_pfa_shot", "p_leakage_up", "p_leakage_down", "snr_up", "snr_doppler", "snr_down",
     "noise_variance", "range_error", "radial_velocity_error", "false_alarms", "range_rmse",
-    "radial_velocity_rmse", "pfa_up", "pfa_down", DETECTED,
+    "radial_velocity_rmse", "pfa_up", "pfa_down", DETECTED_VARIABLE,
 )  # fmt: skip
 
 
-def compared(ours: Store, other: Store) -> dict[str, xr.Dataset]:
+def tabulated_differences(ours: OpenedStore, other: OpenedStore) -> dict[str, xr.Dataset]:
     """Differences of what a table shows, computed: by scanner, or of a grid under no name."""
-    found = ours.sweep.compare(other)
-    one = isinstance(found, xr.Dataset)
-    parts = {"": found} if one else {n: group.to_dataset() for n, group in found.children.items()}
-    shown = {f"{name}{end}" for name in SHOWN for end in ("", "_allowed", "_agrees")}
-    return {n: own[[v for v in own if v in shown]].compute() for n, own in parts.items()}
+    result = ours.sweep.compare(other)
+    is_grid = isinstance(result, xr.Dataset)
+    groups = (
+        {"": result} if is_grid else {n: group.to_dataset() for n, group in result.children.items()}
+    )
+    tabulated = {
+        f"{name}{suffix}" for name in TABULATED_VARIABLES for suffix in ("", "_allowed", "_agrees")
+    }
+    return {
+        n: group_differences[[v for v in group_differences if v in tabulated]].compute()
+        for n, group_differences in groups.items()
+    }
 
 
-def rows(found: xr.Dataset) -> list[list[str]]:
+def difference_rows(differences: xr.Dataset) -> list[list[str]]:
     """Return a row for each quantity with points, in the order of `COLUMNS`."""
-    return [_row(found, name) for name in SHOWN if name in found and found[name].notnull().any()]
-
-
-def _row(found: xr.Dataset, name: str) -> list[str]:
-    array = found[name]
-    known = np.isfinite(array.values)
-    size = np.where(known, np.abs(array.values), -1.0)
-    worst = np.unravel_index(int(np.argmax(size)), size.shape)
-    share = "-"
-    if f"{name}_agrees" in found:
-        agrees = (found[f"{name}_agrees"].values & known).sum() / known.sum()
-        # rounded down: nothing but all is 100 %
-        share = f"{np.floor(1e4 * agrees) / 100:g} %"
-    different = int((size > 0).sum())
     return [
-        labels.with_units(name, str(array.attrs.get("units", ""))),
-        f"{different:,}",
-        f"{np.median(size[known]):.2g}",
-        f"{array.values[worst]:+.3g}" if different else "0",
-        share,
-        _where(array, worst) if different else "-",
+        _difference_row(differences, name)
+        for name in TABULATED_VARIABLES
+        if name in differences and differences[name].notnull().any()
     ]
 
 
-def _where(array: xr.DataArray, index: tuple[np.intp, ...]) -> str:
+def _difference_row(differences: xr.Dataset, name: str) -> list[str]:
+    array = differences[name]
+    is_finite = np.isfinite(array.values)
+    abs_difference = np.where(is_finite, np.abs(array.values), -1.0)
+    worst_index = np.unravel_index(int(np.argmax(abs_difference)), abs_difference.shape)
+    agreement_text = "-"
+    if f"{name}_agrees" in differences:
+        agreeing_fraction = (
+            differences[f"{name}_agrees"].values & is_finite
+        ).sum() / is_finite.sum()
+        # rounded down: nothing but all is 100 %
+        agreement_text = f"{np.floor(1e4 * agreeing_fraction) / 100:g} %"
+    n_different = int((abs_difference > 0).sum())
+    return [
+        labels.axis_label(name, str(array.attrs.get("units", ""))),
+        f"{n_different:,}",
+        f"{np.median(abs_difference[is_finite]):.2g}",
+        f"{array.values[worst_index]:+.3g}" if n_different else "0",
+        agreement_text,
+        _describe_point(array, worst_index) if n_different else "-",
+    ]
+
+
+def _describe_point(array: xr.DataArray, index: tuple[np.intp, ...]) -> str:
     """Coordinates of a point, in the order of the axes."""
     point = array.isel(dict(zip(array.dims, map(int, index), strict=True)))
-    return ", ".join(_told(c) for c in point.coords.values())
+    return ", ".join(_describe_coordinate(c) for c in point.coords.values())
 
 
-def _told(coordinate: xr.DataArray) -> str:
+def _describe_coordinate(coordinate: xr.DataArray) -> str:
     """Return a coordinate's value; with its name where no unit tells what it is."""
     units = str(coordinate.attrs.get("units", ""))
-    value = labels.quantity(coordinate.values.item(), units)
-    return value if units not in ("", "1") else f"{labels.coordinate(str(coordinate.name))} {value}"
+    value = labels.format_quantity(coordinate.values.item(), units)
+    return (
+        value
+        if units not in ("", "1")
+        else f"{labels.coordinate_label(str(coordinate.name))} {value}"
+    )
 
 
-def met(found: xr.Dataset) -> str:
+def describe_common_shots(differences: xr.Dataset) -> str:
     """Return the number of the shots that two flights share, in words."""
-    number, ours, other = found.sizes["shot"], found.attrs["shots"], found.attrs["other_shots"]
-    if number == ours == other:
-        return f"all {labels.counted(number, 'shot')}"
-    return f"{labels.counted(number, 'shot')} that both have, of {ours:,} and {other:,}"
+    n_common, n_ours, n_other = (
+        differences.sizes["shot"],
+        differences.attrs["shots"],
+        differences.attrs["other_shots"],
+    )
+    if n_common == n_ours == n_other:
+        return f"all {labels.format_count(n_common, 'shot')}"
+    return f"{labels.format_count(n_common, 'shot')} that both have, of {n_ours:,} and {n_other:,}"
 
 
-def verdict(parts: Iterable[xr.Dataset]) -> tuple[str, str]:
+def agreement_verdict(compared_groups: Iterable[xr.Dataset]) -> tuple[str, str]:
     """Return ``same``, ``different`` or ``nothing``, and a sentence that says so."""
-    number, apart, thing, counted = 0, 0, "point", ""
-    for found in parts:
-        if "shot" in found.dims:
-            several = any(n > 1 for dim, n in found.sizes.items() if dim != "shot")
-            thing, counted = "shot", ", counted at each place along the axes" * several
-        pairs = [(found[n], found[f"{n}_agrees"]) for n in PROMISED if n in found]
-        number += max((int(array.notnull().sum()) for array, _ in pairs), default=0)
-        apart += max((int((array.notnull() & ~agrees).sum()) for array, agrees in pairs), default=0)
-    if not number:
+    n_points, n_different, noun, count_note = 0, 0, "point", ""
+    for differences in compared_groups:
+        if "shot" in differences.dims:
+            has_other_axes = any(n > 1 for dim, n in differences.sizes.items() if dim != "shot")
+            noun, count_note = "shot", ", counted at each place along the axes" * has_other_axes
+        pairs = [(differences[n], differences[f"{n}_agrees"]) for n in PROMISED if n in differences]
+        n_points += max((int(array.notnull().sum()) for array, _ in pairs), default=0)
+        n_different += max(
+            (int((array.notnull() & ~agrees).sum()) for array, agrees in pairs), default=0
+        )
+    if not n_points:
         return "nothing", "Nothing that both stores have is computed yet."
-    if not apart:
-        told = f"agree at {labels.counted(number, thing)}"
-        return "same", f"Probabilities of detection {told}{counted}."
-    told = f"differ at {apart:,} of {labels.counted(number, thing)}"
-    return "different", f"Probabilities of detection {told}{counted}."
+    if not n_different:
+        phrase = f"agree at {labels.format_count(n_points, noun)}"
+        return "same", f"Probabilities of detection {phrase}{count_note}."
+    phrase = f"differ at {n_different:,} of {labels.format_count(n_points, noun)}"
+    return "different", f"Probabilities of detection {phrase}{count_note}."
 
 
-LEAST = 1e-16
+PLOTTED_DIFFERENCE_MIN = 1e-16
 """Differences below it stand at the left edge of a figure."""
 
 
-def save_figure(found: Mapping[str, xr.Dataset], path: Path) -> Path:
+def save_difference_figure(
+    differences_by_scanner: Mapping[str, xr.Dataset], file_path: Path
+) -> Path:
     """Draw the shares of points that differ by more than some amount, a colour a scanner."""
     from sweep.analysis import canvas
 
-    with canvas.style():
-        chart = figure(found)
+    with canvas.uniform_style():
+        chart = difference_chart(differences_by_scanner)
         if chart is None:
-            return canvas.save(canvas.empty("Nothing that both stores have is computed yet"), path)
-        return canvas.save(canvas.sheet_of(chart, chart.heading, ""), path)
+            return canvas.save_sheet(
+                canvas.message_sheet("Nothing that both stores have is computed yet"), file_path
+            )
+        return canvas.save_sheet(canvas.draw_chart(chart, chart.heading, ""), file_path)
 
 
-def figure(found: Mapping[str, xr.Dataset]) -> Chart | None:
+def difference_chart(differences_by_scanner: Mapping[str, xr.Dataset]) -> Chart | None:
     """Return the chart of the differences, or None if no common point is computed."""
-    parts = list(found.values())
-    names = [n for n in PROMISED if any(n in part and part[n].notnull().any() for part in parts)]
-    if not names:
+    compared_groups = list(differences_by_scanner.values())
+    variables = [
+        n
+        for n in PROMISED
+        if any(n in part and part[n].notnull().any() for part in compared_groups)
+    ]
+    if not variables:
         return None
-    thing = "shot" if any("shot" in part.dims for part in parts) else "point"
-    number = sum(int(part[names[0]].notnull().sum()) for part in parts)
-    up = Axis(f"share of {thing}s beyond (%)", limits=(-3, 103))
-    across = Axis("difference of pd, either way", LOG, (LEAST, 1.0))
+    noun = "shot" if any("shot" in part.dims for part in compared_groups) else "point"
+    n_common = sum(int(part[variables[0]].notnull().sum()) for part in compared_groups)
+    y_axis = ChartAxis(f"share of {noun}s beyond (%)", limits=(-3, 103))
+    x_axis = ChartAxis("difference of pd, either way", LOG, (PLOTTED_DIFFERENCE_MIN, 1.0))
     return Chart(
-        f"{parts[0].attrs['other']}\nless {parts[0].attrs['ours']}",
-        f"Shares of {thing}s that differ by more than some amount, of {', '.join(names)}.",
-        [f"{number:,} {thing}s that both studies have"],
+        f"{compared_groups[0].attrs['other']}\nless {compared_groups[0].attrs['ours']}",
+        f"Shares of {noun}s that differ by more than some amount, of {', '.join(variables)}.",
+        [f"{n_common:,} {noun}s that both studies have"],
         [
-            Panel({"probability": name}, across, up, [
-                line for i, (scanner, part) in enumerate(found.items())
-                for line in _shares(part, name, scanner, i)
+            Panel({"probability": name}, x_axis, y_axis, [
+                line for i, (scanner, part) in enumerate(differences_by_scanner.items())
+                for line in _exceedance_lines(part, name, scanner, i)
             ])
-            for name in names
+            for name in variables
         ],
-        rows=[2] * (len(names) // 2) + [1] * (len(names) % 2),
+        panels_per_row=[2] * (len(variables) // 2) + [1] * (len(variables) % 2),
     )  # fmt: skip
 
 
-def _shares(found: xr.Dataset, name: str, scanner: str, number: int) -> list[Line]:
+def _exceedance_lines(
+    differences: xr.Dataset, name: str, scanner: str, style_index: int
+) -> list[ChartLine]:
     """Shares of points beyond each difference that is, and beyond each that is allowed."""
-    known = np.isfinite(found[name].values)
+    is_finite = np.isfinite(differences[name].values)
     lines = []
-    for values, words, look in (
-        (np.abs(found[name].values), "found", "line"),
-        (found[f"{name}_allowed"].values, "allowed", "stated"),
+    for values, label_suffix, style in (
+        (np.abs(differences[name].values), "found", "line"),
+        (differences[f"{name}_allowed"].values, "allowed", "stated"),
     ):
-        ordered = np.sort(np.maximum(np.broadcast_to(values, known.shape)[known], LEAST))
-        share = 100 * (1 - np.arange(ordered.size + 1) / max(ordered.size, 1))
-        x = np.repeat([LEAST, *ordered, 1.0], 2)[1:-1]
-        y = np.repeat(share, 2)
-        lines.append(Line(x, y, f"{scanner} {words}".strip(), number, look=look))
-    return lines if known.any() else []
+        sorted_values = np.sort(
+            np.maximum(np.broadcast_to(values, is_finite.shape)[is_finite], PLOTTED_DIFFERENCE_MIN)
+        )
+        percent_beyond = 100 * (1 - np.arange(sorted_values.size + 1) / max(sorted_values.size, 1))
+        x = np.repeat([PLOTTED_DIFFERENCE_MIN, *sorted_values, 1.0], 2)[1:-1]
+        y = np.repeat(percent_beyond, 2)
+        lines.append(ChartLine(x, y, f"{scanner} {label_suffix}".strip(), style_index, style=style))
+    return lines if is_finite.any() else []

@@ -10,12 +10,12 @@ import dask.array
 import numpy as np
 import xarray as xr
 
-from sweep.analysis.answers.physical import (
-    parameter,
-    quantity,
+from sweep.analysis.answers.dataset_lookup import (
+    grid_spec_of_dataset,
+    parameter_in_si,
+    parse_si,
     require_variables,
-    si,
-    spec_of,
+    to_si,
 )
 from sweep.model import waveform
 from sweep.model.effects.catalogue import EFFECTS, names_of
@@ -24,21 +24,23 @@ from sweep.model.philox import point_keys
 from sweep.model.sampling import simulate
 from sweep.model.shot import evaluate
 from sweep.model.threshold import TNR, WAYS, tnr_of
-from sweep.spec import Spec
+from sweep.spec import GridSpec
 
-SEGMENTS = ("up", "doppler", "down", "shot")
+SEGMENTS_AND_SHOT = ("up", "doppler", "down", "shot")
 
 
-def named(quantity: str, segment: str) -> str:
+def variable_name(quantity: str, segment: str) -> str:
     """Name of a variable of a segment, or of a shot."""
-    if segment not in SEGMENTS:
-        raise ValueError(f"there is no segment '{segment}': take one of {', '.join(SEGMENTS)}")
+    if segment not in SEGMENTS_AND_SHOT:
+        raise ValueError(
+            f"there is no segment '{segment}': take one of {', '.join(SEGMENTS_AND_SHOT)}"
+        )
     return f"{quantity}_{segment}"
 
 
-def half_width(dataset: xr.Dataset, segment: str) -> xr.DataArray | None:
+def pd_half_width(dataset: xr.Dataset, segment: str) -> xr.DataArray | None:
     """Half-widths of the intervals of pd; None where nothing is drawn."""
-    return dataset.get(f"{named('pd', segment)}_half_width")
+    return dataset.get(f"{variable_name('pd', segment)}_half_width")
 
 
 def detection_probability(dataset: xr.Dataset, segment: str = "shot") -> xr.Dataset:
@@ -57,28 +59,34 @@ def detection_probability(dataset: xr.Dataset, segment: str = "shot") -> xr.Data
         it is. Without draws pd is a closed form, and the interval has no width. The change that
         skipped effects may make is apart, in `effects_error`.
     """
-    require_variables(dataset, named("pd", segment))
-    pd = dataset[named("pd", segment)]
-    reach = half_width(dataset, segment)
-    low, high = (pd, pd) if reach is None else ((pd - reach).clip(0, 1), (pd + reach).clip(0, 1))
+    require_variables(dataset, variable_name("pd", segment))
+    pd = dataset[variable_name("pd", segment)]
+    interval_half_width = pd_half_width(dataset, segment)
+    low, high = (
+        (pd, pd)
+        if interval_half_width is None
+        else ((pd - interval_half_width).clip(0, 1), (pd + interval_half_width).clip(0, 1))
+    )
     result = xr.Dataset({"pd": pd, "low": low, "high": high}).assign_attrs(dataset.attrs)
-    of_pd = pd.attrs.get("long_name", pd.name)
-    for name, words in (("low", "lower"), ("high", "upper")):
+    pd_long_name = pd.attrs.get("long_name", pd.name)
+    for name, end_word in (("low", "lower"), ("high", "upper")):
         result[name].attrs = {
-            "units": "1", "long_name": f"{words} end of the interval of {of_pd}",
-            **confidence(dataset, reach),
+            "units": "1", "long_name": f"{end_word} end of the interval of {pd_long_name}",
+            **confidence_attribute(dataset, interval_half_width),
         }  # fmt: skip
     return result
 
 
-def confidence(dataset: xr.Dataset, reach: xr.DataArray | None) -> dict[str, float]:
+def confidence_attribute(
+    dataset: xr.Dataset, interval_half_width: xr.DataArray | None
+) -> dict[str, float]:
     """Confidence of an interval, if it is one number; 1 if nothing is drawn."""
-    if reach is None:
+    if interval_half_width is None:
         return {"confidence": 1.0}
-    stored = reach.attrs.get("confidence")
-    if stored is None and "confidence" not in dataset.coords:
-        stored = spec_of(dataset).accuracy.confidence
-    return {} if stored is None else {"confidence": float(stored)}
+    confidence_level = interval_half_width.attrs.get("confidence")
+    if confidence_level is None and "confidence" not in dataset.coords:
+        confidence_level = grid_spec_of_dataset(dataset).accuracy.confidence
+    return {} if confidence_level is None else {"confidence": float(confidence_level)}
 
 
 def false_alarms_per_second(
@@ -105,28 +113,36 @@ def false_alarms_per_second(
     ValueError
         The rate cannot be read, or is not positive.
     """
-    shots: xr.DataArray | float
+    shots_per_second: xr.DataArray | float
     if rate is None:
-        architecture, order, duration, gap, looks = (
-            parameter(dataset, f"instrument.{path}", spec_of(dataset))
+        architecture, segment_order, duration, gap, looks = (
+            parameter_in_si(dataset, f"instrument.{path}", grid_spec_of_dataset(dataset))
             for path in (
                 "receiver.architecture", "chirp.segments", "chirp.duration", "chirp.gap",
                 "looks.number",
             )
         )  # fmt: skip
-        segments = xr.apply_ufunc(
-            lambda a, names: len(waveform.order_of(str(a), str(names))), architecture, order,
-            vectorize=True, dask="parallelized", output_dtypes=[int],
-        )  # fmt: skip
-        shots = 1 / (looks * (segments * (duration + gap)))
+        n_segments = xr.apply_ufunc(
+            lambda a, names: len(waveform.order_of(str(a), str(names))),
+            architecture,
+            segment_order,
+            vectorize=True,
+            dask="parallelized",
+            output_dtypes=[int],
+        )
+        shots_per_second = 1 / (looks * (n_segments * (duration + gap)))
     else:
-        shots = quantity(rate, si_unit="Hz", name="the rate of shots")
-        if not shots > 0:
+        shots_per_second = parse_si(rate, si_unit="Hz", name="the rate of shots")
+        if not shots_per_second > 0:
             raise ValueError("the rate of shots is a positive number")
-    alarms = (shots * of_a_shot(dataset, leakage)).rename("false_alarms_per_second")
-    text = "noise and leaked signal" if leakage else "noise alone"
-    return alarms.assign_attrs(
-        units="s-1", long_name="false alarms a second", comment=f"shots with false alarms by {text}"
+    alarm_rate = (shots_per_second * false_alarms_per_shot(dataset, leakage)).rename(
+        "false_alarms_per_second"
+    )
+    cause = "noise and leaked signal" if leakage else "noise alone"
+    return alarm_rate.assign_attrs(
+        units="s-1",
+        long_name="false alarms a second",
+        comment=f"shots with false alarms by {cause}",
     )
 
 
@@ -156,32 +172,34 @@ def false_alarms_per_kilometre(
     ValueError
         Speed or rate cannot be read, or are not positive.
     """
-    metres_a_second = quantity(speed, si_unit="m/s", name="the speed")
-    if not metres_a_second > 0:
+    metres_per_second = parse_si(speed, si_unit="m/s", name="the speed")
+    if not metres_per_second > 0:
         raise ValueError("the speed is a positive number")
-    per_second = false_alarms_per_second(dataset, rate, leakage=leakage)
-    per_kilometre = (per_second * (1000 / metres_a_second)).rename("false_alarms_per_kilometre")
-    return per_kilometre.assign_attrs(
-        per_second.attrs, units="km-1", long_name="false alarms a kilometre"
+    alarms_per_second = false_alarms_per_second(dataset, rate, leakage=leakage)
+    alarms_per_kilometre = (alarms_per_second * (1000 / metres_per_second)).rename(
+        "false_alarms_per_kilometre"
+    )
+    return alarms_per_kilometre.assign_attrs(
+        alarms_per_second.attrs, units="km-1", long_name="false alarms a kilometre"
     )
 
 
-def of_a_shot(dataset: xr.Dataset, leakage: bool) -> xr.DataArray:
+def false_alarms_per_shot(dataset: xr.Dataset, leakage: bool) -> xr.DataArray:
     """Probability of a false alarm in both chirp segments; where spectra are drawn their number."""
     if "pfa_both_chirps" not in dataset:
         # whole spectra were drawn: counted false alarms of all segments, leaked signal's as well
-        drawn = spec_of(dataset).draws.whole_spectra
-        require_variables(dataset, "false_alarms" if drawn else "pfa_both_chirps")
+        draws_spectra = grid_spec_of_dataset(dataset).draws.draws_whole_spectra
+        require_variables(dataset, "false_alarms" if draws_spectra else "pfa_both_chirps")
         return dataset["false_alarms"]
-    noise = dataset["pfa_both_chirps"]
+    pfa_noise = dataset["pfa_both_chirps"]
     if not leakage:
-        return noise
+        return pfa_noise
     require_variables(dataset, "pfa_segment", "p_leakage_up", "p_leakage_down")
-    segments = (dataset["p_leakage_up"], dataset["p_leakage_down"])
-    return shot_with_leakage(dataset["pfa_segment"], noise, *segments)
+    p_leakage = (dataset["p_leakage_up"], dataset["p_leakage_down"])
+    return pfa_both_chirps_with_leakage(dataset["pfa_segment"], pfa_noise, *p_leakage)
 
 
-def shot_with_leakage(
+def pfa_both_chirps_with_leakage(
     pfa_segment: xr.DataArray,
     pfa_both_chirps: xr.DataArray,
     p_leakage_up: xr.DataArray,
@@ -192,12 +210,12 @@ def shot_with_leakage(
     Of noise alone in the up-chirp, and in both, a product, as the segments' numbers of bins
     differ; of leakage in each.
     """
-    down = pfa_both_chirps / (pfa_segment + (pfa_segment == 0))  # both are 0 where one is
-    up = pfa_segment + p_leakage_up * (1 - pfa_segment)
-    return up * (down + p_leakage_down * (1 - down))
+    pfa_down = pfa_both_chirps / (pfa_segment + (pfa_segment == 0))  # both are 0 where one is
+    p_extra_up = pfa_segment + p_leakage_up * (1 - pfa_segment)
+    return p_extra_up * (pfa_down + p_leakage_down * (1 - pfa_down))
 
 
-STATISTICS = ("mean", "least", "largest", "number")
+SUMMARY_STATISTICS = ("mean", "least", "largest", "number")
 
 
 def summary(dataset: xr.Dataset) -> xr.Dataset:
@@ -209,33 +227,41 @@ def summary(dataset: xr.Dataset) -> xr.Dataset:
         Every variable of floats over `statistic`, lazy; nan where no point is finite. The store
         goes through memory chunk by chunk, each chunk once.
     """
-    result = xr.Dataset(coords={"statistic": list(STATISTICS)}, attrs=dataset.attrs)
+    result = xr.Dataset(coords={"statistic": list(SUMMARY_STATISTICS)}, attrs=dataset.attrs)
     for name, array in dataset.data_vars.items():
         if array.dtype.kind == "f":
-            result[name] = xr.DataArray(_reduced(array), dims=["statistic"], attrs=array.attrs)
+            result[name] = xr.DataArray(
+                _lazy_statistics(array), dims=["statistic"], attrs=array.attrs
+            )
     return result
 
 
-def _reduced(array: xr.DataArray) -> dask.array.Array:
+def _lazy_statistics(array: xr.DataArray) -> dask.array.Array:
     """Return the statistics of an array, (4,)."""
-    blocks = dask.array.asarray(array.chunk().data).to_delayed().ravel()
-    parts = [dask.delayed(_of_block)(block) for block in blocks]
-    return dask.array.from_delayed(dask.delayed(_of_all)(parts), (4,), float)
+    delayed_chunks = dask.array.asarray(array.chunk().data).to_delayed().ravel()
+    delayed_statistics = [
+        dask.delayed(_chunk_statistics)(delayed_chunk) for delayed_chunk in delayed_chunks
+    ]
+    return dask.array.from_delayed(
+        dask.delayed(_combine_statistics)(delayed_statistics), (4,), float
+    )
 
 
-def _of_block(block: np.ndarray) -> np.ndarray:
+def _chunk_statistics(chunk: np.ndarray) -> np.ndarray:
     """Sum, extremes and number of the finite values of a block, (4,)."""
-    known = block[np.isfinite(block)]
-    least, largest = (known.min(), known.max()) if known.size else (np.inf, -np.inf)
-    return np.array([known.sum(), least, largest, known.size])
+    finite_values = chunk[np.isfinite(chunk)]
+    minimum, maximum = (
+        (finite_values.min(), finite_values.max()) if finite_values.size else (np.inf, -np.inf)
+    )
+    return np.array([finite_values.sum(), minimum, maximum, finite_values.size])
 
 
-def _of_all(parts: list[np.ndarray]) -> np.ndarray:
+def _combine_statistics(chunk_statistics: list[np.ndarray]) -> np.ndarray:
     """Return the statistics of all blocks together."""
-    total, least, largest, number = np.array(parts).T
-    if not number.sum():
+    sums, minima, maxima, counts = np.array(chunk_statistics).T
+    if not counts.sum():
         return np.array([np.nan, np.nan, np.nan, 0.0])
-    return np.array([total.sum() / number.sum(), least.min(), largest.max(), number.sum()])
+    return np.array([sums.sum() / counts.sum(), minima.min(), maxima.max(), counts.sum()])
 
 
 # Receiver operating characteristics. The magnitude of a segment's strongest bin does not depend on
@@ -251,21 +277,26 @@ def _of_all(parts: list[np.ndarray]) -> np.ndarray:
 # in the study, for its own threshold: far from it, what was left out may change pd by more than the
 # study's tolerance.
 
-MOST_POINTS = 20_000
-MOST_SIMULATED = 200
+ROC_POINTS_MAX = 20_000
+ROC_SIMULATED_POINTS_MAX = 200
 """Points whose curves are made at once, and of these such as have to be simulated anew."""
 
-SAME = 1e-9
+PD_MATCH_TOLERANCE = 1e-9
 """Difference of pd up to which the closed form gives back what is stored."""
 
 CURVE_TNR = "curve_tnr"
 """Not `tnr`, which is the study's own where that is on an axis."""
 
-DOMAIN = "sweep.analysis.roc"
-_RANDOM = sum(1 << k for k, effect in enumerate(EFFECTS) if effect.is_random)
+ROC_KEY_DOMAIN = "sweep.analysis.roc"
+_RANDOM_EFFECT_FLAGS = sum(1 << k for k, effect in enumerate(EFFECTS) if effect.is_random)
 """Flags of the effects that are random."""
 
-_SEGMENTS = {"up": ("up",), "doppler": ("doppler",), "down": ("down",), "shot": ("up", "down")}
+_DETECTING_SEGMENTS = {
+    "up": ("up",),
+    "doppler": ("doppler",),
+    "down": ("down",),
+    "shot": ("up", "down"),
+}
 
 
 def roc(
@@ -299,156 +330,184 @@ def roc(
         Too many points, a probability that is none, a study of whole spectra, or one whose looks
         vary.
     """
-    if spec_of(dataset).draws.whole_spectra:
+    if grid_spec_of_dataset(dataset).draws.draws_whole_spectra:
         raise ValueError(
             "a study that draws whole spectra has no closed form: put the detector's threshold or "
             "design pfa on an axis, and read pd over pfa_bin"
         )
-    chances = np.logspace(-16, -1, 61) if pfa is None else np.atleast_1d(np.asarray(pfa, float))
-    if not ((chances > 0) & (chances < 1)).all():
+    pfas = np.logspace(-16, -1, 61) if pfa is None else np.atleast_1d(np.asarray(pfa, float))
+    if not ((pfas > 0) & (pfas < 1)).all():
         raise ValueError("probabilities of a false alarm lie between 0 and 1")
-    needed = [f"{kind}_{s}" for s in _SEGMENTS[segment] for kind in ("snr", "pd")]
-    needed += [named("pd", segment), "log10_pfa_bin", "effects"]
-    require_variables(dataset, *needed)
-    number = dataset[named("pd", segment)].size
-    if number > MOST_POINTS:
+    variables = [f"{kind}_{s}" for s in _DETECTING_SEGMENTS[segment] for kind in ("snr", "pd")]
+    variables += [variable_name("pd", segment), "log10_pfa_bin", "effects"]
+    require_variables(dataset, *variables)
+    n_points = dataset[variable_name("pd", segment)].size
+    if n_points > ROC_POINTS_MAX:
         raise ValueError(
-            f"{number:,} points make too many curves (at most {MOST_POINTS:,}): select some"
+            f"{n_points:,} points make too many curves (at most {ROC_POINTS_MAX:,}): select some"
         )
-    looks = _looks_of(spec_of(dataset))
-    rule, peaks = (
-        parameter(dataset, path, spec_of(dataset))
+    looks = _looks_of_study(grid_spec_of_dataset(dataset))
+    detection_rule, peak_rule = (
+        parameter_in_si(dataset, path, grid_spec_of_dataset(dataset))
         for path in (waveform.SHOT_DETECTION, waveform.PEAKS)
     )
-    dataset = dataset[list(dict.fromkeys(needed))].compute()
-    level = xr.DataArray(looks.level(np.log(chances)), dims=["pfa_bin"])
-    pd, exact = _closed(dataset, segment, level, looks)
+    dataset = dataset[list(dict.fromkeys(variables))].compute()
+    threshold_ratio = xr.DataArray(looks.level(np.log(pfas)), dims=["pfa_bin"])
+    pd, is_exact = _closed_form_pd(dataset, segment, threshold_ratio, looks)
     if segment == "shot":  # else of two segments out of three
-        exact = exact & (rule == waveform.BOTH_CHIRPS)
-    exact = exact & (peaks == waveform.ALL)
-    tnr = level * _own_tnr(dataset) / _own_level(dataset, looks)
+        is_exact = is_exact & (detection_rule == waveform.BOTH_CHIRPS)
+    is_exact = is_exact & (peak_rule == waveform.ALL)
+    tnr = threshold_ratio * _study_tnr(dataset) / _study_threshold_ratio(dataset, looks)
     result = xr.Dataset(
-        {"pd": pd, CURVE_TNR: tnr, "simulated": ~exact, "half_width": xr.zeros_like(pd)},
-        {"pfa_bin": ("pfa_bin", chances)},
+        {"pd": pd, CURVE_TNR: tnr, "simulated": ~is_exact, "half_width": xr.zeros_like(pd)},
+        {"pfa_bin": ("pfa_bin", pfas)},
     )
-    result = result.transpose("pfa_bin", *dataset[named("pd", segment)].dims)
-    if not exact.all():
-        _simulate(dataset, result, segment, draws)
-    return _described(result, dataset, segment)
+    result = result.transpose("pfa_bin", *dataset[variable_name("pd", segment)].dims)
+    if not is_exact.all():
+        _replace_by_simulation(dataset, result, segment, draws)
+    return _set_attributes(result, dataset, segment)
 
 
-def _looks_of(spec: Spec) -> Looks:
+def _looks_of_study(spec: GridSpec) -> Looks:
     """Return the looks of all points."""
-    on_axes = (member.path for axis in spec.axes for member in axis.members)
-    if varying := sorted({NUMBER, COMBINE, VOTES} & set(on_axes)):
+    axis_paths = (axis_parameter.path for axis in spec.axes for axis_parameter in axis.parameters)
+    if varying_paths := sorted({NUMBER, COMBINE, VOTES} & set(axis_paths)):
         raise ValueError(
-            f"{', '.join(varying)} varies, and with it the threshold that a chance of false alarms "
+            f"{', '.join(varying_paths)} varies, and with it the threshold that a chance of false "
+            "alarms "
             "makes: put the design pfa on an axis, and read pd over it"
         )
     return Looks.of(spec.parameters())
 
 
-def _closed(
-    dataset: xr.Dataset, segment: str, level: xr.DataArray, looks: Looks
+def _closed_form_pd(
+    dataset: xr.Dataset, segment: str, threshold_ratio: xr.DataArray, looks: Looks
 ) -> tuple[xr.DataArray, xr.DataArray]:
     """Return the closed form of pd at each level, and where it holds."""
-    own = _own_level(dataset, looks)
-    pd = xr.ones_like(level)
-    exact = (dataset["effects"] & _RANDOM) == 0
-    for name in _SEGMENTS[segment]:
-        stored = dataset[f"pd_{name}"]
-        amplitude = (2 * dataset[f"snr_{name}"]) ** 0.5
-        pd = pd * xr.apply_ufunc(_crossing, amplitude, level, kwargs={"looks": looks})
-        again = xr.apply_ufunc(_crossing, amplitude, own, kwargs={"looks": looks})
-        exact = exact & ((abs(again - stored) <= SAME) | stored.isnull())
-    return pd, exact
+    study_ratio = _study_threshold_ratio(dataset, looks)
+    pd = xr.ones_like(threshold_ratio)
+    is_exact = (dataset["effects"] & _RANDOM_EFFECT_FLAGS) == 0
+    for segment_name in _DETECTING_SEGMENTS[segment]:
+        stored_pd = dataset[f"pd_{segment_name}"]
+        signal_ratio = (2 * dataset[f"snr_{segment_name}"]) ** 0.5
+        pd = pd * xr.apply_ufunc(
+            _crossing_probability, signal_ratio, threshold_ratio, kwargs={"looks": looks}
+        )
+        recomputed_pd = xr.apply_ufunc(
+            _crossing_probability, signal_ratio, study_ratio, kwargs={"looks": looks}
+        )
+        is_exact = is_exact & (
+            (abs(recomputed_pd - stored_pd) <= PD_MATCH_TOLERANCE) | stored_pd.isnull()
+        )
+    return pd, is_exact
 
 
-def _own_level(dataset: xr.Dataset, looks: Looks) -> xr.DataArray:
+def _study_threshold_ratio(dataset: xr.Dataset, looks: Looks) -> xr.DataArray:
     """Return the study's own threshold over the noise per quadrature."""
     if looks.several:
         return xr.apply_ufunc(looks.level, np.log(10) * dataset["log10_pfa_bin"])
     return (-2 * np.log(10) * dataset["log10_pfa_bin"]) ** 0.5
 
 
-def _own_tnr(dataset: xr.Dataset) -> xr.DataArray:
+def _study_tnr(dataset: xr.Dataset) -> xr.DataArray:
     """Return the study's own threshold-to-noise ratio at each point."""
-    spec, like = spec_of(dataset), dataset["log10_pfa_bin"]
+    spec, template = grid_spec_of_dataset(dataset), dataset["log10_pfa_bin"]
     if TNR in spec.parameters():
-        return parameter(dataset, TNR, spec)
-    places = [dict(zip(like.dims, at, strict=True)) for at in np.ndindex(like.shape)]
-    found = [tnr_of(_parameters_of(like.isel(at).coords, spec)) for at in places]
-    return like.copy(data=np.reshape(np.array(found, float), like.shape))
+        return parameter_in_si(dataset, TNR, spec)
+    indices = [
+        dict(zip(template.dims, point_index, strict=True))
+        for point_index in np.ndindex(template.shape)
+    ]
+    tnrs = [
+        tnr_of(_point_parameters(template.isel(point_index).coords, spec))
+        for point_index in indices
+    ]
+    return template.copy(data=np.reshape(np.array(tnrs, float), template.shape))
 
 
-def _parameters_of(coords: Mapping[Any, xr.DataArray], spec: Spec) -> dict[str, Any]:
+def _point_parameters(coordinates: Mapping[Any, xr.DataArray], spec: GridSpec) -> dict[str, Any]:
     """SI values of all parameters at a point, which has these coordinates."""
-    values = {str(c.attrs["path"]): c for c in coords.values() if "path" in c.attrs}
-    return spec.parameters() | {path: si(value).values.item() for path, value in values.items()}
+    values = {str(c.attrs["path"]): c for c in coordinates.values() if "path" in c.attrs}
+    return spec.parameters() | {path: to_si(value).values.item() for path, value in values.items()}
 
 
-def _crossing(amplitude: np.ndarray, level: np.ndarray, looks: Looks) -> np.ndarray:
+def _crossing_probability(
+    signal_ratio: np.ndarray, threshold_ratio: np.ndarray, looks: Looks
+) -> np.ndarray:
     """Q_1, or its like in several looks; nan where the amplitude or the level is."""
-    known = np.isfinite(amplitude) & np.isfinite(level)
-    found = looks.steady(np.where(known, amplitude, 0), np.where(known, level, 0))[0]
-    return np.where(known, found, np.nan)
+    is_finite = np.isfinite(signal_ratio) & np.isfinite(threshold_ratio)
+    probability = looks.steady(
+        np.where(is_finite, signal_ratio, 0), np.where(is_finite, threshold_ratio, 0)
+    )[0]
+    return np.where(is_finite, probability, np.nan)
 
 
-def _simulate(dataset: xr.Dataset, result: xr.Dataset, segment: str, draws: int) -> None:
+def _replace_by_simulation(
+    dataset: xr.Dataset, result: xr.Dataset, segment: str, draws: int
+) -> None:
     """Put simulated curves in the place of those that the closed form does not give."""
-    spec = spec_of(dataset)
-    places = np.argwhere(np.asarray(result["simulated"].values))
-    if len(places) > MOST_SIMULATED:
+    spec = grid_spec_of_dataset(dataset)
+    point_indices = np.argwhere(np.asarray(result["simulated"].values))
+    if len(point_indices) > ROC_SIMULATED_POINTS_MAX:
         raise ValueError(
-            f"{len(places):,} points have to be simulated anew (at most {MOST_SIMULATED}): select "
+            f"{len(point_indices):,} points have to be simulated anew (at most "
+            f"{ROC_SIMULATED_POINTS_MAX}): select "
             "fewer"
         )
-    dims = dataset[named("pd", segment)].dims
-    pd, width = result["pd"].values.copy(), result["half_width"].values.copy()
-    for place in places:
-        at = dict(zip(dims, map(int, place), strict=True))
-        point = dataset.isel(at)
-        tnr = result[CURVE_TNR].isel(at).values
-        index = (slice(None), *place)
-        pd[index], width[index] = _curve(spec, point, tnr, segment, draws)
+    dims = dataset[variable_name("pd", segment)].dims
+    pd, half_widths = result["pd"].values.copy(), result["half_width"].values.copy()
+    for point_index in point_indices:
+        index_by_dim = dict(zip(dims, map(int, point_index), strict=True))
+        point = dataset.isel(index_by_dim)
+        tnr = result[CURVE_TNR].isel(index_by_dim).values
+        curve_index = (slice(None), *point_index)
+        pd[curve_index], half_widths[curve_index] = _simulate_curve(
+            spec, point, tnr, segment, draws
+        )
     result["pd"] = result["pd"].copy(data=pd)
-    result["half_width"] = result["half_width"].copy(data=width)
+    result["half_width"] = result["half_width"].copy(data=half_widths)
 
 
-def _curve(
-    spec: Spec, point: xr.Dataset, tnr: np.ndarray, segment: str, draws: int
+def _simulate_curve(
+    spec: GridSpec, point: xr.Dataset, tnr: np.ndarray, segment: str, draws: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Chance of detection, and its half-width, at some threshold to noise ratios of a point."""
-    parameters = _parameters_of(point.coords, spec)
-    known = np.isfinite(tnr)
-    if not known.all():
+    parameters = _point_parameters(point.coords, spec)
+    is_finite = np.isfinite(tnr)
+    if not is_finite.all():
         return np.full(tnr.size, np.nan), np.full(tnr.size, np.nan)
     flags = int(point["effects"])
     effects = names_of(flags)
-    name = named("pd", segment)
-    arrays = {p: np.full(tnr.size, value) for p, value in parameters.items() if p not in WAYS}
-    arrays[TNR] = tnr
-    if flags & _RANDOM:
+    pd_name = variable_name("pd", segment)
+    parameter_arrays = {
+        p: np.full(tnr.size, value) for p, value in parameters.items() if p not in WAYS
+    }
+    parameter_arrays[TNR] = tnr
+    if flags & _RANDOM_EFFECT_FLAGS:
         # One key for all thresholds: the same draws, so that curves fall without noise.
-        others = {p: v for p, v in sorted(parameters.items()) if p not in WAYS}
-        row = [[v for v in others.values() if not isinstance(v, str)]]
+        key_parameters = {p: v for p, v in sorted(parameters.items()) if p not in WAYS}
+        key_values = [[v for v in key_parameters.values() if not isinstance(v, str)]]
         keys = np.repeat(
-            point_keys(np.array(row, float), domain=DOMAIN, seed=spec.seed), tnr.size, 0
+            point_keys(np.array(key_values, float), domain=ROC_KEY_DOMAIN, seed=spec.seed),
+            tnr.size,
+            0,
         )
-        found = simulate(arrays, effects, keys=keys, batch_sizes=[draws], method="probabilities")
-        return found[name], found[f"{name}_half_width"]
-    return evaluate(arrays, effects)[name], np.zeros(tnr.size)
+        outputs = simulate(
+            parameter_arrays, effects, keys=keys, batch_sizes=[draws], method="probabilities"
+        )
+        return outputs[pd_name], outputs[f"{pd_name}_half_width"]
+    return evaluate(parameter_arrays, effects)[pd_name], np.zeros(tnr.size)
 
 
-def _described(result: xr.Dataset, dataset: xr.Dataset, segment: str) -> xr.Dataset:
+def _set_attributes(result: xr.Dataset, dataset: xr.Dataset, segment: str) -> xr.Dataset:
     """Units and words."""
-    words = {
+    long_names = {
         "pd": f"probability of detection, {segment}",
         CURVE_TNR: "threshold to noise ratio",
         "simulated": "whether the point was simulated anew at every threshold",
         "half_width": f"half-width of the interval of the probability of detection, {segment}",
         "pfa_bin": "probability of false alarm in one bin, from noise alone",
     }
-    for name, long_name in words.items():
+    for name, long_name in long_names.items():
         result[name].attrs = {"units": "1", "long_name": long_name}
     return result.assign_attrs(dataset.attrs)

@@ -18,27 +18,27 @@ import numpy as np
 import xarray as xr
 
 from sweep.analysis import labels
-from sweep.analysis.answers.physical import (
-    HOW_TO_JOIN,
-    SPECS,
+from sweep.analysis.answers.dataset_lookup import (
+    JOIN_REMEDY,
+    SPECS_ATTRIBUTE,
     STUDY_ID,
-    marker_of,
-    markers,
+    marker_name,
+    marker_names,
     parameter_coordinate,
-    si,
-    study_of,
+    spec_of_dataset,
+    to_si,
 )
-from sweep.spec import SceneSpec, Spec
-from sweep.spec.axes import Member, values_in
-from sweep.spec.rules import Numeric
+from sweep.spec import GridSpec, SceneSpec
+from sweep.spec.axes import AxisParameter, convert_from_si
+from sweep.spec.rules import NumericRule
 from sweep.spec.sections import parameter_rules
 
-CLOSE = 1e-9
+RELATIVE_TOLERANCE = 1e-9
 """Relative tolerance for matching a value to one of an axis."""
 
 
-def answer_per_study(
-    dataset: xr.Dataset, answer: Callable[[xr.Dataset], Any], *, every_axis: bool
+def compute_answer_per_study(
+    dataset: xr.Dataset, answer: Callable[[xr.Dataset], Any], *, require_axes: bool
 ) -> Any:
     """Compute an answer from a dataset of one study, or for each design of a join.
 
@@ -48,7 +48,7 @@ def answer_per_study(
         A dataset of `sweep.open`, or a selection of it.
     answer
         Function of the dataset of a single study.
-    every_axis
+    require_axes
         Whether the answer uses the study's parameters, so that each axis must have its coordinate.
 
     Returns
@@ -62,47 +62,49 @@ def answer_per_study(
     ValueError
         The dataset does not prove that it is one study's.
     """
-    of_sweep = {STUDY_ID, SPECS, "spec", "model_version", *markers(dataset)}
-    if not every_axis and not of_sweep & {*dataset.coords, *dataset.attrs}:
+    names_from_sweep = {STUDY_ID, SPECS_ATTRIBUTE, "spec", "model_version", *marker_names(dataset)}
+    if not require_axes and not names_from_sweep & {*dataset.coords, *dataset.attrs}:
         return answer(dataset)  # arrays of no study, of which nothing but the arrays is used
     dim = _join_dimension(dataset)
     if not dim:
-        return answer(proven(dataset, every_axis=every_axis))
+        return answer(check_single_study(dataset, require_axes=require_axes))
     answers = [
-        answer(proven(dataset.isel({dim: place}), every_axis=every_axis))
-        for place in range(dataset.sizes[dim])
+        answer(check_single_study(dataset.isel({dim: design_index}), require_axes=require_axes))
+        for design_index in range(dataset.sizes[dim])
     ]
-    names = dataset[dim]
-    answers = [found.drop_vars([dim, STUDY_ID], errors="ignore") for found in answers]
-    if any("vertex" in found.dims for found in answers):
-        parts = [
-            found.assign({dim: ("vertex", np.repeat(name, found.sizes["vertex"]))})
-            for name, found in zip(names.values, answers, strict=True)
+    design_names = dataset[dim]
+    answers = [
+        design_answer.drop_vars([dim, STUDY_ID], errors="ignore") for design_answer in answers
+    ]
+    if any("vertex" in design_answer.dims for design_answer in answers):
+        contours = [
+            design_answer.assign({dim: ("vertex", np.repeat(name, design_answer.sizes["vertex"]))})
+            for name, design_answer in zip(design_names.values, answers, strict=True)
         ]
-        return xr.concat(parts, "vertex", combine_attrs="drop_conflicts")
-    result = join_along(answers, dim, names.values.tolist())
+        return xr.concat(contours, "vertex", combine_attrs="drop_conflicts")
+    result = concatenate_designs(answers, dim, design_names.values.tolist())
     result = result.assign_coords({STUDY_ID: dataset[STUDY_ID]})
     return result.assign_attrs(dataset.attrs) if isinstance(result, xr.Dataset) else result
 
 
-def proven(dataset: xr.Dataset, *, every_axis: bool) -> xr.Dataset:
+def check_single_study(dataset: xr.Dataset, *, require_axes: bool) -> xr.Dataset:
     """Check that a dataset is one study's; return it with coordinate attributes restored.
 
     Raises
     ------
     ValueError
         It is of no or several studies, its coordinates were changed, a dimension is no axis, or
-        (with ``every_axis``) the coordinate of an axis is missing.
+        (with ``require_axes``) the coordinate of an axis is missing.
     """
-    _join_dimension(dataset, refuse=True)
-    spec = study_of(dataset)
-    dataset = _with_attributes(dataset, spec)
-    if SPECS in dataset.attrs:
-        dataset = _of_design(dataset, spec)
+    _join_dimension(dataset, refuse_join=True)
+    spec = spec_of_dataset(dataset)
+    dataset = _restore_coordinate_attributes(dataset, spec)
+    if SPECS_ATTRIBUTE in dataset.attrs:
+        dataset = _select_design(dataset, spec)
     _check_coordinates(dataset, spec)
     _check_dimensions(dataset, spec)
-    if every_axis:
-        check_axes(dataset, spec)
+    if require_axes:
+        check_axis_coordinates(dataset, spec)
         if "effects" in dataset and dataset["effects"].dtype.kind not in "iu":
             raise ValueError(
                 "'effects' has no flags any more: an operation such as mean, shift or rolling has "
@@ -111,128 +113,150 @@ def proven(dataset: xr.Dataset, *, every_axis: bool) -> xr.Dataset:
     return dataset
 
 
-def check_axes(dataset: xr.Dataset, spec: Spec | SceneSpec) -> None:
+def check_axis_coordinates(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> None:
     """Raise a ValueError if the coordinate of an axis is missing, so that its value is unknown."""
-    for member in _members(spec):
-        if parameter_coordinate(dataset, member.path) is None:
+    for axis_parameter in _axis_parameters(spec):
+        if parameter_coordinate(dataset, axis_parameter.path) is None:
             raise ValueError(
-                f"the dataset lacks the coordinate {member.name} ({member.path}), an axis of its "
+                f"the dataset lacks the coordinate {axis_parameter.coordinate} "
+                f"({axis_parameter.path}), an axis of its "
                 "study: it was dropped, or averaged or summed over. Select one value and keep it: "
-                f"ds.sweep.sel({member.name}=...), or isel without drop=True"
+                f"ds.sweep.sel({axis_parameter.coordinate}=...), or isel without drop=True"
             )
 
 
-def _join_dimension(dataset: xr.Dataset, *, refuse: bool = False) -> str:
+def _join_dimension(dataset: xr.Dataset, *, refuse_join: bool = False) -> str:
     """Return the dimension along which a dataset joins studies, or '' for a single study.
 
-    Raises a ValueError if the dataset proves neither; with ``refuse`` also for a join.
+    Raises a ValueError if the dataset proves neither; with ``refuse_join`` also for a join.
     """
     if STUDY_ID not in dataset.coords:
         raise ValueError(
             f"the dataset lacks the coordinate '{STUDY_ID}', which proves that it is one study's: "
             "it is no dataset of sweep.open, or is made of several studies. Take one that "
-            f"sweep.open gave, or {HOW_TO_JOIN}"
+            f"sweep.open gave, or {JOIN_REMEDY}"
         )
-    identity = dataset[STUDY_ID]
-    if not identity.dims:
+    study_id_coord = dataset[STUDY_ID]
+    if not study_id_coord.dims:
         return ""
-    dim = str(identity.dims[0])
-    if not refuse and identity.ndim == 1 and SPECS in dataset.attrs and dim in dataset.coords:
+    dim = str(study_id_coord.dims[0])
+    if (
+        not refuse_join
+        and study_id_coord.ndim == 1
+        and SPECS_ATTRIBUTE in dataset.attrs
+        and dim in dataset.coords
+    ):
         return dim
-    studies = ", ".join(str(value)[:8] for value in dict.fromkeys(identity.values.ravel().tolist()))
-    remedy = f"it has the spec of the first alone; {HOW_TO_JOIN}"
-    if SPECS in dataset.attrs:
+    short_ids = ", ".join(
+        str(value)[:8] for value in dict.fromkeys(study_id_coord.values.ravel().tolist())
+    )
+    remedy = f"it has the spec of the first alone; {JOIN_REMEDY}"
+    if SPECS_ATTRIBUTE in dataset.attrs:
         remedy = f"select one of them, ds.isel({dim}=0)"
     raise ValueError(
-        f"the dataset is put together along '{dim}' of the studies {studies}: {remedy}"
+        f"the dataset is put together along '{dim}' of the studies {short_ids}: {remedy}"
     )
 
 
-def _members(spec: Spec | SceneSpec) -> list[Member]:
+def _axis_parameters(spec: GridSpec | SceneSpec) -> list[AxisParameter]:
     """Return the parameters on the axes of a study."""
-    return [member for axis in spec.axes for member in axis.members]
+    return [axis_parameter for axis in spec.axes for axis_parameter in axis.parameters]
 
 
-def _with_attributes(dataset: xr.Dataset, spec: Spec | SceneSpec) -> xr.Dataset:
+def _restore_coordinate_attributes(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> xr.Dataset:
     """Restore path and units of coordinates where an operation dropped both."""
-    restored = {}
-    for member in _members(spec):
-        array = dataset.coords.get(member.name)
-        if array is not None and not {"path", "units"} & set(array.attrs):
-            restored[member.name] = array.assign_attrs(path=member.path, units=member.units)
-    return dataset.assign_coords(restored) if restored else dataset
+    restored_coords = {}
+    for axis_parameter in _axis_parameters(spec):
+        coord = dataset.coords.get(axis_parameter.coordinate)
+        if coord is not None and not {"path", "units"} & set(coord.attrs):
+            restored_coords[axis_parameter.coordinate] = coord.assign_attrs(
+                path=axis_parameter.path, units=axis_parameter.units
+            )
+    return dataset.assign_coords(restored_coords) if restored_coords else dataset
 
 
-def _is_of_study(array: xr.DataArray, spec: Spec | SceneSpec) -> np.ndarray:
+def _is_value_of_study(coord: xr.DataArray, spec: GridSpec | SceneSpec) -> np.ndarray:
     """Return whether the study has each value of a parameter's coordinate, bool array."""
-    path = array.attrs["path"]
-    on_axis = [np.asarray(member.values) for member in _members(spec) if member.path == path]
-    allowed = on_axis[0] if on_axis else np.atleast_1d(spec.parameters()[path])
-    values = np.atleast_1d(si(array).values)
-    if allowed.dtype.kind not in "fiu" or values.dtype.kind not in "fiu":
-        return np.isin(values.astype(str), allowed.astype(str))
-    allowed = np.sort(allowed.astype(float))
-    place = np.searchsorted(allowed, values).clip(1, max(allowed.size - 1, 1))
-    nearest = np.stack([allowed[place - 1], allowed[place.clip(max=allowed.size - 1)]])
+    path = coord.attrs["path"]
+    axis_values = [
+        np.asarray(axis_parameter.values)
+        for axis_parameter in _axis_parameters(spec)
+        if axis_parameter.path == path
+    ]
+    study_values = axis_values[0] if axis_values else np.atleast_1d(spec.parameters()[path])
+    values = np.atleast_1d(to_si(coord).values)
+    if study_values.dtype.kind not in "fiu" or values.dtype.kind not in "fiu":
+        return np.isin(values.astype(str), study_values.astype(str))
+    study_values = np.sort(study_values.astype(float))
+    insertion_index = np.searchsorted(study_values, values).clip(1, max(study_values.size - 1, 1))
+    neighbours = np.stack(
+        [
+            study_values[insertion_index - 1],
+            study_values[insertion_index.clip(max=study_values.size - 1)],
+        ]
+    )
     return np.asarray(
-        (np.abs(nearest - values) <= CLOSE * np.maximum(np.abs(values), np.abs(nearest))).any(
-            axis=0
-        )
+        (
+            np.abs(neighbours - values)
+            <= RELATIVE_TOLERANCE * np.maximum(np.abs(values), np.abs(neighbours))
+        ).any(axis=0)
     )
 
 
-def _parameter_coordinates(dataset: xr.Dataset, spec: Spec | SceneSpec) -> list[xr.DataArray]:
+def _parameter_coordinates(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> list[xr.DataArray]:
     """Return the coordinates that are parameters of a study."""
-    known = spec.parameters()
-    axes = {member.path for member in _members(spec)}
-    return [array for array in dataset.coords.values()
-            if array.attrs.get("path") in axes | known.keys()]  # fmt: skip
+    fixed_parameters = spec.parameters()
+    axis_paths = {axis_parameter.path for axis_parameter in _axis_parameters(spec)}
+    return [coord for coord in dataset.coords.values()
+            if coord.attrs.get("path") in axis_paths | fixed_parameters.keys()]  # fmt: skip
 
 
-def _check_coordinates(dataset: xr.Dataset, spec: Spec | SceneSpec) -> None:
+def _check_coordinates(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> None:
     """Refuse coordinates with values that the study does not have."""
-    for array in _parameter_coordinates(dataset, spec):
-        is_of_study = _is_of_study(array, spec)
-        if SPECS in dataset.attrs and not array.dims:
+    for coord in _parameter_coordinates(dataset, spec):
+        is_value_known = _is_value_of_study(coord, spec)
+        if SPECS_ATTRIBUTE in dataset.attrs and not coord.dims:
             continue  # a value of another design: there this one has no point
-        if not is_of_study.all():
-            value = np.atleast_1d(array.values)[np.argmin(is_of_study)]
-            shown = labels.quantity(value, str(array.attrs.get("units", "")))
+        if not is_value_known.all():
+            value = np.atleast_1d(coord.values)[np.argmin(is_value_known)]
+            value_text = labels.format_quantity(value, str(coord.attrs.get("units", "")))
             raise ValueError(
-                f"{array.name} has the value {shown}, which its study does not have: the "
+                f"{coord.name} has the value {value_text}, which its study does not have: the "
                 "coordinate was changed, averaged or interpolated. Use the values that sweep.open "
                 "gave"
             )
 
 
-def _check_dimensions(dataset: xr.Dataset, spec: Spec | SceneSpec) -> None:
+def _check_dimensions(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> None:
     """Raise a ValueError if a dimension is neither an axis nor that of a parameter's coordinate."""
-    known = {axis.name for axis in spec.axes} | {"shot", "draw", "return_number", "statistic"}
-    known |= {str(dim) for array in _parameter_coordinates(dataset, spec) for dim in array.dims}
-    foreign = [
-        dim for array in dataset.data_vars.values() for dim in array.dims if dim not in known
+    known_dims = {axis.name for axis in spec.axes} | {"shot", "draw", "return_number", "statistic"}
+    known_dims |= {
+        str(dim) for array in _parameter_coordinates(dataset, spec) for dim in array.dims
+    }
+    unknown_dims = [
+        dim for array in dataset.data_vars.values() for dim in array.dims if dim not in known_dims
     ]
-    if foreign and isinstance(spec, Spec):
+    if unknown_dims and isinstance(spec, GridSpec):
         raise ValueError(
-            f"'{foreign[0]}' is no axis of the study: the dataset is stacked from several, or "
-            f"expanded. Select one value along it, or {HOW_TO_JOIN}"
+            f"'{unknown_dims[0]}' is no axis of the study: the dataset is stacked from several, or "
+            f"expanded. Select one value along it, or {JOIN_REMEDY}"
         )
 
 
 # Joins of several studies
 
 
-def _of_design(dataset: xr.Dataset, spec: Spec | SceneSpec) -> xr.Dataset:
+def _select_design(dataset: xr.Dataset, spec: GridSpec | SceneSpec) -> xr.Dataset:
     """Reduce one design of a join to the points and variables of its study."""
-    stored = json.loads(dataset.attrs[SPECS])[str(dataset[STUDY_ID].item())]
-    dataset = dataset.drop_vars(set(dataset.data_vars) - set(stored["variables"]))
-    for array in _parameter_coordinates(dataset, spec):
-        if array.name in dataset.dims:
-            dataset = dataset.isel({array.name: np.flatnonzero(_is_of_study(array, spec))})
+    design_record = json.loads(dataset.attrs[SPECS_ATTRIBUTE])[str(dataset[STUDY_ID].item())]
+    dataset = dataset.drop_vars(set(dataset.data_vars) - set(design_record["variables"]))
+    for coord in _parameter_coordinates(dataset, spec):
+        if coord.name in dataset.dims:
+            dataset = dataset.isel({coord.name: np.flatnonzero(_is_value_of_study(coord, spec))})
     return dataset
 
 
-def joined(datasets: Mapping[str, xr.Dataset], dim: str) -> xr.Dataset:
+def join_designs(datasets: Mapping[str, xr.Dataset], dim: str) -> xr.Dataset:
     """Join the datasets of several studies along a new dimension, each a design.
 
     Parameters
@@ -254,128 +278,143 @@ def joined(datasets: Mapping[str, xr.Dataset], dim: str) -> xr.Dataset:
     ValueError
         The name of the dimension is taken, one study comes twice, or zipped axes differ.
     """
-    specs = {name: study_of(dataset) for name, dataset in datasets.items()}
-    _check_names(datasets, dim)
-    reference = _reference_coordinates(datasets)
-    parts = [_aligned(datasets[name], specs[name], reference) for name in datasets]
-    order = list(dict.fromkeys(str(d) for part in parts for d in part.dims))
-    parts = [part.transpose(*[d for d in order if d in part.dims]) for part in parts]
-    identities = [part[STUDY_ID].item() for part in parts]
-    parts = [part.drop_vars([STUDY_ID, *markers(part)]) for part in parts]
-    result = join_along(parts, dim, list(datasets))
-    result = result.assign_coords({STUDY_ID: (dim, identities), marker_of(identities): True})
-    result.attrs = _attributes_of_join(datasets)
+    specs = {name: spec_of_dataset(dataset) for name, dataset in datasets.items()}
+    _check_join_names(datasets, dim)
+    reference_coords = _reference_coordinates(datasets)
+    aligned = [
+        _align_coordinates(datasets[name], specs[name], reference_coords) for name in datasets
+    ]
+    dim_order = list(dict.fromkeys(str(d) for part in aligned for d in part.dims))
+    aligned = [part.transpose(*[d for d in dim_order if d in part.dims]) for part in aligned]
+    study_ids = [part[STUDY_ID].item() for part in aligned]
+    aligned = [part.drop_vars([STUDY_ID, *marker_names(part)]) for part in aligned]
+    result = concatenate_designs(aligned, dim, list(datasets))
+    result = result.assign_coords({STUDY_ID: (dim, study_ids), marker_name(study_ids): True})
+    result.attrs = _joined_attributes(datasets)
     return result
 
 
-_SUMMED = ("points", "points_committed", "blocks", "blocks_committed")
+_SUMMED_ATTRIBUTES = ("points", "points_committed", "blocks", "blocks_committed")
 
 
-def _attributes_of_join(datasets: Mapping[str, xr.Dataset]) -> dict[str, Any]:
+def _joined_attributes(datasets: Mapping[str, xr.Dataset]) -> dict[str, Any]:
     """Return the attributes of a join: common ones, summed counts, and all specs."""
-    first, *others = (dataset.attrs for dataset in datasets.values())
-    common = {
-        key: value for key, value in first.items()
-        if key != "spec" and all(str(own.get(key)) == str(value) for own in others)
-    }  # fmt: skip
+    first_attributes, *other_attributes = (dataset.attrs for dataset in datasets.values())
+    common_attributes = {
+        key: value
+        for key, value in first_attributes.items()
+        if key != "spec"
+        and all(str(attributes.get(key)) == str(value) for attributes in other_attributes)
+    }
     specs = {
         dataset[STUDY_ID].item(): {
             "spec": dataset.attrs["spec"], "variables": [str(name) for name in dataset.data_vars],
         }
         for dataset in datasets.values()
     }  # fmt: skip
-    return common | {
+    return common_attributes | {
         "title": f"Designs: {', '.join(datasets)}",
-        SPECS: json.dumps(specs, ensure_ascii=False),
-        **{key: sum(int(d.attrs[key]) for d in datasets.values()) for key in _SUMMED},
+        SPECS_ATTRIBUTE: json.dumps(specs, ensure_ascii=False),
+        **{key: sum(int(d.attrs[key]) for d in datasets.values()) for key in _SUMMED_ATTRIBUTES},
     }
 
 
-def _check_names(datasets: Mapping[str, xr.Dataset], dim: str) -> None:
+def _check_join_names(datasets: Mapping[str, xr.Dataset], dim: str) -> None:
     """Raise a ValueError if the dimension's name is taken, or a study occurs twice."""
-    taken = {str(name) for d in datasets.values() for name in [*d.dims, *d.coords, *d.data_vars]}
-    if not dim.isidentifier() or dim in taken:
+    used_names = {
+        str(name) for d in datasets.values() for name in [*d.dims, *d.coords, *d.data_vars]
+    }
+    if not dim.isidentifier() or dim in used_names:
         raise ValueError(f"'{dim}' can't name the dimension of designs: it is taken, or no word")
-    identities: dict[str, str] = {}
+    name_by_study_id: dict[str, str] = {}
     for name, dataset in datasets.items():
-        twin = identities.setdefault(dataset[STUDY_ID].item(), name)
-        if twin != name:
-            raise ValueError(f"the designs '{twin}' and '{name}' are the same study")
+        first_name = name_by_study_id.setdefault(dataset[STUDY_ID].item(), name)
+        if first_name != name:
+            raise ValueError(f"the designs '{first_name}' and '{name}' are the same study")
 
 
 def _reference_coordinates(datasets: Mapping[str, xr.Dataset]) -> dict[str, xr.DataArray]:
     """Return for each parameter path the coordinate of the first dataset that has one."""
-    found: dict[str, xr.DataArray] = {}
+    coord_by_path: dict[str, xr.DataArray] = {}
     for dataset in datasets.values():
-        for array in dataset.coords.values():
-            if "path" in array.attrs:
-                found.setdefault(str(array.attrs["path"]), array)
-    return found
+        for coord in dataset.coords.values():
+            if "path" in coord.attrs:
+                coord_by_path.setdefault(str(coord.attrs["path"]), coord)
+    return coord_by_path
 
 
-def _aligned(
-    dataset: xr.Dataset, spec: Spec | SceneSpec, reference: Mapping[str, xr.DataArray]
+def _align_coordinates(
+    dataset: xr.Dataset, spec: GridSpec | SceneSpec, reference_coords: Mapping[str, xr.DataArray]
 ) -> xr.Dataset:
-    """Give a dataset the coordinates of ``reference``, in their names and units."""
-    for path, like in reference.items():
-        array = parameter_coordinate(dataset, path)
-        if like.name not in like.dims:
+    """Give a dataset the coordinates of ``reference_coords``, in their names and units."""
+    for path, reference_coord in reference_coords.items():
+        coord = parameter_coordinate(dataset, path)
+        if reference_coord.name not in reference_coord.dims:
             if (
-                array is None
-                or array.dims != like.dims
-                or not np.array_equal(array.values, like.values)
+                coord is None
+                or coord.dims != reference_coord.dims
+                or not np.array_equal(coord.values, reference_coord.values)
             ):
                 raise ValueError(
-                    f"the studies differ along the zipped axis '{like.dims[0]}', whose values "
+                    f"the studies differ along the zipped axis '{reference_coord.dims[0]}', whose "
+                    "values "
                     "can't be matched one by one: join studies with the same one"
                 )
             continue
-        units = str(like.attrs.get("units", ""))
-        if array is None:
-            value = _displayed(np.atleast_1d(spec.parameters()[path]), path, units)
-            dataset = dataset.expand_dims({str(like.name): value})
-        elif array.name not in array.dims:
+        units = str(reference_coord.attrs.get("units", ""))
+        if coord is None:
+            axis_values = _to_display_units(np.atleast_1d(spec.parameters()[path]), path, units)
+            dataset = dataset.expand_dims({str(reference_coord.name): axis_values})
+        elif coord.name not in coord.dims:
             raise ValueError(
-                f"{array.name} is on the zipped axis '{array.dims[0]}' of one study and an axis by "
+                f"{coord.name} is on the zipped axis '{coord.dims[0]}' of one study and an axis by "
                 "itself in another: join studies with the same axes"
             )
         else:
-            if array.attrs.get("units", "") != units:
-                value = _displayed(np.asarray(si(array).values), path, units)
-                dataset = dataset.assign_coords({array.name: value})
-            if array.name != like.name:
-                dataset = dataset.rename({array.name: like.name})
-        dataset[like.name].attrs = dict(like.attrs)
+            if coord.attrs.get("units", "") != units:
+                axis_values = _to_display_units(np.asarray(to_si(coord).values), path, units)
+                dataset = dataset.assign_coords({coord.name: axis_values})
+            if coord.name != reference_coord.name:
+                dataset = dataset.rename({coord.name: reference_coord.name})
+        dataset[reference_coord.name].attrs = dict(reference_coord.attrs)
     return dataset
 
 
-def _displayed(values: np.ndarray, path: str, units: str) -> np.ndarray:
+def _to_display_units(si_values: np.ndarray, path: str, units: str) -> np.ndarray:
     """Convert SI values to display units; return words unchanged."""
     rule = parameter_rules()[path]
-    if not isinstance(rule, Numeric) or not units:
-        return values
-    return values_in(rule.exact(f"1 {units}")[1], values)
+    if not isinstance(rule, NumericRule) or not units:
+        return si_values
+    return convert_from_si(rule.read_exact(f"1 {units}")[1], si_values)
 
 
-def join_along(parts: Sequence[Any], dim: str, names: Sequence[str]) -> Any:
+def concatenate_designs(designs: Sequence[Any], dim: str, design_names: Sequence[str]) -> Any:
     """Concatenate datasets or arrays along a new dimension; missing points get a fill value."""
-    fills: Any = np.nan
-    if isinstance(parts[0], xr.Dataset):
-        variables = {name: array for part in parts for name, array in part.data_vars.items()}
-        fills = {name: _FILLS.get(array.dtype.kind, np.nan) for name, array in variables.items()}
-        parts = [
-            part.assign({
-                name: xr.full_like(array.isel(dict.fromkeys(array.dims, 0), drop=True), fills[name])
-                for name, array in variables.items() if name not in part
-            })
-            for part in parts
-        ]  # fmt: skip
+    fill_values: Any = np.nan
+    if isinstance(designs[0], xr.Dataset):
+        variables = {name: array for part in designs for name, array in part.data_vars.items()}
+        fill_values = {
+            name: _MISSING_VALUE_BY_KIND.get(array.dtype.kind, np.nan)
+            for name, array in variables.items()
+        }
+        designs = [
+            part.assign(
+                {
+                    name: xr.full_like(
+                        array.isel(dict.fromkeys(array.dims, 0), drop=True), fill_values[name]
+                    )
+                    for name, array in variables.items()
+                    if name not in part
+                }
+            )
+            for part in designs
+        ]
     return xr.concat(
-        parts, xr.DataArray(np.asarray(names, str), dims=[dim], name=dim), data_vars="all",
-        coords="minimal", compat="override", join="outer", fill_value=fills,
+        designs, xr.DataArray(np.asarray(design_names, str), dims=[dim], name=dim), data_vars="all",
+        coords="minimal", compat="override", join="outer", fill_value=fill_values,
         combine_attrs="drop_conflicts",
     )  # fmt: skip
 
 
-_FILLS = {"i": -1, "u": 0, "b": False}
+_MISSING_VALUE_BY_KIND = {"i": -1, "u": 0, "b": False}
 """Fill values of points that a design lacks, by NumPy kind; nan for other kinds."""

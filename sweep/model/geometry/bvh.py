@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sweep.kernels import njit
+from sweep.kernel_cache import njit
 
 WIDTH = 8
 """Children of a node: one vector of float64 with AVX-512, two with AVX2."""

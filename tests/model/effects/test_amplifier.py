@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from effect_points import points_of
+from random_planner_points import planner_inputs
 
 from sweep.model import shot
 from sweep.model.effects.amplifier import BOTH, current_variance, emission, emission_size
@@ -77,7 +77,7 @@ def test_a_shot_has_as_much_noise_more_as_the_law_says_of_its_receiver(table_4_1
     more = noisy.noise_sources["spontaneous_emission"]
     assert more / own_shot == pytest.approx(2 * 1.1 * on_detector / 1.602176634e-19, rel=1e-9)
     assert noisy.quiet_variance == pytest.approx(bare.quiet_variance + more)
-    size = emission_size(points_of(parameters))
+    size = emission_size(planner_inputs(parameters))
     assert size.noise == pytest.approx(more / sum(
         value for name, value in bare.noise_sources.items() if name != "signal_shot"
     ))  # fmt: skip
@@ -87,6 +87,6 @@ def test_a_shot_has_as_much_noise_more_as_the_law_says_of_its_receiver(table_4_1
 
 
 def test_nothing_is_there_without_an_amplifier_or_a_local_oscillator(table_4_1):
-    assert emission_size(points_of(table_4_1())) is None
+    assert emission_size(planner_inputs(table_4_1())) is None
     amplified = {"instrument.laser.spontaneous_emission": 1.6}
-    assert emission_size(points_of(table_4_1(architecture="direct") | amplified)) is None
+    assert emission_size(planner_inputs(table_4_1(architecture="direct") | amplified)) is None

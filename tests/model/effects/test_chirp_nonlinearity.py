@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from effect_points import points_of, shots_of
+from random_planner_points import planner_inputs, prepare_single_category
 
 from sweep.model.effects import phase_errors
 from sweep.model.effects.sweep_table import sweep_table
@@ -97,7 +97,7 @@ def test_a_ripple_in_a_table_is_that_of_the_whole_record(table_4_1, delayed):
     text = table_of(lambda t: (RIPPLE * np.sin(turn * t + 0.3)).tolist())
     p = table_4_1(range=range_, acquisition_delay=delayed, fft_size=2**17, window="hann")
     p = p | {phase_errors.ERROR_TABLE: text}
-    shots = shots_of(p, ("chirp_nonlinearity",))
+    shots = prepare_single_category(p, ("chirp_nonlinearity",))
     delay, rate, length = 2 * range_ / LIGHT, 6e8, shots.window.length
     t = delayed + np.arange(length) / rate
 
@@ -132,7 +132,7 @@ def test_a_ripple_in_a_table_is_that_of_the_whole_record(table_4_1, delayed):
 def test_a_tables_size_covers_what_it_does_to_the_record(table_4_1):
     text = table_of(lambda t: (2e3 + RIPPLE * np.sin(4e4 * t)).tolist())
     p = table_4_1(range=np.array([100.0, 3000.0]), radial_velocity=30.0)
-    smear = phase_errors.sweep_smear(points_of(p | {phase_errors.ERROR_TABLE: text}))
+    smear = phase_errors.sweep_smear(planner_inputs(p | {phase_errors.ERROR_TABLE: text}))
     x, t = np.linspace(-1, 1, 4001), 2**17 / 6e8
     psi = phase_errors.table_phase(
         x, table=sweep_table(text), sign=1, chirp_duration=CHIRP,

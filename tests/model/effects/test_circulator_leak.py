@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from effect_points import shots_of
+from random_planner_points import prepare_single_category
 
 from sweep.model import shot
 from sweep.model.effects import circulator_leak as leak
@@ -30,7 +30,9 @@ def leaking(table_4_1):
 @pytest.mark.parametrize(("segment", "sign"), [(0, 1), (1, 0), (2, -1)])
 def test_the_line_is_that_of_simulated_records(leaking, segment, sign, record):
     further = {"instrument.receiver.record": record}
-    shots = shots_of(leaking(path=40.0, further=further, range=1500.0, fft_size=2**14), WITH)
+    shots = prepare_single_category(
+        leaking(path=40.0, further=further, range=1500.0, fft_size=2**14), WITH
+    )
     scale, line = leak.line_of(shots, 0, segment)
     # By hand: 2 Re sqrt(P_lo P_tx / I) [A] by 7 kohm, two poles of 400 MHz, at S d / c.
     beat = -sign * 1e9 / 500e-6 * 40.0 / LIGHT
@@ -97,7 +99,7 @@ def test_leaked_light_makes_shot_noise_and_the_beats_noise(leaking):
         "instrument.laser.relative_intensity_noise": 1e-15,
         "instrument.receiver.common_mode_rejection": 300.0,
     }  # fmt: skip
-    sources = shots_of(leaking(further=laser), WITH).noise_sources
+    sources = prepare_single_category(leaking(further=laser), WITH).noise_sources
     light, volts = 1 / ISOLATION, 7e3**2
     assert sources["leak_shot"] == pytest.approx(2 * CHARGE * 1.1 * light * 4e8 * volts)
     power = (2 * 1.1) ** 2 * 1e-3 * light / 2  # of the beat [A^2]
@@ -125,7 +127,7 @@ def test_skirts_raise_alarms_as_often_as_in_simulated_records(leaking, monkeypat
         path=7.3, isolation=10**9.3, window="rectangular", fft_size=2**12, tnr=8.0,
         reflectance=1e-12, range=2000.0,
     )  # fmt: skip
-    shots = shots_of(p, WITH)
+    shots = prepare_single_category(p, WITH)
     scale, line = leak.line_of(shots, 0, 0)
     level, sigma = float(shots.threshold[0]), float(shots.bin_deviation[0])
     rng, number, size = np.random.default_rng(8), 5_000, 2**12

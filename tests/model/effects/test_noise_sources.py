@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from effect_points import points_of
+from random_planner_points import planner_inputs
 
 from sweep.model import shot, window
 from sweep.model.effects.noise_sources import current_variance, echo_size, sun_size
@@ -38,7 +38,7 @@ def test_the_share_of_sunlight_by_radiometry_of_the_patch_seen(table_4_1):
         solar_irradiance=2.6e8, reflectance=1.0, range=1000.0, beam_divergence=1e-3, fft_size=1024,
         optical_efficiency=0.8,
     )  # fmt: skip
-    found = sun_size(points_of(scene))
+    found = sun_size(planner_inputs(scene))
     assert found.threshold_follows
     assert found.noise == pytest.approx(0.8 * 1.125e-19 / OTHERS, rel=1e-3)
 
@@ -50,7 +50,7 @@ def test_false_alarms_rise_below_five_metres_as_the_thesis_reports(table_4_1):
     """
     distance = np.array([1.0, 2.0, 5.0, 20.0])
     parameters = table_4_1(range=distance, fft_size=1024, radial_velocity=10.0)
-    found = echo_size(points_of(parameters))
+    found = echo_size(planner_inputs(parameters))
     share = 1.40992e-13 / OTHERS * 1.953125e-12 * (2000.0 / distance) ** 2 / 1e-3
     np.testing.assert_allclose(found.noise, share, rtol=1e-4)
     assert not found.threshold_follows

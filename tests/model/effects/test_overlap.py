@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from effect_points import kept_in, planned, points_of
+from random_planner_points import effects_kept_in_tile, plan_points, planner_inputs
 
 from sweep.model import sampling, segments, shot, truth
 from sweep.model.constants import SPEED_OF_LIGHT
@@ -203,14 +203,14 @@ def test_plans_of_random_instruments_keep_the_tolerance_of_the_truth(table_4_1, 
             power=10 ** rng.uniform(-6, -1, number),
         ) | {"footprint.speckle": "none"}  # fmt: skip
         modes = {"range_walk": "off", "acceleration": "off"}
-        made = planned(points_of(scene), modes, tolerance)
+        made = plan_points(planner_inputs(scene), modes, tolerance)
         row = made.names.index("overlap")
         kept, dropped = kept + made.kept[row].sum(), dropped + (~made.kept[row]).sum()
         for i in range(number):
             one = {path: v[i : i + 1] if np.ndim(v) else v for path, v in scene.items()}
             shots = shots_of(one, "segment_motion")
             exact = truth.find(shots, range_walk=False)
-            found = shot.find(*(s for _, s in shot.prepare(one, kept_in(made, i))))
+            found = shot.find(*(s for _, s in shot.prepare(one, effects_kept_in_tile(made, i))))
             allowed = tolerance + made.error[i]
             assert np.nansum(abs(found[:, 0] - exact[:, 0])) <= allowed + 1e-9
             off = abs(found[:, 2] - exact[:, 2]) / np.maximum(exact[:, 2], shots.bin_deviation)
@@ -229,8 +229,8 @@ def test_what_beamlets_at_other_ranges_leave_is_bounded(table_4_1):
     )  # fmt: skip
     shots = shots_of(scene)
     fast, exact = shot.find(shots), truth.find(shots, range_walk=False)
-    made = planned(points_of(scene), {}, 0.0)
-    left = overlap.left(points_of(scene))
+    made = plan_points(planner_inputs(scene), {}, 0.0)
+    left = overlap.left(planner_inputs(scene))
     assert (left > 0).any() and (made.error > 0).any()
     off = abs(fast[:, 2] - exact[:, 2]) / np.maximum(exact[:, 2], shots.bin_deviation)
     assert (np.nanmax(off, axis=0) <= made.error + 1e-9).all()
@@ -254,7 +254,7 @@ def test_one_number_of_samples_for_all_beamlets_is_within_its_bound(table_4_1, n
         sample_rate=rate, duration=duration, reflectance_law="lambert",
         bandwidth=10 ** rng.uniform(7, 8), power=1.0, tnr=5.0, radial_velocity=0.0,
     )  # fmt: skip
-    shots, bound = shots_of(scene), np.atleast_2d(overlap.left(points_of(scene)))
+    shots, bound = shots_of(scene), np.atleast_2d(overlap.left(planner_inputs(scene)))
     for i in range(shots.size):
         for row, segment in enumerate(np.flatnonzero(shots.segments).tolist()):
             off = difference(shots, i, segment, range_walk=False)
@@ -269,7 +269,7 @@ def test_looks_that_begin_before_the_middle_one_are_within_its_bound(table_4_1):
         radial_velocity=3000.0,
     ) | {"instrument.looks.number": 16}  # fmt: skip
     ((_, shots),) = shot.prepare(scene, (*WITH_OVERLAP, "segment_motion"))
-    bound = float(np.ravel(overlap.left(points_of(scene)))[0])
+    bound = float(np.ravel(overlap.left(planner_inputs(scene)))[0])
     first = segment_motion.looks_of(shots)[0]
     assert 0 < bound < 0.05
     assert difference(first, 0, 0, range_walk=False) <= bound + AGREEMENT
@@ -285,7 +285,7 @@ def test_leakage_of_an_echo_that_begins_with_a_step_is_within_its_size(table_4_1
             range=rng.uniform(30.0, 2000.0, 30), power=10 ** rng.uniform(-6, 1, 30),
             tnr=rng.uniform(3, 9, 30), radial_velocity=0.0,
         )  # fmt: skip
-        made = planned(points_of(scene), {}, 0.0)
+        made = plan_points(planner_inputs(scene), {}, 0.0)
         most = made.change[made.names.index("leakage")]
         found = shot.find(shots_of(scene))
         extra = np.nansum(found[:, 5], axis=0)

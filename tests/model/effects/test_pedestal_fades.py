@@ -5,7 +5,7 @@ Each record has its own random walk theta. The beat has the phase theta(t) - the
 
 import numpy as np
 import pytest
-from engine import keys
+from shot_helpers import make_point_keys
 
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.detectors import main_lobe
@@ -135,7 +135,7 @@ def test_a_pedestal_fades_with_its_line_and_detects(
 @pytest.mark.parametrize("law", ["none", "developed"])
 def test_draws_detect_by_the_pedestal_as_probabilities_say(law, table_4_1):
     p = parameters_of(table_4_1, 300e3, 150.0, law, "any_bin", 1.3)
-    chosen, given = effects_of(law), {"keys": keys(1)}
+    chosen, given = effects_of(law), {"keys": make_point_keys(1)}
     expected = float(evaluate(p, chosen)["pd_up"][0])
     for method, draws, slack in (
         ("probabilities", 20_000, 0.0), ("noise", 20_000, 0.02), ("spectra", 1000, 0.02)

@@ -4,9 +4,14 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from effect_points import kept_in, planned, points_of, scene
 from hypothesis import given
 from hypothesis import strategies as st
+from random_planner_points import (
+    effects_kept_in_tile,
+    plan_points,
+    planner_inputs,
+    random_parameters,
+)
 
 from sweep.model.effects.catalogue import EFFECTS
 from sweep.model.effects.effect import Effect, Size
@@ -90,7 +95,7 @@ def test_where_the_signal_is_drowned_anything_may_go():
     phases = catalogue({"phases": Size(magnitude=0.5)})
     made = given_plan(Given(np.array([1e-4, 7.0, 1e3]), 6.55), {}, 1e-3, phases)
     assert made.kept.tolist() == [[False, True, True]] and made.error.max() < 1e-3
-    assert kept_in(made, 1) == ("phases",) and kept_in(made, 0) == ()
+    assert effects_kept_in_tile(made, 1) == ("phases",) and effects_kept_in_tile(made, 0) == ()
     # pd is 1 there all the same, which is what the noise's side of it tells
     cancel = catalogue({"phases": Size(added=1e-2)})
     made = given_plan(Given(np.array([1e-4, 1e3]), 6.55), {}, 1e-3, cancel)
@@ -116,7 +121,10 @@ def test_forced_effects_stay_and_go_and_the_error_is_told():
     sizes = {n: None if v is None else np.full(2, v) for n, v in sizes.items()}
     modes = {"a": "on", "b": "off", "far": "on"}
     made = given_plan(Given(np.ones(2), 1.0), modes, 1e-3, catalogue(sizes))
-    assert kept_in(made, 0) == ("a", "c")  # of what is absent there is nothing to force on
+    assert effects_kept_in_tile(made, 0) == (
+        "a",
+        "c",
+    )  # of what is absent there is nothing to force on
     assert made.error == pytest.approx(0.3)
 
 
@@ -150,12 +158,15 @@ def test_an_effect_within_another_needs_it():
     within = {"phases": "footprint", "spread": "footprint", "turn": "phases"}
     points, effects = Given(np.ones(2), 1.0), catalogue(sizes, within)
     made = given_plan(points, {}, 1e-3, effects)
-    assert kept_in(made, 0) == ("footprint", "phases") and kept_in(made, 1) == ()
-    assert kept_in(given_plan(points, {}, 0.6, effects), 0) == ()
+    assert (
+        effects_kept_in_tile(made, 0) == ("footprint", "phases")
+        and effects_kept_in_tile(made, 1) == ()
+    )
+    assert effects_kept_in_tile(given_plan(points, {}, 0.6, effects), 0) == ()
     made = given_plan(points, {"footprint": "off"}, 1e-3, effects)
-    assert kept_in(made, 0) == () and made.error[0] == pytest.approx(0.5001011)
+    assert effects_kept_in_tile(made, 0) == () and made.error[0] == pytest.approx(0.5001011)
     all_three = ("footprint", "phases", "turn")
-    assert kept_in(given_plan(points, {"turn": "on"}, 1.0, effects), 1) == all_three
+    assert effects_kept_in_tile(given_plan(points, {"turn": "on"}, 1.0, effects), 1) == all_three
     with pytest.raises(ValueError, match="phases cannot be on"):
         given_plan(points, {"footprint": "off", "phases": "on"}, 1e-3, effects)
 
@@ -198,14 +209,15 @@ def test_a_tighter_tolerance_keeps_all_that_a_looser_one_does(table_4_1, seed, e
         "architecture": str(rng.choice(["homodyne", "heterodyne", "direct"])),
         "beamlets": int(rng.choice([0, 1, 19])),
     }
-    parameters = scene(table_4_1, 12, seed, **further) | {
+    parameters = random_parameters(table_4_1, 12, seed, **further) | {
         "target.acceleration": rng.choice([0.0, 1.0]) * 10 ** rng.uniform(-4, 3, 12),
         "instrument.laser.line_width": rng.choice([0.0, 1.0]) * 10 ** rng.uniform(0, 5, 12),
         "instrument.chirp.quadratic_error": rng.choice([0.0, 1.0]) * 10 ** rng.uniform(0, 6, 12),
     }
     modes = {"leakage": str(rng.choice(["auto", "on"]))}
     kept = [
-        planned(points_of(parameters), modes, 10.0**exponent).kept for exponent in sorted(exponents)
+        plan_points(planner_inputs(parameters), modes, 10.0**exponent).kept
+        for exponent in sorted(exponents)
     ]
     for tighter, looser in pairwise(kept):
         assert (tighter >= looser).all()

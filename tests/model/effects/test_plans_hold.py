@@ -3,7 +3,14 @@ the tolerance."""
 
 import numpy as np
 import pytest
-from effect_points import found, kept_in, planned, points_of, scene, shots_of
+from random_planner_points import (
+    effects_kept_in_tile,
+    find_spectra,
+    plan_points,
+    planner_inputs,
+    prepare_single_category,
+    random_parameters,
+)
 
 from sweep.model import shot
 from sweep.model.effects import saturation
@@ -67,27 +74,31 @@ def test_no_effect_changes_more_than_its_size_whatever_else_there_is(table_4_1, 
     noticed = 0
     for seed in range(3):
         rng = np.random.default_rng((seed, kind))
-        parameters = scene(
+        parameters = random_parameters(
             table_4_1, POINTS, seed, fft_size=2**13, bins_counted="all",
             **{"beamlets": 7} | KINDS[kind],
         )  # fmt: skip
         inner = counted(parameters, seed)
         moving, still = (
-            planned(points_of(parameters), modes, 1.0, CHOICE).change for modes in ({}, STILL)
+            plan_points(planner_inputs(parameters), modes, 1.0, CHOICE).change
+            for modes in ({}, STILL)
         )
         for name in CORE:
             others = some_of(rng, name)
             changes = moving if "doppler" in others | {name} else still
             most = dict(zip(CORE, changes, strict=True))
-            on, off = found(inner, others | {name}), found(inner, others)
+            on, off = find_spectra(inner, others | {name}), find_spectra(inner, others)
             assert (np.minimum(changed(on, off), 1) <= most[name] + ROUNDING).all(), (name, others)
-            moved = magnitudes_moved(on, off, shots_of(inner, others).bin_deviation)
+            moved = magnitudes_moved(on, off, prepare_single_category(inner, others).bin_deviation)
             assert (np.minimum(moved, 1) <= most[name] + ROUNDING).all(), (name, others)
             if name == "leakage":
                 extra = np.nansum(on[:, 5], axis=0)
                 assert (np.minimum(extra, 1) <= most[name] * (1 + 1e-9) + 1e-12).all()
             if name == "signal_shot_noise":
-                seen = [shot.statistics(shots_of(inner, e)) for e in (others | {name}, others)]
+                seen = [
+                    shot.statistics(prepare_single_category(inner, e))
+                    for e in (others | {name}, others)
+                ]
                 for alarm in ("pfa_segment", "log10_pfa_segment", "log10_pfa_shot"):
                     moved = abs(seen[0][alarm] - seen[1][alarm])
                     assert (np.minimum(moved, 1) <= most[name] + ROUNDING).all()
@@ -140,17 +151,17 @@ def test_no_further_effect_changes_more_than_its_size(table_4_1, kind, name):
     for seed in range(4):
         rng = np.random.default_rng((seed, kind, 5))
         slow = rng.choice([-1, 1], POINTS) * 10 ** rng.uniform(-2, 2.5, POINTS)
-        parameters = scene(
+        parameters = random_parameters(
             table_4_1, POINTS, seed, fft_size=2**13, bins_counted="all",
             **{"beamlets": 7, "radial_velocity": slow} | KINDS[kind],
         ) | FURTHER[name](rng)  # fmt: skip
         others = some_of(rng, "") | {"doppler"} | ({"range_walk"} if seed % 2 else set())
         others = (others | ({"overlap"} if seed > 1 else set())) - {name}
-        made = planned(points_of(parameters), {}, 1.0)
+        made = plan_points(planner_inputs(parameters), {}, 1.0)
         most = made.change[made.names.index(name)]
-        on, off = found(parameters, others | {name}), found(parameters, others)
+        on, off = find_spectra(parameters, others | {name}), find_spectra(parameters, others)
         assert (np.minimum(changed(on, off), 1) <= most + ROUNDING).all()
-        moved = magnitudes_moved(on, off, shots_of(parameters, others).bin_deviation)
+        moved = magnitudes_moved(on, off, prepare_single_category(parameters, others).bin_deviation)
         assert (np.minimum(moved, 1) <= most + ROUNDING).all()
         noticed += (most < 1).sum()
     assert noticed > 10
@@ -161,10 +172,10 @@ def test_no_further_effect_changes_more_than_its_size(table_4_1, kind, name):
 def test_pd_of_what_is_kept_is_within_the_tolerance(table_4_1, kind, tolerance):
     kept = dropped = 0
     for seed in range(2):
-        parameters = scene(
+        parameters = random_parameters(
             table_4_1, POINTS, seed, fft_size=2**13, **{"beamlets": 19} | KINDS[kind]
         )
-        made = planned(points_of(parameters), {}, tolerance, CHOICE)
+        made = plan_points(planner_inputs(parameters), {}, tolerance, CHOICE)
         inner = counted(parameters, seed)
         truth = shot.evaluate(inner)
         assert (made.error <= tolerance).all()
@@ -174,7 +185,10 @@ def test_pd_of_what_is_kept_is_within_the_tolerance(table_4_1, kind, tolerance):
             of_kept = shot.evaluate(inner, names)
             error = abs(of_kept["pd_shot"] - truth["pd_shot"])[here]
             assert (error <= tolerance + ROUNDING).all(), names
-            whole, part = shots_of(inner, CORE), shots_of(inner, names)
+            whole, part = (
+                prepare_single_category(inner, CORE),
+                prepare_single_category(inner, names),
+            )
             moved = magnitudes_moved(find(whole), find(part), part.bin_deviation)
             assert (moved[here] <= np.expm1(tolerance) + ROUNDING).all(), names
             if "leakage" not in names:
@@ -216,7 +230,7 @@ def test_sizes_and_plans_hold_for_footprints_that_rays_find(table_4_1, phases, s
         tile = np.repeat(np.arange(len(edges) - 1), stretch)
         ground = Cast(footprints, beside)
         made, still = (
-            planned(points_of(parameters, of_rays(ground)), modes, 0.05, CHOICE, edges)
+            plan_points(planner_inputs(parameters, of_rays(ground)), modes, 0.05, CHOICE, edges)
             for modes in ({}, STILL)
         )
         for place, name in enumerate(CORE):
@@ -227,7 +241,7 @@ def test_sizes_and_plans_hold_for_footprints_that_rays_find(table_4_1, phases, s
             assert (np.minimum(changed(on, off), 1) <= most + ROUNDING).all(), (name, others)
         truth = find(prepare_cast(parameters, ground))
         for i in range(len(edges) - 1):
-            of_kept = find(prepare_cast(parameters, ground, kept_in(made, i)))
+            of_kept = find(prepare_cast(parameters, ground, effects_kept_in_tile(made, i)))
             error = abs(of_kept[0, 0] * of_kept[2, 0] - truth[0, 0] * truth[2, 0])
             assert (error[tile == i] <= 0.05 + ROUNDING).all()
         has_beside = made.change[CORE.index("several_returns")].any()
@@ -241,7 +255,7 @@ def test_a_scene_calls_for_rotation_where_bodies_turn(table_4_1):
     parameters = DEFAULTS | table_4_1(beamlets=7, range=np.full(4, 100.0))
     seen = of_rays(Cast(footprints))
     turning, still = (
-        planned(points_of(parameters, seen, rotating=turns), {}, 0.5,
+        plan_points(planner_inputs(parameters, seen, rotating=turns), {}, 0.5,
                 [effect for effect in EFFECTS if effect.name == "rotation"])
         for turns in (True, False)
     )  # fmt: skip
@@ -277,18 +291,18 @@ def test_saturation_knows_every_effect_that_adds_noise():
 @pytest.mark.parametrize("name", STRONG_NOISE)
 def test_noise_of_any_source_that_saturates_an_adc_is_in_the_bound_of_saturation(table_4_1, name):
     """Full scale is 1.5 to 5 deviations of all noise: what it clips, it clips by that source."""
-    parameters = scene(
+    parameters = random_parameters(
         table_4_1, POINTS, 3, fft_size=2**13, bins_counted="all", beamlets=7,
         range=np.geomspace(100.0, 5000.0, POINTS), window="hann",
     ) | STRONG_NOISE[name]  # fmt: skip
     parameters["instrument.processing.full_scale"] = 1.0
     for _ in range(3):  # the steps of an ADC follow its full scale
-        deviation = np.sqrt(shots_of(parameters, {name}).noise_variance)
+        deviation = np.sqrt(prepare_single_category(parameters, {name}).noise_variance)
         parameters["instrument.processing.full_scale"] = deviation * np.geomspace(1.5, 5, POINTS)
-    made = planned(points_of(parameters), {}, 1.0)
+    made = plan_points(planner_inputs(parameters), {}, 1.0)
     most = made.change[made.names.index("saturation")]
-    on, off = found(parameters, {name, "saturation"}), found(parameters, {name})
-    moved = magnitudes_moved(on, off, shots_of(parameters, {name}).bin_deviation)
+    on, off = find_spectra(parameters, {name, "saturation"}), find_spectra(parameters, {name})
+    moved = magnitudes_moved(on, off, prepare_single_category(parameters, {name}).bin_deviation)
     assert (np.minimum(moved, 1) <= most + ROUNDING).all()
     assert (np.minimum(changed(on, off), 1) <= most + ROUNDING).all()
     assert moved.max() > 1e-3
@@ -299,7 +313,7 @@ def test_steps_of_an_adc_are_compared_with_the_noise_that_filters_leave_at_the_l
     table_4_1, antialias
 ):
     """Lines lie at up to half the sample rate, far beyond the poles of the receiver."""
-    parameters = scene(
+    parameters = random_parameters(
         table_4_1, POINTS, 5, fft_size=2**13, bins_counted="all", beamlets=1, window="hann",
         range=np.linspace(300.0, 20e3, POINTS), power=np.geomspace(1e-2, 1e4, POINTS),
         sample_rate=600e6, duration=500e-6,
@@ -311,12 +325,12 @@ def test_steps_of_an_adc_are_compared_with_the_noise_that_filters_leave_at_the_l
         "instrument.processing.bits": 6.0, "instrument.processing.full_scale": 1.0,
     }  # fmt: skip
     others = {"doppler"}
-    deviation = np.sqrt(shots_of(parameters, others).noise_variance)
+    deviation = np.sqrt(prepare_single_category(parameters, others).noise_variance)
     parameters["instrument.processing.full_scale"] = deviation * np.geomspace(1, 100, POINTS)
-    made = planned(points_of(parameters), {}, 1.0)
+    made = plan_points(planner_inputs(parameters), {}, 1.0)
     most = made.change[made.names.index("quantisation")]
-    on, off = found(parameters, others | {"quantisation"}), found(parameters, others)
+    on, off = find_spectra(parameters, others | {"quantisation"}), find_spectra(parameters, others)
     assert (np.minimum(changed(on, off), 1) <= most + ROUNDING).all()
-    moved = magnitudes_moved(on, off, shots_of(parameters, others).bin_deviation)
+    moved = magnitudes_moved(on, off, prepare_single_category(parameters, others).bin_deviation)
     assert (np.minimum(moved, 1) <= most + ROUNDING).all()
     assert (most < 1).any() and changed(on, off).max() > 1e-3 and moved.max() > 1e-3

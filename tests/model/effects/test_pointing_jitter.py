@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from engine import by_vectors, keys
+from shot_helpers import intersect_level_plane, make_point_keys
 
 from sweep.model.effects.effect import Realisation
 from sweep.model.effects.pointing_jitter import angles, turned
@@ -10,7 +10,7 @@ from sweep.model.effects.pointing_jitter import angles, turned
 
 def angles_of(draws, sigma):
     """Angles of one point's draws."""
-    realisation = Realisation(np.repeat(keys(1), draws, axis=0), np.arange(draws))
+    realisation = Realisation(np.repeat(make_point_keys(1), draws, axis=0), np.arange(draws))
     return angles(realisation, np.full(draws, sigma))
 
 
@@ -21,7 +21,7 @@ def test_turned_beams_meet_the_plane_where_rays_do(grazing):
         range=1500.0, grazing_angle=grazing, radial_velocity=80.0, angles=off,
         velocity_across=(30.0, -20.0),
     )  # fmt: skip
-    far, angle, direction = by_vectors(1500.0, grazing, off)
+    far, angle, direction = intersect_level_plane(1500.0, grazing, off)
     np.testing.assert_allclose(seen.range, far, rtol=1e-12)
     np.testing.assert_allclose(np.sin(seen.grazing_angle), np.sin(angle), rtol=1e-12)
     aim = np.array([np.cos(grazing), 0.0, -np.sin(grazing)])

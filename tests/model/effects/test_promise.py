@@ -13,9 +13,9 @@ TOLERANCES = (1e-2, 1e-3, 1e-5)
 def promise_instruments():
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(BENCHMARKS)
-        import promise_instruments
+        import tolerance_of_random_instruments
 
-        yield promise_instruments
+        yield tolerance_of_random_instruments
 
 
 @pytest.mark.parametrize("asked", ["nothing", "leakage", "jitter"])

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from effect_points import points_of
+from random_planner_points import planner_inputs
 
 from sweep.model import shot, truth
 from sweep.model.effects import phase_errors
@@ -102,7 +102,7 @@ def test_a_target_that_starts_from_rest_walks_in_the_down_segment(table_4_1, acc
         for some in (effects, (*effects, "range_walk"))
     ]
     changed = np.abs(found[0] / found[1] - 1)
-    points = points_of(parameters)
+    points = planner_inputs(parameters)
     points.smears["range_walk"] = phase_errors.walk_smear(points)
     size = phase_errors.RANGE_WALK.size(points)
     told = np.broadcast_to(np.ravel(size.magnitude + size.added), 3)

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from engine import keys
 from scipy import special, stats
 from scipy.integrate import quad
+from shot_helpers import make_point_keys
 
 from sweep.model.effects.catalogue import DEFAULTS
 from sweep.model.effects.effect import Realisation
@@ -121,7 +121,7 @@ def draws_of(law, legs, points, draws, first=0):
         LogVariances(*(np.repeat(np.broadcast_to(v, points), draws) for v in one)) for one in legs
     ]
     return factors(
-        law, spread, Realisation(np.repeat(keys(points), draws, axis=0), number)
+        law, spread, Realisation(np.repeat(make_point_keys(points), draws, axis=0), number)
     ).reshape(points, draws)
 
 

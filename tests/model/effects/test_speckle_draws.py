@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from engine import keys, prepared
-from mean_over_draws import evaluate
+from mean_over_draws import mean_statistics
 from scipy.integrate import quad
+from shot_helpers import make_point_keys, prepare_single_category
 
 from sweep.model import truth, window
 from sweep.model.effects import speckle
@@ -35,7 +35,7 @@ def with_share(parameters, share):
 
 def factors(draws, beamlets, share=0.0, random_phases=False, seeded=None):
     """Factors g of draws of a point, (draws, beamlets)."""
-    chosen = np.repeat(keys(1) if seeded is None else seeded, draws, axis=0)
+    chosen = np.repeat(make_point_keys(1) if seeded is None else seeded, draws, axis=0)
     magnitude, cycles = speckle.factors(
         Realisation(chosen, np.arange(draws)), beamlets=beamlets,
         coherent_share=np.full(draws, share), random_phases=random_phases,
@@ -78,10 +78,10 @@ SCENES = {
 def test_a_draws_peak_is_that_of_its_record(scene, table_4_1):
     """The same factors for all segments, conjugated where the beat folds."""
     parameters = table_4_1(**{"fft_size": 4096} | scene)
-    shots, share = prepared(parameters, STILL[:-1]), 0.2
+    shots, share = prepare_single_category(parameters, STILL[:-1]), 0.2
     number = shots.offset.shape[1]
     g = factors(20, number, share, random_phases=shots.incoherent)
-    (drawn,) = realise(with_share(parameters, share), STILL, keys=keys(1), draws=20)
+    (drawn,) = realise(with_share(parameters, share), STILL, keys=make_point_keys(1), draws=20)
     found = find(drawn.shots)
     for segment in range(3):
         exact = true_magnitudes(true_spectra(shots, segment), g).max(axis=1)
@@ -94,9 +94,9 @@ def test_detection_over_several_bins_is_that_of_plain_sums(table_4_1):
         fft_size=2**14, range=3000.0, grazing_angle=0.2, beam_divergence=3e-3, beamlets=19,
         tnr=7.0, phases="incoherent", power=1.0,
     )  # fmt: skip
-    shots, draws = prepared(parameters, STILL[:-1]), 400
+    shots, draws = prepare_single_category(parameters, STILL[:-1]), 400
     g = factors(draws, 19)
-    means = evaluate(parameters | ROUGH, STILL, keys=keys(1), draws=draws)
+    means = mean_statistics(parameters | ROUGH, STILL, keys=make_point_keys(1), draws=draws)
     beta, pd = shots.threshold[0] / shots.bin_deviation[0], {}
     spectra = {name: true_spectra(shots, s) for s, name in ((0, "up"), (2, "down"))}
     lines = (abs(spectra["up"]) ** 2).sum(axis=(0, 1))
@@ -126,7 +126,7 @@ def at_snrs(table_4_1, snrs, **changes):
 
 def in_one_bin(parameters, steady=0.0, diffuse=1.0):
     """Closed form of each segment: shares of the steady amplitude's square and diffuse power."""
-    shots, plain = prepared(parameters), evaluate_without(parameters)
+    shots, plain = prepare_single_category(parameters), evaluate_without(parameters)
     powers = evaluate_without(parameters | {"footprint.phases": "incoherent"})
     return {
         s: marcum_q1(
@@ -140,8 +140,8 @@ def in_one_bin(parameters, steady=0.0, diffuse=1.0):
 
 def test_speckled_beamlets_in_a_bin_are_a_swerling_1_target(table_4_1):
     parameters, draws = at_snrs(table_4_1, SNRS), 10_000
-    means = evaluate(parameters, SPECKLED, keys=keys(3), draws=draws)
-    shots = prepared(parameters)
+    means = mean_statistics(parameters, SPECKLED, keys=make_point_keys(3), draws=draws)
+    shots = prepare_single_category(parameters)
     swerling = np.exp(-0.5 * (shots.threshold / shots.bin_deviation) ** 2 / (1 + SNRS))
     closed = in_one_bin(parameters)
     np.testing.assert_allclose(closed["up"], swerling, rtol=1e-5)
@@ -173,12 +173,12 @@ def joint_detection(powers, covariance, level):
 def test_one_beamlet_fades_alike_in_up_and_down(table_4_1):
     """All that parts the two segments is noise: the bivariate Rayleigh law of one amplitude."""
     parameters = at_snrs(table_4_1, SNRS, beamlets=1)
-    shots, plain = prepared(parameters), evaluate_without(parameters)
+    shots, plain = prepare_single_category(parameters), evaluate_without(parameters)
     powers = 2 * plain["snr_up"], 2 * plain["snr_down"]
     exact = joint_detection(
         powers, np.sqrt(powers[0] * powers[1]), shots.threshold / shots.bin_deviation
     )
-    means = evaluate(parameters, SPECKLED, keys=keys(3), draws=10_000)
+    means = mean_statistics(parameters, SPECKLED, keys=make_point_keys(3), draws=10_000)
     assert (abs(means["pd_shot"] - exact) <= 5 * means["pd_shot_error"] + 1e-6).all()
     alone = means["pd_up"] * means["pd_down"]
     assert (means["pd_shot"] > alone + 10 * means["pd_shot_error"]).all()
@@ -191,7 +191,9 @@ def test_partly_rough_surfaces_are_ricean(share, beamlets, table_4_1):
     parameters = at_snrs(
         table_4_1, [15.0, 60.0], phases="coherent", beam_divergence=5e-6, beamlets=beamlets
     )
-    means = evaluate(with_share(parameters, share), SPECKLED, keys=keys(2), draws=10_000)
+    means = mean_statistics(
+        with_share(parameters, share), SPECKLED, keys=make_point_keys(2), draws=10_000
+    )
     for segment, exact in in_one_bin(parameters, share, 1 - share).items():
         error = means[f"pd_{segment}_error"]
         assert (abs(means[f"pd_{segment}"] - exact) <= 5 * error + 1e-6).all(), segment
@@ -241,7 +243,7 @@ def test_up_and_down_speckles_part_as_depth_and_frequency_make_them(table_4_1):
         between = 1e9 - 2e12 * (2048 / 600e6 - 2 * 2 * 2000.0 / 299792458.0)
         depth = 2000.0 * 50e-6 / 4 / np.tan(grazing_angle)
         exact = joint(parameters, 4 * np.pi * between * depth / 299792458.0)
-        means = evaluate(parameters, SPECKLED, keys=keys(1), draws=5_000)
+        means = mean_statistics(parameters, SPECKLED, keys=make_point_keys(1), draws=5_000)
         assert abs(means["pd_shot"] - exact) <= 5 * means["pd_shot_error"] + 1.5e-3
         gains.append((means["pd_shot"] / (means["pd_up"] * means["pd_down"]))[0])
     assert gains[0] > 1.5 > 1.02 > gains[-1] > 0.98
@@ -249,7 +251,7 @@ def test_up_and_down_speckles_part_as_depth_and_frequency_make_them(table_4_1):
 
 def joint(parameters, phase):
     """Chance of both chirps where beamlets part by normal phases [rad] of this deviation."""
-    shots, plain = prepared(parameters), evaluate_without(parameters)
+    shots, plain = prepare_single_category(parameters), evaluate_without(parameters)
     powers = 2 * plain["snr_up"], 2 * plain["snr_down"]
     return joint_detection(
         powers,
@@ -264,13 +266,13 @@ def test_what_moves_across_the_beam_turns_speckles_apart_between_segments(table_
     gains = []
     for speed in (0.0, 6.0, 15.0, 100.0):
         moving = parameters | {"target.transverse_velocity": speed}
-        means = evaluate(moving, SPECKLED, keys=keys(1), draws=5_000)
+        means = mean_statistics(moving, SPECKLED, keys=make_point_keys(1), draws=5_000)
         exact = joint(moving, 2 * np.pi * 2 * 500e-6 * 2 * speed * 12.5e-6 / 1550e-9)
         assert abs(means["pd_shot"] - exact) <= 5 * means["pd_shot_error"] + 2e-3
         gains.append((means["pd_shot"] / (means["pd_up"] * means["pd_down"]))[0])
     assert gains[0] > 1.5 > 1.05 > gains[-1]
-    still = evaluate(moving, STILL, keys=keys(1), draws=100)
-    at_rest = evaluate(parameters, STILL, keys=keys(1), draws=100)
+    still = mean_statistics(moving, STILL, keys=make_point_keys(1), draws=100)
+    at_rest = mean_statistics(parameters, STILL, keys=make_point_keys(1), draws=100)
     np.testing.assert_allclose(still["pd_shot"], at_rest["pd_shot"], rtol=1e-9)
 
 
@@ -290,7 +292,7 @@ def test_turning_adds_to_what_depth_does_or_takes_it_back(radial_velocity, table
     gains = {}
     for sense in (-1, 1):
         moving = parameters | {"target.transverse_velocity": sense * speed}
-        means = evaluate(moving, SPECKLED, keys=keys(1), draws=5_000)
+        means = mean_statistics(moving, SPECKLED, keys=make_point_keys(1), draws=5_000)
         gains[sense] = (means["pd_shot"] / (means["pd_up"] * means["pd_down"]))[0]
     assert gains[-1] > 1.5 > 1.1 > gains[1]
 
@@ -300,7 +302,7 @@ def test_a_smooth_surface_is_what_the_shot_is_without(across, table_4_1):
     parameters = table_4_1(grazing_angle=0.3, range=np.array([2500.0, 4000.0]), beamlets=19)
     parameters |= {"target.roughness": 0.0, "target.transverse_velocity": across}
     plain = evaluate_without(parameters)
-    means = evaluate(parameters, SPECKLED, keys=keys(2), draws=2)
+    means = mean_statistics(parameters, SPECKLED, keys=make_point_keys(2), draws=2)
     for name in ("pd_up", "pd_doppler", "pd_down", "pd_shot", "snr_doppler", "pfa_segment"):
         np.testing.assert_allclose(means[name], plain[name], rtol=1e-7)
 
@@ -312,7 +314,7 @@ def test_what_stands_under_a_line_fades_with_it(table_4_1):
         "instrument.laser.line_width": 20e3, "instrument.laser.line_shape": "lorentzian"
     }  # fmt: skip
     effects = (*SPECKLED, "line_width")
-    (stretch,) = realise(parameters, effects, keys=keys(1), draws=50)
+    (stretch,) = realise(parameters, effects, keys=make_point_keys(1), draws=50)
     ratio = stretch.shots.pedestal / statistics(stretch.shots)["snr_up"]
     np.testing.assert_allclose(ratio, ratio[0], rtol=1e-4)  # the image's phase moves with it
     assert np.ptp(stretch.shots.pedestal) > 0.5 * stretch.shots.pedestal.mean()
@@ -320,4 +322,6 @@ def test_what_stands_under_a_line_fades_with_it(table_4_1):
 
 def test_direct_detection_is_refused(table_4_1):
     with pytest.raises(ValueError, match="direct detection"):
-        evaluate(table_4_1(architecture="direct") | ROUGH, SPECKLED, keys=keys(1), draws=1)
+        mean_statistics(
+            table_4_1(architecture="direct") | ROUGH, SPECKLED, keys=make_point_keys(1), draws=1
+        )

@@ -7,7 +7,7 @@ import pytest
 
 from sweep.model.geometry import bvh
 from sweep.model.geometry.bvh import LEAF, build, nearest
-from sweep.scenes.rasters import BYTES_A_CELL
+from sweep.scenes.rasters import BYTES_PER_CELL
 from sweep.scenes.terrain import Terrain
 
 
@@ -176,12 +176,12 @@ def test_a_tree_is_built_in_little_memory(n, monkeypatch):
     """
     monkeypatch.setattr(bvh, "_AT_ONCE", 4096)
     terrain = Terrain(np.random.default_rng(3).random((n, n)), (1.0, 1.0), np.zeros(3))
-    mesh, _ = terrain.facets().mesh()
+    mesh, _ = terrain.to_facets().to_mesh()
     build(mesh.vertices, mesh.faces)
     tracemalloc.start()
     tree = build(mesh.vertices, mesh.faces)
     peak = tracemalloc.get_traced_memory()[1] / n**2
     tracemalloc.stop()
     of_mesh = sum(array.nbytes for array in (mesh.vertices, mesh.faces, mesh.surface)) / n**2
-    assert peak + of_mesh < BYTES_A_CELL
+    assert peak + of_mesh < BYTES_PER_CELL
     assert sum(array.nbytes for array in tree) / n**2 < 125

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from exact_rays import fractions, last_places, met, nearest
+from exact_rays import error_in_ulps, intersect_triangle, nearest_triangle, to_fractions
 
 from sweep.model.geometry import quaternion
 from sweep.model.geometry.mesh import merge
 from sweep.model.geometry.rays import Caster, Pose
-from sweep.scenes.meshes import clean
+from sweep.scenes.meshes import clean_mesh
 from sweep.scenes.terrain import Terrain
 
 GALE = Path(__file__).parents[4] / "shared" / "data" / "gale_crater_hirise_1m.tif"
@@ -87,7 +87,7 @@ def icosphere(subdivisions):
 
 def facets(heights):
     """Vertices and faces of ground of steps of 1 m."""
-    ground = Terrain(heights, (1.0, 1.0), np.zeros(3)).facets()
+    ground = Terrain(heights, (1.0, 1.0), np.zeros(3)).to_facets()
     return ground.vertices + ground.origin, ground.faces
 
 
@@ -105,7 +105,7 @@ def gale():
 def closed():
     """A bumpy sphere: vertices, faces and caster."""
     vertices, faces = bumpy_sphere(4)
-    mesh, _ = clean(vertices, faces, 0)
+    mesh, _ = clean_mesh(vertices, faces, 0)
     return vertices, faces, Caster(mesh)
 
 
@@ -118,15 +118,15 @@ def test_ranges_on_real_terrain_are_exact_but_for_their_rounding(gale):
     away = unit([[0.02, 0.01, 1.0], [1.0, 0.6, 0.42]])[np.arange(number) % 2]
     origins = target + 2000.0 * away
     directions = unit(target - origins)
-    hits = cast(Caster(clean(vertices, faces, 0)[0]), origins, directions)
+    hits = cast(Caster(clean_mesh(vertices, faces, 0)[0]), origins, directions)
     worst = 0.0
     for i in range(number):
-        truth = nearest(vertices, faces, origins[i], directions[i])
+        truth = nearest_triangle(vertices, faces, origins[i], directions[i])
         if truth is None:  # passes beside the terrain's rim
             assert hits.face[i] == -1
             continue
         assert hits.face[i] == truth[1]
-        assert last_places(hits.range[i], truth[0]) <= 1.0
+        assert error_in_ulps(hits.range[i], truth[0]) <= 1.0
         worst = max(worst, abs(float(Fraction(hits.range[i]) - truth[0])) * PHASE_PER_METRE)
     assert (hits.face >= 0).sum() > 15
     assert worst < 2e-6
@@ -136,7 +136,7 @@ def test_ranges_on_real_terrain_are_exact_but_for_their_rounding(gale):
 def test_no_ray_leaves_a_closed_surface_through_a_vertex_or_an_edge(closed, offset):
     """Every ray from inside must hit, wherever it is aimed: 100,000 at vertices and edges."""
     vertices, faces = closed[:2]
-    caster = Caster(clean(vertices + offset, faces, 0)[0])
+    caster = Caster(clean_mesh(vertices + offset, faces, 0)[0])
     rng = np.random.default_rng(5)
     placed = vertices + offset
     at_vertices = placed[rng.integers(0, len(vertices), 50_000)]
@@ -152,7 +152,7 @@ def test_no_ray_leaves_a_closed_surface_through_a_vertex_or_an_edge(closed, offs
 
 
 def test_a_cube_is_met_at_its_slabs_from_outside_and_from_inside():
-    caster = Caster(clean(CORNERS, CUBE, np.arange(12) // 2)[0])
+    caster = Caster(clean_mesh(CORNERS, CUBE, np.arange(12) // 2)[0])
     rng = np.random.default_rng(9)
     outside = 10.0 * unit(rng.normal(size=(500, 3)))
     origins = np.concatenate([outside, rng.uniform(-0.9, 0.9, (500, 3))])
@@ -185,8 +185,8 @@ def test_a_miss_says_so_everywhere(closed):
 
 
 def test_no_ray_within_a_silhouette_by_a_billionth_of_a_metre_passes_it():
-    leaf, _ = clean([[1, -5, 10], [9, -5, 10], [1, 9, 10.3]], [[0, 1, 2]], 7)
-    ground, _ = clean([[-90, -90, 0], [90, -90, 0], [0, 90, 0]], [[0, 1, 2]], 8)
+    leaf, _ = clean_mesh([[1, -5, 10], [9, -5, 10], [1, 9, 10.3]], [[0, 1, 2]], 7)
+    ground, _ = clean_mesh([[-90, -90, 0], [90, -90, 0], [0, 90, 0]], [[0, 1, 2]], 8)
     y = np.random.default_rng(16).uniform(-4.9, 8.0, 10_000)
     targets = np.stack([np.full_like(y, 1 + 1e-9), y, 10 + 0.3 * (y + 5) / 14], axis=1)
     origins = targets + 2000.0 * unit([0.3, 0.2, 1])
@@ -254,7 +254,7 @@ def test_ranges_within_a_bundle_keep_digits_that_their_difference_has_lost(offse
     rng = np.random.default_rng(13)
     vertices, faces = facets(0.3 * rng.normal(size=(30, 30)))
     vertices = vertices + offset
-    mesh, _ = clean(vertices, faces, 0)
+    mesh, _ = clean_mesh(vertices, faces, 0)
     centre = 30 * rng.integers(5, 25, 15) + rng.integers(5, 25, 15)
     origins = vertices[centre] + [[0.1, 0.2, 0.0]] + 2000.0 * unit([0.3, 0.2, 1])
     directions = beam(np.tile(unit([-0.3, -0.2, -1.0]), (15, 1)), 400e-6, 9)
@@ -264,7 +264,7 @@ def test_ranges_within_a_bundle_keep_digits_that_their_difference_has_lost(offse
     assert 20 < same[:, 1:].sum() < 100
     for i in range(15):
         exact = [
-            met(vertices[faces[face]], origins[i], d)[0]
+            intersect_triangle(vertices[faces[face]], origins[i], d)[0]
             for d, face in zip(directions[i], bundle.face[i], strict=True)
         ]
         for b in range(9):
@@ -278,8 +278,8 @@ def test_ranges_within_a_bundle_keep_digits_that_their_difference_has_lost(offse
 
 def test_beamlets_of_one_beam_see_several_surfaces_and_may_miss():
     """A leaf above the ground's end: leaf, ground and, at the beam's centre, sky."""
-    leaf, _ = clean([[1, -5, 10], [9, -5, 10], [1, 9, 10]], [[0, 1, 2]], 7)
-    ground, _ = clean(
+    leaf, _ = clean_mesh([[1, -5, 10], [9, -5, 10], [1, 9, 10]], [[0, 1, 2]], 7)
+    ground, _ = clean_mesh(
         [[-9, -9, 0], [0.5, -9, 0], [0.5, 9, 0], [-9, 9, 0]], [[0, 1, 2], [0, 2, 3]], 8
     )
     caster = Caster([merge([leaf, ground])])
@@ -304,7 +304,7 @@ def placed(vertices, pose, i):
 def test_bodies_that_tumble_are_met_where_their_moved_meshes_would_be():
     rng = np.random.default_rng(14)
     shapes = [(CORNERS, CUBE), bumpy_sphere(1), (3 * CORNERS, CUBE)]
-    meshes = [clean(v, f, s)[0] for s, (v, f) in enumerate(shapes)]
+    meshes = [clean_mesh(v, f, s)[0] for s, (v, f) in enumerate(shapes)]
     n = 60
     poses = [
         Pose(rng.uniform(-4, 4, (n, 3)), unit(rng.normal(size=(n, 4)))),
@@ -318,7 +318,9 @@ def test_bodies_that_tumble_are_met_where_their_moved_meshes_would_be():
     bundle = caster.bundle(origins, directions, poses=poses)
     for i in range(n):
         moved = [placed(shapes[k][0], poses[k], i) for k in range(2)] + [shapes[2][0]]
-        world = [clean(v, f, k)[0] for k, (v, (_, f)) in enumerate(zip(moved, shapes, strict=True))]
+        world = [
+            clean_mesh(v, f, k)[0] for k, (v, (_, f)) in enumerate(zip(moved, shapes, strict=True))
+        ]
         still = Caster(merge(world))
         truth = still.bundle(origins[i : i + 1], directions[i : i + 1])
         np.testing.assert_array_equal(bundle.body[i], truth.surface[0])
@@ -336,7 +338,7 @@ def test_bodies_that_tumble_are_met_where_their_moved_meshes_would_be():
 
 def exact_rotation(q):
     """Rotation matrix of a quaternion of any length, in fractions."""
-    w, x, y, z = fractions(q)
+    w, x, y, z = to_fractions(q)
     scale = w * w + x * x + y * y + z * z
     rows = [
         [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -354,17 +356,17 @@ def test_a_tumbling_body_at_two_kilometres_keeps_its_phase(offset):
     pose = Pose(offset + rng.uniform(-1, 1, (n, 3)), unit(rng.normal(size=(n, 4))))
     origins = pose.position + 2000.0 * unit(rng.normal(size=(n, 3)))
     directions = unit(pose.position + rng.uniform(-0.8, 0.8, (n, 3)) - origins)
-    mesh, _ = clean(CORNERS, CUBE, 0)
+    mesh, _ = clean_mesh(CORNERS, CUBE, 0)
     hits = cast(Caster(mesh), origins, directions, poses=[pose])
     assert (hits.face >= 0).sum() > 25
     for i in np.flatnonzero(hits.face >= 0):
         rotation = exact_rotation(pose.attitude[i])
-        shift = fractions(pose.position[i])
+        shift = to_fractions(pose.position[i])
         corners = [
-            [dot(row, fractions(v)) + s for row, s in zip(rotation, shift, strict=True)]
+            [dot(row, to_fractions(v)) + s for row, s in zip(rotation, shift, strict=True)]
             for v in CORNERS[CUBE[hits.face[i]]]
         ]
-        t, _ = met(corners, origins[i], directions[i])
+        t, _ = intersect_triangle(corners, origins[i], directions[i])
         # The range's rounding, and the body's: 1e-15 m over the cosine of incidence.
         bound = 0.5 * np.spacing(2000.0) + 2e-15 / hits.cos_incidence[i]
         assert float(abs(Fraction(hits.range[i]) - t)) <= bound
@@ -372,7 +374,7 @@ def test_a_tumbling_body_at_two_kilometres_keeps_its_phase(offset):
 
 
 def test_of_bodies_one_behind_the_other_the_nearest_is_hit_in_whatever_order_they_come():
-    mesh, _ = clean(CORNERS, CUBE, 0)
+    mesh, _ = clean_mesh(CORNERS, CUBE, 0)
     straight = np.array([1.0, 0.0, 0.0, 0.0])
     poses = [Pose(np.array([x, 0.0, 0.0]), straight) for x in (50.0, 10.0, 30.0)]
     for order in ([0, 1, 2], [1, 2, 0], [2, 0, 1]):

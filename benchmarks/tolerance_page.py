@@ -1,0 +1,481 @@
+"""Test of every tolerance: 1,000 points of every experiment, at six tolerances.
+
+And of as many instruments drawn at random. Run with `make promise`, some twenty minutes; names of
+experiments, or `instruments`, as arguments look at those alone.
+Writes docs/promise.md.
+"""
+
+import argparse
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import tolerance_of_draws
+import tolerance_of_random_instruments
+from benchmark_helpers import DOCS, EXPERIMENTS, markdown_table, wrap_page
+from rich.console import Console
+from rich.progress import Progress
+
+from sweep.model.accuracy import Accuracy
+from sweep.spec import GridSpec, SceneSpec, SpecError, load
+from sweep.tasks.accuracy.measurement import (
+    N_PROMISED_ERRORS,
+    add_fixed_effects,
+    result_differences,
+    tolerance_of_setting,
+)
+from sweep.tasks.accuracy.settings import (
+    ADAPTIVE_KIND,
+    ALL_EFFECTS_KIND,
+    AS_WRITTEN_KIND,
+    FIXED_EFFECTS_KIND,
+    REFERENCE_KIND,
+    REFERENCE_RAYS,
+    REFERENCE_RAYS_TOLERANCE,
+    TRIED_TOLERANCES,
+    AccuracySetting,
+    SettingLadder,
+    build_ladder,
+)
+from sweep.tasks.accuracy.study_sample import (
+    FlightSample,
+    GridSample,
+    StudySample,
+    Trial,
+    merge_trials,
+)
+from sweep.tasks.engine.blocks import ParameterBlockGrid
+
+POINTS, SEED, ROUNDS = 1000, 2017, 5
+POINTS_TIMED_TOGETHER = 4096
+"""Points that are timed together: what one costs depends on those beside it in its block."""
+SHARE_WITHIN_MIN = 0.999
+"""Share of the points that shall keep a tolerance."""
+REPEATED_TRIAL_SECONDS_MAX = 0.5
+"""Seconds that a trial may take to be repeated: longer ones are timed well enough as it is."""
+BEAMLETS = "footprint.beamlets"
+CHECK_RAYS = 31_987
+"""What the reference of flights is held against."""
+COHERENT_CHECK_RAYS = 4_009
+"""Rays that coherent flights are held against."""
+COST_RATIO_MAX = 1.1
+"""What timings may be off."""
+SAME_ERROR_RATIO, ZERO_ERROR = 1.1, 1e-9
+"""Errors that count as the same, relative to each other, and as none."""
+ERROR_QUANTITIES = ("pd", "log10 pfa", "magnitude", "leakage")
+INSTRUMENTS_SECTION = "instruments"
+EXPERIMENT_VARIANTS = {
+    "range_angle_over_rough_ground": (
+        "range_angle", {"footprint.phases": "incoherent", "footprint.beamlets": "auto"},
+    ),
+}  # fmt: skip
+"""Experiments with some values put onto them."""
+PAGE_HEAD = """# Is the tolerance kept?
+
+Written by `make promise`. It computes 1,000 random points of each experiment (of flights, some
+tiles of shots) at each `accuracy.tolerance`. `footprint.beamlets` is `auto` where the experiment
+leaves the number free. The reference has all effects on. It has as many beamlets as at 1e-9, or in
+flights more rays than any tolerance needs.
+
+The columns are the errors of pd (the largest of segments and shot), of log10 of the probability of
+a false alarm, and of |X| of the largest bins. The error of |X| is relative to itself, or to sigma
+if that is larger. A cell has the error of the worst point. If not all points are within the
+tolerance, it begins with the share of those that are; 99.9 % are required. Studies with draws have
+a table of their own.
+
+The last error is that of the probability of leakage in the up- or the down-chirp. Skipping leakage
+itself keeps the tolerance. The tolerance does not cover the change of leakage by other skipped
+effects and by few beamlets ([effects](effects.md)). This column shows that change. It does not
+count in comparisons of settings.
+
+A detection occupies some of the 65,536 bins that could raise a false alarm. One bin more or fewer
+changes log10 pfa by 6.6e-6.
+
+`us` is processor time a point, planning included. Two columns have the time of other settings, with
+the same effects at every point, and with lines and leakage to one of the six tolerances. `fixed` is
+the cheapest of these that keeps the tolerance. `front` is the cheapest whose worst error is no
+larger than this row's, as on the front of error against time of `sweep accuracy`.
+
+"""
+RAYS_SECTION = f"""
+## Flights against many more rays
+
+Each beamlet of a flight is a ray. If powers add, `footprint.beamlets: auto` casts few rays for
+every shot, and more for shots that need them. The rows show the number of rays of a shot, and
+the error against a reference. The reference has all effects on and {REFERENCE_RAYS:,} rays of every
+shot, or more until the estimated error is below {REFERENCE_RAYS_TOLERANCE:g}, {Accuracy.rays[-1]:,}
+at
+the most. A number given by an experiment has a row too, with all effects on. The last row of each
+flight compares the reference with {CHECK_RAYS:,} rays and more, at a part of the flight. A cell has
+the share of shots within the tolerance, the largest error of the best 90 % of the shots, and the
+worst error. `us` is processor time a shot, rays included.
+
+If phases are coherent, the number of beamlets is part of the scene, as in the thesis. No number is
+enough: a smooth slope sends almost nothing back, and the small sum that remains depends on the
+number. These flights have one row, their own number against {COHERENT_CHECK_RAYS:,}.
+"""
+COSTS_SECTION = """
+## Cost and tolerance
+
+The test asks whether cost rises with accuracy no faster than on the front of error against time.
+The first table has the ratio of `us` to `front` at each tolerance. The answer is yes if no ratio is
+higher by more than {margin:.0%} than the first, or than 1 if the first is lower.
+
+{front}
+
+A stricter test compares with the cheapest setting that keeps the tolerance (`fixed`). Its accuracy
+is known only afterwards, and most settings are far more accurate than their tolerance. So the
+setting for a loose tolerance often serves for tighter ones too, at the same cost.
+
+{fixed}
+"""
+
+
+class ToleranceRow(NamedTuple):
+    """Result of an experiment at a tolerance."""
+
+    tolerance: float
+    errors: tuple[np.ndarray, ...]
+    """(points,) each, by :data:`ERROR_QUANTITIES`."""
+    seconds: float
+    fixed_seconds: float = np.nan
+    """Time of the cheapest fixed setting that keeps the tolerance [s]; nan where there is none."""
+    front_seconds: float = np.nan
+    """The same of the cheapest whose worst error is no larger."""
+    label: str = ""
+    """What stands in the place of a tolerance."""
+
+
+def run_trials(bench: StudySample, rungs: Sequence[AccuracySetting], rounds: int) -> list[Trial]:
+    """Rungs on all points of a sample: what they see, and the best of their times."""
+    parts = bench.split(bench.size)
+    for rung in rungs:  # compiles what there is to compile
+        bench.try_setting(rung, parts[0] if len(parts) > 1 else parts[0][:1], 1)
+    bench.drop_caches()
+    trials_by_part: list[list[Trial]] = []
+    for part in parts:
+        best_by_rung: dict[int, Trial] = {}
+        for round_number in range(rounds):  # in turn, so that whatever slows the machine slows all
+            for rung_number, rung in enumerate(rungs):
+                if round_number > 0 and (
+                    rung.kind == REFERENCE_KIND
+                    or best_by_rung[rung_number].seconds_per_point * len(part)
+                    > REPEATED_TRIAL_SECONDS_MAX
+                ):
+                    continue
+                points_together = (
+                    1
+                    if rung.kind == REFERENCE_KIND
+                    else min(POINTS_TIMED_TOGETHER, bench.timed_points_max)
+                )
+                trial = bench.try_setting(rung, part, points_together)
+                best_by_rung[rung_number] = min(
+                    best_by_rung.get(rung_number, trial),
+                    trial,
+                    key=lambda trial: trial.seconds_per_point,
+                )
+        trials_by_part.append([best_by_rung[rung_number] for rung_number in sorted(best_by_rung)])
+        bench.drop_caches()
+    return [merge_trials(trials) for trials in zip(*trials_by_part, strict=True)]
+
+
+class ExperimentResult(NamedTuple):
+    """Results of an experiment."""
+
+    rows: list[ToleranceRow]
+    ray_rows: list[ToleranceRow]
+    """Of a flight: its own number against many more; last, these against yet more."""
+
+
+def measure_experiment(spec: GridSpec | SceneSpec) -> ExperimentResult:
+    """Tolerances of a study without draws."""
+    is_flight = isinstance(spec, SceneSpec)
+    bench = (
+        FlightSample(spec, POINTS) if is_flight else GridSample(spec, POINTS, random_points(spec))
+    )
+    full_ladder = build_ladder(spec)
+    rung_by_tolerance = {
+        tolerance_of_setting(rung): rung
+        for rung in full_ladder.settings
+        if rung.kind == ADAPTIVE_KIND
+    }
+    full_ladder = add_fixed_effects(full_ladder, bench, TRIED_TOLERANCES)
+    fixed_rungs = [
+        rung for rung in full_ladder.settings if rung.kind in (FIXED_EFFECTS_KIND, ALL_EFFECTS_KIND)
+    ]
+    rungs = [*rung_by_tolerance.values(), *fixed_rungs, full_ladder.reference]
+    trials = run_trials(bench, rungs, ROUNDS)
+    trial_by_name = {rung.name: trial for rung, trial in zip(rungs, trials, strict=True)}
+    all_on_rung = next(rung for rung in fixed_rungs if rung.kind == ALL_EFFECTS_KIND)
+    reference_seen = trial_by_name[full_ladder.reference.name].results
+    worst_by_name = {
+        rung.name: worst_error(result_differences(trial_by_name[rung.name].results, reference_seen))
+        for rung in fixed_rungs
+    }
+    rows, ray_rows = [], []
+    for tolerance, rung in rung_by_tolerance.items():
+        trial = trial_by_name[rung.name]
+        errors = result_differences(trial.results, reference_seen)
+        worst_of_row = worst_error(errors)
+        fixed_seconds, front_seconds = (
+            min(
+                (
+                    trial_by_name[name].seconds_per_point
+                    for name, error in worst_by_name.items()
+                    if error <= error_max
+                ),
+                default=np.nan,
+            )
+            for error_max in (tolerance, max(SAME_ERROR_RATIO * worst_of_row, ZERO_ERROR))
+        )
+        rows.append(
+            ToleranceRow(tolerance, errors, trial.seconds_per_point, fixed_seconds, front_seconds)
+        )
+        label = f"{tolerance:g}: {rays_text(trial.results.n_beamlets)}" if is_flight else ""
+        ray_rows.append(rows[-1]._replace(label=label))
+    if not is_flight:
+        return ExperimentResult(rows, [])
+    if BEAMLETS not in full_ladder.reference.overrides:
+        return ExperimentResult(
+            rows,
+            [
+                reference_check_row(
+                    bench,
+                    full_ladder,
+                    trial_by_name[all_on_rung.name],
+                    "own, coherent",
+                    COHERENT_CHECK_RAYS,
+                )
+            ],
+        )
+    if spec.footprint.beamlets:
+        given_number_trial, label = (
+            trial_by_name[all_on_rung.name],
+            f"{spec.footprint.beamlets:,} by hand",
+        )
+        ray_rows.append(
+            ToleranceRow(
+                np.inf,
+                result_differences(given_number_trial.results, reference_seen),
+                given_number_trial.seconds_per_point,
+                label=label,
+            )
+        )
+    trial, label = trial_by_name[full_ladder.reference.name], f"{REFERENCE_RAYS:,} rays and more"
+    check_row = reference_check_row(bench, full_ladder, trial, label, CHECK_RAYS)
+    return ExperimentResult(rows, [*ray_rows, check_row])
+
+
+def random_points(spec: GridSpec) -> np.ndarray:
+    """Numbers of points, each as likely, without repetition."""
+    points = ParameterBlockGrid(spec).n_points
+    chosen = np.random.default_rng(SEED).choice(points, min(POINTS, points), replace=False)
+    return np.sort(chosen)
+
+
+def worst_error(errors: Sequence[np.ndarray]) -> float:
+    """The largest error of all that is promised."""
+    return float(np.nanmax(np.concatenate(errors[:N_PROMISED_ERRORS])))
+
+
+def rays_text(rays_by_shot: np.ndarray) -> str:
+    """Numbers of rays of shots, where they have any: the mean, and the most."""
+    if not np.isfinite(rays_by_shot).any():
+        return "nothing seen"
+    return f"{np.nanmean(rays_by_shot):,.0f} rays, at most {np.nanmax(rays_by_shot):,.0f}"
+
+
+def reference_check_row(
+    bench: StudySample, full_ladder: SettingLadder, timed_trial: Trial, label: str, more_rays: int
+) -> ToleranceRow:
+    """The reference's number of rays against more of them, at a part of the sample."""
+    reference, part = full_ladder.reference, bench.split(bench.size)[0]
+    finer = replace(
+        reference, name=f"{more_rays} rays", overrides={**reference.overrides, BEAMLETS: more_rays}
+    )
+    reference_trial, finer_trial = (bench.try_setting(rung, part, 1) for rung in (reference, finer))
+    bench.drop_caches()
+    return ToleranceRow(
+        np.inf,
+        result_differences(reference_trial.results, finer_trial.results),
+        timed_trial.seconds_per_point,
+        label=label,
+    )
+
+
+def error_cell(errors: np.ndarray, tolerance: float) -> str:
+    """The worst error; before it, where not all are within the tolerance, how many are."""
+    known_errors = errors[np.isfinite(errors)]
+    if not known_errors.size:
+        return "-"
+    worst, share_within = float(known_errors.max()), float((known_errors <= tolerance).mean())
+    return (
+        error_text(worst)
+        if share_within == 1
+        else f"**{100 * share_within:.2f} %**, {error_text(worst)}"
+    )
+
+
+def error_text(error: float) -> str:
+    """An error as cells have it."""
+    return "<1e-9" if error < 1e-9 else f"{error:.1e}"
+
+
+def error_spread_cell(errors: np.ndarray, tolerance: float) -> str:
+    """Share of the points within the tolerance, the error that 90 % keep, and the worst."""
+    known_errors = errors[np.isfinite(errors)]
+    if not known_errors.size:
+        return "-"
+    share_within_text = (
+        f"{100 * (known_errors <= tolerance).mean():.4g} %, " if np.isfinite(tolerance) else ""
+    )
+    return (
+        f"{share_within_text}{error_text(np.quantile(known_errors, 0.9))}, "
+        f"{error_text(known_errors.max())}"
+    )
+
+
+def error_table_rows(name: str, rows: Sequence[ToleranceRow]) -> Iterator[list[str]]:
+    """Rows of the table."""
+    for row in rows:
+        cells = [error_cell(errors, row.tolerance) for errors in row.errors]
+        times = [
+            f"{1e6 * seconds:.3g}" if np.isfinite(seconds) else "-"
+            for seconds in (row.seconds, row.fixed_seconds, row.front_seconds)
+        ]
+        yield [name, f"{len(row.errors[0]):,}", f"{row.tolerance:g}", *cells, *times]
+
+
+def ray_table_rows(name: str, rows: Sequence[ToleranceRow]) -> Iterator[list[str]]:
+    """Rows of the table of rays."""
+    for row in rows:
+        cells = [error_spread_cell(errors, row.tolerance) for errors in row.errors]
+        yield [name, row.label or f"{row.tolerance:g}", *cells, f"{1e6 * row.seconds:.3g}"]
+
+
+def cost_row(name: str, ratios: Sequence[float]) -> list[str]:
+    """A row of a table of costs: ratios by tolerance, and whether they rise."""
+    known_ratios = [ratio for ratio in ratios if np.isfinite(ratio)]
+    cost_rise = max(known_ratios) / max(known_ratios[0], 1.0) if known_ratios else np.nan
+    verdict = "kept" if cost_rise <= COST_RATIO_MAX else f"NOT kept: {cost_rise:.2f} times"
+    cells = [f"{ratio:.2f}" if np.isfinite(ratio) else "-" for ratio in ratios]
+    return [name, *cells, verdict if known_ratios else "no front"]
+
+
+def missed_tolerances(name: str, rows: Sequence[ToleranceRow]) -> Iterator[str]:
+    """Quantities that do not keep their tolerance, in words."""
+    for row in rows:
+        for quantity, errors in zip(ERROR_QUANTITIES, row.errors, strict=True):
+            known_errors = errors[np.isfinite(errors)]
+            share_within = (
+                float((known_errors <= row.tolerance).mean()) if known_errors.size else 1.0
+            )
+            if share_within < SHARE_WITHIN_MIN:
+                share_missed = f"{100 * (1 - share_within):.2f} %"
+                message = (
+                    f"- {name} at {row.tolerance:g}: {quantity} of {share_missed} of the points"
+                )
+                yield message + (", which is not promised" if quantity == "leakage" else "")
+
+
+class TolerancePage:
+    """The page, experiment by experiment."""
+
+    def __init__(self) -> None:
+        self._missed: list[str] = []
+        self._error_rows: list[list[str]] = []
+        self._ray_rows: list[list[str]] = []
+        self._front_rows: list[list[str]] = []
+        self._cost_rows: list[list[str]] = []
+        self._sections: dict[str, list[str]] = {"drawn": [], "instruments": []}
+
+    def add_random_instruments(self) -> None:
+        """Look at instruments drawn at random."""
+        missed_messages, section_text = tolerance_of_random_instruments.instruments_section(
+            POINTS, np.random.default_rng()
+        )
+        self._missed += missed_messages
+        self._sections["instruments"].append(section_text)
+
+    def add_experiment(self, stem: str) -> None:
+        """Look at an experiment."""
+        experiment, overrides = EXPERIMENT_VARIANTS.get(stem, (stem, {}))
+        name, path = stem.replace("_", " "), EXPERIMENTS / f"{experiment}.yaml"
+        try:
+            spec = load(path)
+        except SpecError as error:
+            self._missed.append(f"- {name}: not looked at: {str(error).splitlines()[0]}")
+            return
+        spec = AccuracySetting(name="", kind=AS_WRITTEN_KIND, overrides=overrides).apply_to(spec)
+        if spec.draws.method == "spectra":
+            self._missed.append(f"- {name}: not looked at: draws noise alone, and counts")
+        elif not isinstance(spec, SceneSpec) and spec.draws.has_draws:
+            rows, integral_error = tolerance_of_draws.draw_at_tolerances(path, spec)
+            self._missed += tolerance_of_draws.missed_tolerances(
+                name, rows, float(spec.accuracy.confidence)
+            )
+            self._sections["drawn"].append(
+                tolerance_of_draws.study_section(name, rows, integral_error, spec)
+            )
+        else:
+            self._add_result(name, measure_experiment(spec))
+
+    def _add_result(self, name: str, result: ExperimentResult) -> None:
+        self._error_rows += error_table_rows(name, result.rows)
+        self._ray_rows += ray_table_rows(name, result.ray_rows)
+        self._front_rows.append(
+            cost_row(name, [row.seconds / row.front_seconds for row in result.rows])
+        )
+        self._cost_rows.append(
+            cost_row(name, [row.seconds / row.fixed_seconds for row in result.rows])
+        )
+        self._missed += missed_tolerances(name, result.rows)
+
+    def page_text(self) -> str:
+        """The whole text."""
+        columns = ["experiment", "points", "tolerance", *ERROR_QUANTITIES, "us", "fixed", "front"]
+        by_tolerance = [
+            "experiment",
+            *(f"{tolerance:g}" for tolerance in TRIED_TOLERANCES),
+            "no faster",
+        ]
+        front, fixed = (
+            markdown_table(by_tolerance, rows) for rows in (self._front_rows, self._cost_rows)
+        )
+        parts = [
+            PAGE_HEAD.strip(),
+            "\n".join(self._missed) if self._missed else "Every tolerance is kept.",
+            markdown_table(columns, self._error_rows),
+            *self._sections["drawn"],
+            *self._sections["instruments"],
+            RAYS_SECTION.strip(),
+            markdown_table(["experiment", "tolerance", *ERROR_QUANTITIES, "us"], self._ray_rows),
+            COSTS_SECTION.strip().format(margin=COST_RATIO_MAX - 1, front=front, fixed=fixed),
+        ]
+        return wrap_page("\n\n".join(parts)) + "\n"
+
+
+def main() -> None:
+    """The whole page, or some experiments' rows."""
+    all_names = sorted([*EXPERIMENT_VARIANTS, *(path.stem for path in EXPERIMENTS.glob("*.yaml"))])
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("names", nargs="*", choices=[*all_names, INSTRUMENTS_SECTION, []])
+    arguments = parser.parse_args()
+    page = TolerancePage()
+    with Progress(console=Console(stderr=True)) as bar:
+        names = arguments.names or [*all_names, INSTRUMENTS_SECTION]
+        for experiment_name in bar.track(names, description="points of each experiment"):
+            if experiment_name == INSTRUMENTS_SECTION:
+                page.add_random_instruments()
+            else:
+                page.add_experiment(experiment_name)
+    text = page.page_text()
+    if arguments.names:
+        print(text.removeprefix(PAGE_HEAD))
+    else:
+        (DOCS / "promise.md").write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

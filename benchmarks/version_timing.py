@@ -1,0 +1,321 @@
+"""Time a point, side by side with an earlier commit: both check-outs take turns in one run.
+
+    python benchmarks/version_timing.py                        # all studies, some ten minutes
+    python benchmarks/version_timing.py published rough_ground --rounds 9
+    python benchmarks/version_timing.py --group speckle --earlier 7881fb1
+
+`make side-by-side` does all of the first group. The group of speckle has smooth points, whose time
+is to stay, flights of the library's instruments in developed speckle, and developed points against
+smooth ones of this version: `make speckle-time`.
+
+Each version runs in a process of its own, with its own compiled kernels and experiments, through
+`sweep.load` and `sweep.run(scheduler="none")` alone. A study is run whole and as a small part of
+itself; the processor's time for a point is the difference of the two over the points that the small
+one lacks, so that what a run costs once (reading, ground, the store) does not count. The versions
+change places each round. Others on the machine only ever add to a time, so that the ratio is that
+of the least times of all rounds; those of single rounds are from .. to.
+"""
+
+import argparse
+import copy
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import yaml
+from benchmark_helpers import ROOT, experiment_mapping
+
+EARLIER_COMMIT = "9b29f45"
+WORK_DIR = ROOT / "results" / "side_by_side"
+FLIGHT_RATIO_MAX = 1.3
+"""Ratio that flights may come to."""
+
+
+class TimedStudy(NamedTuple):
+    """An experiment, what is put onto it for the whole and for its small part, and the aim."""
+
+    experiment: str | dict[str, Any]
+    """Name, or the spec itself."""
+    ratio_max: float
+    whole_overrides: dict[str, Any]
+    part_overrides: dict[str, Any]
+    against: str = ""
+    """Study of this version that it is compared with; of the earlier version where empty."""
+
+
+def timed_flight(experiment: str, scanner: str, rate: float, **overrides: Any) -> TimedStudy:
+    """A flight measured at this rate [Hz], and at a tenth of it."""
+    path = f"scanners.{scanner}.rate"
+    return TimedStudy(
+        experiment,
+        FLIGHT_RATIO_MAX,
+        overrides | {path: f"{rate} Hz"},
+        overrides | {path: f"{rate / 10} Hz"},
+    )
+
+
+ROUGH_GROUND = {"footprint.phases": "incoherent", "footprint.beamlets": "auto"}
+RANGE_AXIS = "axes.target.range"
+FEW_DRAWS = {"draws.number": 10}
+STUDIES = {
+    "published": TimedStudy(
+        "range_angle", 1.25, {}, {RANGE_AXIS: {"step": ["1 m", "1 km", "1 m"]}}
+    ),
+    "rough_ground": TimedStudy(
+        "range_angle",
+        1.0,
+        ROUGH_GROUND | {RANGE_AXIS: {"step": ["1 m", "10 km", "5 m"]}},
+        ROUGH_GROUND | {RANGE_AXIS: {"step": ["1 m", "1 km", "5 m"]}},
+    ),
+    "speckled_target": TimedStudy(
+        "speckled_target", 1.0, {}, {RANGE_AXIS: {"step": ["1 km", "12 km", "2 km"]}}
+    ),
+    "morpheus_three_beam": timed_flight("morpheus_three_beam", "three", 500),
+    "oblique_descent": timed_flight("oblique_descent", "corners", 200),
+    "square_high_descent": timed_flight("square_high_descent", "corners", 200),
+    "square_low_descent": timed_flight("square_low_descent", "corners", 200),
+    "expanded_pattern": timed_flight("expanded_pattern", "squares", 200),
+    "forest_scan": timed_flight("forest_scan", "sweep", 650),
+    "scan_pattern_comparison": timed_flight("scan_pattern_comparison", "three", 200, **FEW_DRAWS),
+}  # fmt: skip
+
+
+DEVELOPED = 2.5
+"""Ratio that a point in developed speckle may come to against a smooth one."""
+
+
+def speckle_grid(rule: str, speckle: str, angle: int) -> dict[str, Any]:
+    """Spec of points at one grazing angle [deg], all of whose echoes are there in time."""
+    return {
+        "title": "Points in time",
+        "instrument": {
+            "like": "chester_2017_table_4_1",
+            "processing": {"detection": rule, "acquisition_delay": "50 us"},
+        },
+        "target": {
+            "reflectance": 0.1, "radial_velocity": "150 m/s", "grazing_angle": f"{angle} deg",
+        },
+        "footprint": {"speckle": speckle},
+        "axes": {},
+    }  # fmt: skip
+
+
+def speckle_flight(
+    instrument: str, heights: tuple[int, int], draws: int, method: str
+) -> TimedStudy:
+    """Descent from one height [m] to another, of a raster of 64 beams over a plane."""
+    spec: dict[str, Any] = {
+        "title": "Descent in time",
+        "instrument": {"like": instrument},
+        "scene": {"objects": {"g": {"kind": "plane", "size": "20 km", "reflectance": 0.1}}},
+        "platform": {
+            "path": {
+                "kind": "straight", "from": ["0 m", "0 m", f"{heights[0]} m"],
+                "to": ["50 m", "0 m", f"{heights[1]} m"],
+                "initial_speed": f"{heights[0] / 25} m/s",
+            },
+            "attitude": {"kind": "nadir"},
+        },
+        "scanners": {
+            "b": {"kind": "raster", "columns": 8, "rows": 8, "half_angles": ["25 deg", "25 deg"]}
+        },
+        "draws": {"number": draws, "method": method},
+        "footprint": {"beamlets": 19},
+    }  # fmt: skip
+    rates = ({"scanners.b.rate": f"{rate} Hz"} for rate in (4.0, 0.4))
+    return TimedStudy(spec, FLIGHT_RATIO_MAX, *rates)
+
+
+def speckle_studies() -> dict[str, TimedStudy]:
+    """Return points and flights, and developed points against smooth ones."""
+    studies = {}
+    for rule in ("any_bin", "peak_bin"):
+        for angle in (90, 30, 5):
+            for speckle in ("none", "developed"):
+                ranges = (
+                    {RANGE_AXIS: {"linear": ["500 m", "6 km"], "number": number}}
+                    for number in (30_000, 3_000)
+                )
+                study = TimedStudy(speckle_grid(rule, speckle, angle), 1.0, *ranges)
+                if speckle == "developed":
+                    study = study._replace(ratio_max=DEVELOPED, against=f"{rule}_{angle}_none")
+                studies[f"{rule}_{angle}_{speckle}"] = study
+    for instrument, heights in (("lander_ndl", (1500, 1000)), ("automotive_fmcw", (150, 100))):
+        for method in ("probabilities", "noise"):
+            for draws in (1, 10, 100):
+                name = f"{instrument}_{method}_{draws}"
+                studies[name] = speckle_flight(instrument, heights, draws, method)
+    return studies
+
+
+GROUPS = {"experiments": STUDIES, "speckle": speckle_studies()}
+
+
+def experiment_with_overrides(
+    checkout: Path, study: TimedStudy, overrides: dict[str, Any]
+) -> dict[str, Any]:
+    """The experiment of a check-out as plain data, with overrides."""
+    if isinstance(study.experiment, str):
+        spec = experiment_mapping(checkout / "experiments", study.experiment)
+    else:
+        spec = copy.deepcopy(study.experiment)
+    for path, value in overrides.items():
+        section, _, field_path = path.partition(".")
+        sections, name = (
+            ([], field_path)
+            if section == "axes"
+            else (field_path.split(".")[:-1], field_path.rpartition(".")[2])
+        )
+        inner = spec.setdefault(section, {})
+        for section_name in sections:
+            inner = inner[section_name]
+        inner[name] = value
+    return spec
+
+
+def serve_runs() -> None:
+    """Run the spec files named on standard input; answer with processor time [s] and points."""
+    import sweep
+
+    for line in sys.stdin:
+        spec = sweep.load(line.strip())
+        with tempfile.TemporaryDirectory() as folder:
+            start = time.process_time()
+            outcome = sweep.run(spec, store=f"{folder}/side.zarr", scheduler="none", progress=False)
+            cpu_seconds = time.process_time() - start
+        if not outcome.complete:
+            sys.exit(f"{line.strip()}: {outcome.stopped or outcome.failures}")
+        print(json.dumps([cpu_seconds, outcome.points]), flush=True)
+
+
+class Version:
+    """A process that runs studies by the check-out in a folder."""
+
+    def __init__(self, name: str, checkout: Path) -> None:
+        self.name, self._checkout = name, checkout
+        environment = {
+            "PYTHONPATH": str(checkout),
+            "NUMBA_CACHE_DIR": str(WORK_DIR / f"kernels_{name}"),
+            "OMP_NUM_THREADS": "1",
+            "OPENBLAS_NUM_THREADS": "1",
+        }
+        self._process = subprocess.Popen(
+            [sys.executable, __file__, "--serve"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env=os.environ | environment,
+            cwd=WORK_DIR,
+        )
+
+    def run(self, spec: Path) -> tuple[float, int]:
+        """Processor time [s] of a study, and its points."""
+        assert self._process.stdin is not None and self._process.stdout is not None
+        print(spec, file=self._process.stdin, flush=True)
+        answer_line = self._process.stdout.readline()
+        if not answer_line:
+            sys.exit(f"{self.name} has ended: see above")
+        cpu_seconds, points = json.loads(answer_line)
+        return cpu_seconds, points
+
+    def seconds_per_point(self, study: TimedStudy, folder: Path) -> float:
+        """Processor time of a point [s] that the whole study has and its part lacks."""
+        results = []
+        for name, overrides in (("whole", study.whole_overrides), ("part", study.part_overrides)):
+            file = folder / f"{name}_{self.name}.yaml"
+            spec = experiment_with_overrides(self._checkout, study, overrides)
+            file.write_text(yaml.safe_dump(spec, sort_keys=False))
+            results.append(self.run(file))
+        (whole_seconds, whole_points), (part_seconds, part_points) = results
+        return (whole_seconds - part_seconds) / (whole_points - part_points)
+
+    def close(self) -> None:
+        """End the process."""
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        self._process.wait()
+
+
+def check_out_commit(commit: str) -> Path:
+    """The tree of a commit, made once."""
+    checkout = WORK_DIR / commit
+    if not checkout.exists():
+        subprocess.run(
+            ["git", "worktree", "add", "--detach", str(checkout), commit], check=True, cwd=ROOT
+        )
+    return checkout
+
+
+def measure_versions(versions: list[Version], study: TimedStudy, rounds: int) -> list[list[float]]:
+    """Times of a point [s], (rounds, versions), after a round that may compile."""
+    with tempfile.TemporaryDirectory() as folder:
+        seconds_by_round = []
+        for count in range(rounds + 1):
+            order = versions if count % 2 else versions[::-1]
+            seconds_by_version = {
+                version.name: version.seconds_per_point(study, Path(folder)) for version in order
+            }
+            seconds_by_round.append([seconds_by_version[version.name] for version in versions])
+        return seconds_by_round[1:]
+
+
+def show_row(
+    name: str, before: float, after: float, ratio: float, low: float, high: float, aim: float,
+    against: str = "",
+) -> None:  # fmt: skip
+    """Print times [us] and their ratio, and tell whether it is beyond the aim.
+
+    A study that is compared with another of this version has the aim of that comparison alone.
+    """
+    goal = f"{'':8}" if against else f"{aim:8.2f}"
+    missed = "" if against or ratio <= aim else "  missed"
+    print(f"{name:32}{before:14.3g}{after:14.3g}{ratio:8.2f}{low:8.2f}{high:8.2f}{goal}{missed}",
+          flush=True)  # fmt: skip
+
+
+def main() -> None:
+    """Print a row for each study as it is measured."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("studies", nargs="*", help="names of studies, default all")
+    parser.add_argument("--group", choices=GROUPS, default="experiments")
+    parser.add_argument("--earlier", default=EARLIER_COMMIT, help="commit to stand beside this one")
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.serve:
+        return serve_runs()
+    group = GROUPS[arguments.group]
+    if unknown := set(arguments.studies) - set(group):
+        parser.error(f"no such study: {', '.join(sorted(unknown))}; there are {', '.join(group)}")
+    WORK_DIR.mkdir(parents=True, exist_ok=True)
+    versions = [
+        Version(arguments.earlier, check_out_commit(arguments.earlier)),
+        Version("now", ROOT),
+    ]
+    print(f"{'study':32}{arguments.earlier + ' [us]':>14}{'now [us]':>14}{'ratio':>8}{'from':>8}"
+          f"{'to':>8}{'aim':>8}")  # fmt: skip
+    least: dict[str, float] = {}
+    for name in arguments.studies or group:
+        study = group[name]
+        seconds_by_round = measure_versions(versions, study, arguments.rounds)
+        earlier, now = (1e6 * min(column) for column in zip(*seconds_by_round, strict=True))
+        least[name] = now
+        ratios = sorted(after / before for before, after in seconds_by_round)
+        show_row(
+            name, earlier, now, now / earlier, ratios[0], ratios[-1], study.ratio_max, study.against
+        )
+        if study.against in least:
+            ratio = now / least[study.against]
+            show_row(f"  / {study.against}", least[study.against], now, ratio, ratio, ratio,
+                     study.ratio_max)  # fmt: skip
+    for version in versions:
+        version.close()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,649 @@
+"""Settings that `sweep accuracy` tried: who beats whom, in tables, words and a figure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure as Sheet
+from matplotlib.ticker import FuncFormatter, LogLocator
+
+from sweep.analysis import canvas, labels
+from sweep.analysis.datasets import ACCURACY_KIND, read_attributes_of_kind
+from sweep.analysis.tables import PageTable, TablePage
+from sweep.storage.locations import Location, output_dir
+from sweep.storage.store_format import OPEN_ZARR_KWARGS
+from sweep.storage.verified_store import open_verified_store
+
+TABULATED_TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
+
+NEGLIGIBLE_ERROR = 1e-9
+"""Error below which settings are alike: that of the reference itself."""
+
+AS_WRITTEN_KIND, ADAPTIVE_KIND, THESIS_KIND, REFERENCE_KIND = (
+    "as written",
+    "adaptive",
+    "thesis",
+    "reference",
+)
+CLOSED_FORM_KIND, IMPROVED_THESIS_KIND = "closed form", "thesis improved"
+BEAMLETS_KIND, LINE_PATTERN_KIND = "beamlets", "in a line"
+MEAN_OF_DRAWS_KIND, COUNTED_DRAWS_KIND, DRAWS_IN_NOISE_KIND = (
+    "means of draws",
+    "draws counted",
+    "draws in noise",
+)
+FIXED_KINDS = (
+    "fixed effects",
+    BEAMLETS_KIND,
+    LINE_PATTERN_KIND,
+    CLOSED_FORM_KIND,
+    "all on",
+    MEAN_OF_DRAWS_KIND,
+    COUNTED_DRAWS_KIND,
+    DRAWS_IN_NOISE_KIND,
+)
+"""Kinds of settings that are the same at every point."""
+
+FIXED_SPEEDUP_MIN, THESIS_SPEEDUP_MIN = 1 / 1.1, 5.0
+"""Goals of adaptive settings: against the best fixed one, against the thesis's way."""
+
+THESIS_BEAMLETS = 109
+"""Beamlets of the thesis's way."""
+
+MEDIAN_ROUNDS_MIN = 3
+"""Rounds of which fewer have no median that one slow trial would not move."""
+
+RANDOM_ERROR_QUANTILE = 0.95
+"""Share of the points whose error counts where errors are random; else all of them do."""
+
+
+@dataclass(frozen=True)
+class MeasuredSetting:
+    """A rung, in numbers."""
+
+    name: str
+    kind: str
+    tolerance: float
+    seconds_by_round: np.ndarray  # seconds a point by round
+    planning_seconds: float  # seconds a point in the best round
+    pd_error: np.ndarray  # by point
+    log10_pfa_error: float  # largest over the points; nan where it has none, as the next two
+    magnitude_error: float
+    leakage_error: float  # no part of what is promised: it jumps where a bin comes to the threshold
+    error_quantile: float  # share of the points that :attr:`error` is of
+
+    @property
+    def best_seconds(self) -> float:
+        """A point, in the best of the rounds."""
+        return float(np.min(self.seconds_by_round))
+
+    @property
+    def largest_error(self) -> float:
+        """Return the largest error of all promised; if random, that of pd at most points."""
+        if self.error_quantile < 1.0:
+            return self.pd_error_quantile(self.error_quantile)
+        promised_errors = self.pd_error_quantile(1.0), self.log10_pfa_error, self.magnitude_error
+        return float(np.fmax.reduce(promised_errors))
+
+    @property
+    def is_complete(self) -> bool:
+        """True where it simulates all that is asked for, or lacks what makes no larger an error."""
+        return self.kind != CLOSED_FORM_KIND or self.leakage_error <= max(
+            self.largest_error, NEGLIGIBLE_ERROR
+        )
+
+    def pd_error_quantile(self, fraction: float) -> float:
+        """Error of pd that this share of the points stays below."""
+        return float(np.nanquantile(self.pd_error, fraction))
+
+    def speedup_over(self, other: MeasuredSetting, extra_seconds: float = 0.0) -> float:
+        """Time of another over that of this, round by round, in the median; of few rounds, at best.
+
+        Both with what a point takes besides [s].
+        """
+        if self.seconds_by_round.size < MEDIAN_ROUNDS_MIN:
+            return (other.best_seconds + extra_seconds) / (self.best_seconds + extra_seconds)
+        return float(
+            np.median(
+                (other.seconds_by_round + extra_seconds) / (self.seconds_by_round + extra_seconds)
+            )
+        )
+
+
+def read_settings(dataset: xr.Dataset) -> list[MeasuredSetting]:
+    """Return the settings of a store that `sweep accuracy` made, in its order."""
+    array_by_name = {name: array.values for name, array in dataset.variables.items()}
+    error_quantile = (
+        RANDOM_ERROR_QUANTILE if np.isfinite(array_by_name["standard_error"]).any() else 1.0
+    )
+    return [
+        MeasuredSetting(
+            name=str(name),
+            kind=str(array_by_name["kind"][i]),
+            tolerance=float(array_by_name["tolerance"][i]),
+            seconds_by_round=array_by_name["seconds"][i],
+            planning_seconds=float(
+                array_by_name["planning"][i, np.argmin(array_by_name["seconds"][i])]
+            ),
+            pd_error=array_by_name["pd_error"][i],
+            log10_pfa_error=float(np.fmax.reduce(array_by_name["log10_pfa_error"][i])),
+            magnitude_error=float(np.fmax.reduce(array_by_name["magnitude_error"][i])),
+            leakage_error=float(np.fmax.reduce(array_by_name["leakage_error"][i])),
+            error_quantile=error_quantile,
+        )
+        for i, name in enumerate(array_by_name["rung"])
+    ]
+
+
+def select_kinds(settings: Iterable[MeasuredSetting], *kinds: str) -> list[MeasuredSetting]:
+    """Return settings of some kinds."""
+    return [setting for setting in settings if setting.kind in kinds]
+
+
+def without_reference(settings: Iterable[MeasuredSetting]) -> list[MeasuredSetting]:
+    """All but the reference, which has no error of its own."""
+    return [setting for setting in settings if setting.kind != REFERENCE_KIND]
+
+
+def pareto_front(settings: Sequence[MeasuredSetting]) -> list[MeasuredSetting]:
+    """Return the settings that none is both as fast and as accurate as, the fastest first."""
+    front_settings: list[MeasuredSetting] = []
+    for setting in sorted(settings, key=lambda s: (s.best_seconds, s.largest_error)):
+        if not front_settings or max(setting.largest_error, NEGLIGIBLE_ERROR) < max(
+            front_settings[-1].largest_error, NEGLIGIBLE_ERROR
+        ):
+            front_settings.append(setting)
+    return front_settings
+
+
+def cheapest_within_error(
+    settings: Sequence[MeasuredSetting], error_max: float
+) -> MeasuredSetting | None:
+    """Return the fastest setting whose error is no larger."""
+    error_limit = max(error_max, NEGLIGIBLE_ERROR)
+    accurate_settings = [setting for setting in settings if setting.largest_error <= error_limit]
+    return min(accurate_settings, key=lambda s: s.best_seconds, default=None)
+
+
+class SettingComparison(NamedTuple):
+    """An adaptive setting against another, both with no more than an error; None where none is."""
+
+    adaptive: MeasuredSetting
+    other: MeasuredSetting | None
+
+    def speedup(self, extra_seconds: float = 0.0) -> float:
+        """Time of the other over that of the adaptive one; inf against nothing.
+
+        Both with what a point takes besides [s].
+        """
+        return self.adaptive.speedup_over(self.other, extra_seconds) if self.other else math.inf
+
+
+def compare_with_fixed(settings: Sequence[MeasuredSetting]) -> list[SettingComparison]:
+    """For each error that adaptive settings have: the fastest of them, the fastest fixed one."""
+    adaptive_settings = select_kinds(settings, ADAPTIVE_KIND)
+    fixed_settings = [
+        setting for setting in select_kinds(settings, *FIXED_KINDS) if setting.is_complete
+    ]
+    errors = sorted(
+        {max(setting.largest_error, NEGLIGIBLE_ERROR) for setting in adaptive_settings},
+        reverse=True,
+    )
+    cheapest_by_error = (
+        (cheapest_within_error(adaptive_settings, error), error) for error in errors
+    )
+    return [
+        SettingComparison(cheapest_adaptive, cheapest_within_error(fixed_settings, error))
+        for cheapest_adaptive, error in cheapest_by_error
+        if cheapest_adaptive is not None
+    ]
+
+
+def compare_with_thesis(
+    settings: Sequence[MeasuredSetting], kind: str = THESIS_KIND
+) -> list[SettingComparison]:
+    """Return the fastest adaptive setting as accurate as each form of the thesis's way."""
+    adaptive_settings = select_kinds(settings, ADAPTIVE_KIND)
+    cheapest_by_thesis = (
+        (cheapest_within_error(adaptive_settings, thesis_form.largest_error), thesis_form)
+        for thesis_form in select_kinds(settings, kind)
+    )
+    return [
+        SettingComparison(cheapest_adaptive, thesis)
+        for cheapest_adaptive, thesis in cheapest_by_thesis
+        if cheapest_adaptive is not None
+    ]
+
+
+SETTING_COLUMNS = ("setting", "us a point", "planning", "median", "90 %", "largest", "log10 pfa",
+           "magnitude", "leakage", "front")  # fmt: skip
+"""Time, its share of planning, and errors: three quantiles of pd's, the largest of the others."""
+
+
+SHORT_SETTING_COLUMNS = ("setting", "time", "90 %", "largest", "log pfa", "peak", "leakage")
+"""The same in few columns."""
+
+CHEAPEST_COLUMNS = ("error allowed", "cheapest setting", "us a point", "its error")
+
+STORING_ATTRIBUTE = "storing_seconds"
+"""Attribute that stores of earlier versions lack."""
+
+
+def setting_rows(settings: Sequence[MeasuredSetting]) -> list[list[str]]:
+    """Return a row for each setting, by COLUMNS."""
+    front_settings = pareto_front(without_reference(settings))
+    return [
+        [
+            s.name,
+            format_microseconds(s.best_seconds),
+            format_microseconds(s.planning_seconds) if s.planning_seconds else "-",
+            *(format_error(s.pd_error_quantile(fraction)) for fraction in (0.5, 0.9, 1.0)),
+            *map(format_error, (s.log10_pfa_error, s.magnitude_error, s.leakage_error)),
+            "*" if s in front_settings else "",
+        ]
+        for s in settings
+    ]
+
+
+def short_setting_rows(settings: Sequence[MeasuredSetting]) -> list[list[str]]:
+    """Return the rows by SHORT: settings on the Pareto front have a star before their names."""
+    return [
+        [f"{front_mark or ' '} {name}", f"{time} us", *errors]
+        for name, time, _, _, *errors, front_mark in setting_rows(settings)
+    ]
+
+
+def cheapest_rows(settings: Sequence[MeasuredSetting]) -> list[list[str]]:
+    """Return the cheapest setting for each tolerance: tolerance, setting, its time, its error."""
+    table_rows = []
+    for tolerance in TABULATED_TOLERANCES:
+        cheapest_setting = cheapest_within_error(without_reference(settings), tolerance)
+        cells = cheapest_setting and [
+            cheapest_setting.name,
+            format_microseconds(cheapest_setting.best_seconds),
+            format_error(cheapest_setting.largest_error),
+        ]
+        table_rows.append([f"{tolerance:g}", *(cells or ["none", "", ""])])
+    return table_rows
+
+
+def conclusion_sentences(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> list[str]:
+    """Conclusions in words."""
+    attributes = dataset.attrs
+    conclusions = [_as_written_sentence(dataset, settings)]
+    conclusions += _fixed_sentences(compare_with_fixed(settings), attributes)
+    conclusions += _thesis_sentences(
+        settings, attributes["thesis_beamlets"]
+    ) + _closed_form_sentences(settings)
+    conclusions.append(_reference_sentence(attributes))
+    notes = attributes["notes"]  # a list in stores of earlier versions
+    notes = notes.splitlines() if isinstance(notes, str) else notes
+    conclusions += [note[0].upper() + note[1:] + "." for note in notes]
+    if stop_reason := attributes["stopped"]:
+        points_text = f"{attributes['points']} {attributes['unit']}"
+        conclusions.append(f"Not the whole sample ({stop_reason}): {points_text} of it.")
+    return conclusions
+
+
+def accuracy_page(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> TablePage:
+    """Tables and sentences under the study's title."""
+    page_tables = [
+        PageTable("Settings", SETTING_COLUMNS, setting_rows(settings)),
+        PageTable("Cheapest setting for each error", CHEAPEST_COLUMNS, cheapest_rows(settings)),
+    ]
+    return TablePage(
+        f"{dataset.attrs['title']}: accuracy",
+        page_tables,
+        conclusion_sentences(dataset, settings),
+        [],
+    )
+
+
+def _as_written_sentence(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> str:
+    (as_written,) = select_kinds(settings, AS_WRITTEN_KIND)
+    n_points, unit = dataset.attrs["study_points"], dataset.attrs["unit"]
+    cheapest_setting = cheapest_within_error(without_reference(settings), as_written.largest_error)
+    subject = f"All {n_points:,} {unit} take" if n_points > 1 else "The study takes"
+    text = (
+        f"As written: {format_microseconds(as_written.best_seconds)} us a point, error "
+        f"{format_error(as_written.largest_error)}. "
+        f"{subject} {_format_duration(n_points * as_written.best_seconds)} on one core"
+    )
+    if (storing_seconds := dataset.attrs.get(STORING_ATTRIBUTE)) is not None:
+        text += (
+            f"; storing them takes at least {_format_duration(storing_seconds)} more with any "
+            "setting"
+        )
+    if (
+        cheapest_setting is None
+        or cheapest_setting is as_written
+        or cheapest_setting.speedup_over(as_written) < 1.05
+    ):
+        return text + ". No other setting is both faster and as accurate."
+    speedup_text = f"{cheapest_setting.speedup_over(as_written):.2g}"
+    return (
+        text
+        + f". The setting {cheapest_setting.name} is {speedup_text} times as fast and as accurate."
+    )
+
+
+def _fixed_sentences(comparisons: Sequence[SettingComparison], attributes: dict) -> list[str]:
+    """Statement on adaptive against fixed settings."""
+    if not comparisons:
+        return []
+    worst_comparison = min(comparisons, key=SettingComparison.speedup)
+    if worst_comparison.other is None:
+        return ["No fixed setting is as accurate as any adaptive one."]
+    verdict_text = (
+        "met"
+        if worst_comparison.speedup() >= FIXED_SPEEDUP_MIN
+        else _slowdown_text(worst_comparison, comparisons, attributes)
+    )
+    speedups = [f"{comparison.speedup():.2g}" for comparison in comparisons if comparison.other]
+    low, high = min(speedups, key=float), max(speedups, key=float)
+    span_text = low if low == high else f"{low} to {high}"
+    return [
+        f"At equal error, adaptive settings are {span_text} times as fast as the best single "
+        f"fixed setting. Least speed-up: {worst_comparison.adaptive.name} over "
+        f"{worst_comparison.other.name}. "
+        f"Requirement, never slower by more than 10 %: {verdict_text}."
+    ]
+
+
+def _slowdown_text(
+    worst_comparison: SettingComparison, comparisons: Sequence[SettingComparison], attributes: dict
+) -> str:
+    """By how much an adaptive setting is slower, and what that is of all that the study takes."""
+    n_points = attributes["study_points"]
+    extra_seconds = worst_comparison.adaptive.best_seconds * (1 - worst_comparison.speedup())
+    lost_text, planning_text = (
+        _format_duration(n_points * point_seconds)
+        for point_seconds in (extra_seconds, worst_comparison.adaptive.planning_seconds)
+    )
+    shortfall_text = f"NOT met, by {lost_text} in all; planning takes {planning_text}"
+    if (storing_seconds := attributes.get(STORING_ATTRIBUTE)) is None:
+        return shortfall_text
+    speedup_with_store = min(
+        comparison.speedup(storing_seconds / n_points) for comparison in comparisons
+    )
+    return f"{shortfall_text}; with the study's store it is {speedup_with_store:.2g} times as fast"
+
+
+def _thesis_sentences(settings: Sequence[MeasuredSetting], beamlets: int) -> list[str]:
+    """Statements on adaptive settings against the thesis's way, as described and improved."""
+    comparisons = compare_with_thesis(settings)
+    if not comparisons:
+        return []
+    verdict_text = " and ".join(
+        f"{'met' if comparison.speedup() >= THESIS_SPEEDUP_MIN else 'NOT met'} over "
+        f"{comparison.other.name}"
+        for comparison in comparisons
+        if comparison.other
+    )
+    requirement_note = f"Requirement, at least {THESIS_SPEEDUP_MIN:g}: {verdict_text}."
+    if beamlets != THESIS_BEAMLETS:
+        requirement_note = f"This scene has {beamlets} beamlets, the thesis {THESIS_BEAMLETS}."
+    statements = [
+        f"The thesis's way is compared at its own error. {_speedup_sentences(comparisons)} "
+        f"{requirement_note}"
+    ]
+    if improved_comparisons := compare_with_thesis(settings, IMPROVED_THESIS_KIND):
+        statements.append(
+            "Improved versions of it are compared likewise. "
+            f"{_speedup_sentences(improved_comparisons)}"
+        )
+    return statements
+
+
+def _speedup_sentences(comparisons: Sequence[SettingComparison]) -> str:
+    """One sentence for each adaptive setting and error."""
+    speedups_by_case: dict[str, list[str]] = {}
+    for comparison in comparisons:
+        if comparison.other:
+            case = (
+                f"{comparison.adaptive.name}, error {format_error(comparison.other.largest_error)}"
+            )
+            speedups_by_case.setdefault(case, []).append(
+                f"{comparison.speedup():.2g} over {comparison.other.name}"
+            )
+    return " ".join(
+        f"Speed-up of {case}: {'; '.join(speedups)}." for case, speedups in speedups_by_case.items()
+    )
+
+
+def _closed_form_sentences(settings: Sequence[MeasuredSetting]) -> list[str]:
+    """Compare the closed form with the thesis's way: same beamlets, same effects."""
+    described_text, improved_text = (
+        "; ".join(
+            f"{closed_form_setting.speedup_over(thesis_setting):.2g} over {thesis_setting.name}"
+            for closed_form_setting in select_kinds(settings, CLOSED_FORM_KIND)
+            for thesis_setting in select_kinds(settings, kind)
+        )
+        for kind in (THESIS_KIND, IMPROVED_THESIS_KIND)
+    )
+    if not described_text:
+        return []
+    text = (
+        "The closed form is compared with the thesis's way for the same beamlets and effects, "
+        f"without leakage and changes within a record (range walk). Speed-up: {described_text}."
+    )
+    return [text + (f" Speed-up over improved versions: {improved_text}." if improved_text else "")]
+
+
+def _reference_sentence(attributes: dict) -> str:
+    text = f"Reference: {attributes['reference']}"
+    if not attributes["truth_points"]:
+        return text + ". It is not compared with the time domain."
+    beamlets_note = (
+        f", with {n_beamlets} beamlets in both,"
+        if (n_beamlets := attributes["truth_beamlets"])
+        else ""
+    )
+    return text + (
+        f". At {attributes['truth_points']} {attributes['unit']}{beamlets_note} it differs from "
+        "the time "
+        f"domain by {format_error(attributes['truth_pd_difference'])} in pd and by "
+        f"{format_error(attributes['truth_magnitude_difference'])} in magnitude."
+    )
+
+
+def _format_duration(seconds: float) -> str:
+    if seconds < 100:
+        return f"{seconds:.2g} s"
+    return f"{seconds / 60:,.0f} min" if seconds < 6000 else f"{seconds / 3600:,.0f} h"
+
+
+def format_microseconds(seconds: float) -> str:
+    """Return a time in microseconds, in three digits."""
+    value = 1e6 * seconds
+    return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
+
+
+def format_error(value: float) -> str:
+    """Return an error in two digits; 0 below what counts, nothing for nan."""
+    if math.isnan(value):
+        return "-"
+    return (
+        f"{value:.1e}"
+        if value >= NEGLIGIBLE_ERROR
+        else f"<{NEGLIGIBLE_ERROR:.0e}".replace("e-0", "e-")
+    )
+
+
+NUMBERED_KINDS = (
+    BEAMLETS_KIND,
+    LINE_PATTERN_KIND,
+    MEAN_OF_DRAWS_KIND,
+    COUNTED_DRAWS_KIND,
+    DRAWS_IN_NOISE_KIND,
+)
+"""Kinds whose settings are told apart by the number that their names begin with."""
+
+CONNECTED_KINDS = (ADAPTIVE_KIND, *NUMBERED_KINDS)
+"""Kinds whose settings are one method, looked at more or less closely."""
+
+MARK_BY_KIND = {
+    ADAPTIVE_KIND: ("o", canvas.LINE_COLOURS[0], "adaptive, by tolerance"),
+    "fixed effects": ("s", canvas.LINE_COLOURS[2], "the same effects everywhere"),
+    BEAMLETS_KIND: ("^", canvas.LINE_COLOURS[1], "number of beamlets in a lattice"),
+    LINE_PATTERN_KIND: ("<", canvas.LINE_COLOURS[7], "number of beamlets in a line"),
+    "all on": ("D", canvas.LINE_COLOURS[3], "all effects on"),
+    MEAN_OF_DRAWS_KIND: ("P", canvas.LINE_COLOURS[5], "mean over so many draws"),
+    COUNTED_DRAWS_KIND: ("^", canvas.LINE_COLOURS[1], "detections in so many draws"),
+    DRAWS_IN_NOISE_KIND: ("<", canvas.LINE_COLOURS[7], "the same, noise in every bin"),
+    CLOSED_FORM_KIND: ("X", canvas.LINE_COLOURS[5], "in closed form what the thesis's way has"),
+    THESIS_KIND: ("v", canvas.LINE_COLOURS[4], "the thesis's way"),
+    IMPROVED_THESIS_KIND: ("p", canvas.LINE_COLOURS[4], "the thesis's way, improved"),
+    AS_WRITTEN_KIND: ("*", canvas.LINE_COLOURS[6], "as written"),
+}
+"""Marker, colour and words of each kind."""
+
+
+def draw_accuracy_sheet(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> Sheet:
+    """Return the figure of a store that `sweep accuracy` made."""
+    plotted_settings = without_reference(settings)
+    sheet, (axes,) = canvas.sheet_with_axes(10.0, 6.2, 1, 1)
+    axes.step(
+        *zip(*map(_plot_position, pareto_front(plotted_settings)), strict=True),
+        where="post",
+        color="0.35",
+        linewidth=1.2,
+        linestyle="--",
+        zorder=1,
+        label="Pareto front of time and error",
+    )
+    for kind, (marker, colour, label) in MARK_BY_KIND.items():
+        kind_settings = select_kinds(plotted_settings, kind)
+        for i, setting in enumerate(kind_settings):
+            _draw_mark(axes, setting, marker, colour, label if i == 0 else "")
+        if kind in CONNECTED_KINDS and kind_settings:
+            polyline = zip(*map(_plot_position, kind_settings), strict=True)
+            axes.plot(*polyline, color=colour, linewidth=0.8, alpha=0.5, zorder=1)
+            kind_settings = kind_settings[:1] + kind_settings[1:][-1:]
+        for setting in kind_settings:
+            axes.annotate(
+                _short_name(setting),
+                _plot_position(setting),
+                xytext=(6, 5),
+                textcoords="offset points",
+                fontsize=7.5,
+                color=colour,
+            )
+    _set_axes(
+        axes,
+        min(setting.pd_error_quantile(0.5) for setting in plotted_settings),
+        max(s.largest_error for s in plotted_settings),
+    )
+    canvas.set_title(sheet, f"{dataset.attrs['title']}: what accuracy costs")
+    canvas.set_caption(sheet, _sheet_note(dataset, plotted_settings))
+    return sheet
+
+
+def _draw_mark(axes: Axes, setting: MeasuredSetting, marker: str, colour: str, label: str) -> None:
+    """Draw a mark at the largest error, a line down to pd's of 90 %, a dot at its median."""
+    time, largest_error = _plot_position(setting)
+    error_90, error_median = (
+        max(setting.pd_error_quantile(fraction), NEGLIGIBLE_ERROR) for fraction in (0.9, 0.5)
+    )
+    if error_90 > NEGLIGIBLE_ERROR:
+        axes.plot(
+            [time, time],
+            [error_90, largest_error],
+            color=colour,
+            linewidth=1.0,
+            alpha=0.6,
+            zorder=2,
+        )
+        axes.plot([time], [error_90], marker="_", color=colour, markersize=7, zorder=2)
+    if error_median > NEGLIGIBLE_ERROR:
+        axes.plot([time], [error_median], marker=".", color=colour, markersize=4, zorder=2)
+    mark_size = 11 if marker == "*" else 7
+    axes.plot(
+        [time], [largest_error], marker=marker, color=colour, markersize=mark_size, linestyle="",
+        markeredgecolor="white", markeredgewidth=0.7, label=label or None, zorder=4,
+    )  # fmt: skip
+
+
+def _plot_position(setting: MeasuredSetting) -> tuple[float, float]:
+    """Time [us] and error at which a setting is drawn."""
+    return 1e6 * setting.best_seconds, max(setting.largest_error, NEGLIGIBLE_ERROR)
+
+
+def _short_name(setting: MeasuredSetting) -> str:
+    """Short name that tells a setting from others of its kind."""
+    if setting.kind == ADAPTIVE_KIND:
+        return f"{setting.tolerance:.0e}".replace("e-0", "e-")
+    if setting.kind == THESIS_KIND:
+        return setting.name.removeprefix("thesis ")
+    if setting.kind in NUMBERED_KINDS:
+        return setting.name.split()[0]
+    return ""
+
+
+def _set_axes(axes: Axes, error_min: float, error_max: float) -> None:
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_ylim(max(NEGLIGIBLE_ERROR, error_min) / 2, max(2.5, 2 * error_max))
+    axes.margins(x=0.16)
+    plain_formatter = FuncFormatter(lambda value, _: f"{value:g}")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_formatter(plain_formatter)
+    axes.xaxis.set_minor_formatter(FuncFormatter(lambda value, _: ""))
+    axes.set_xlabel("time a point on one core (µs)")
+    axes.set_ylabel("largest error of pd, log10 pfa and magnitudes")
+    axes.grid(True, which="major", color="0.9", linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+
+
+def _sheet_note(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> str:
+    """Return the notes that explain the figure."""
+    attributes = dataset.attrs
+    error_quantile = settings[0].error_quantile
+    mark_meaning = "the largest" if error_quantile == 1 else f"that of {100 * error_quantile:.0f} %"
+    phrases = [
+        f"mark: {mark_meaning} of "
+        f"{labels.format_count(attributes['points'], attributes['unit'][:-1])}; "
+        f"bar and dot: 90 % and half of them, in pd alone; {NEGLIGIBLE_ERROR:g} and less at the "
+        "foot",
+        f"best of {labels.format_count(dataset.sizes['round'], 'round')}; "
+        f"reference: {attributes['reference']}",
+    ]
+    if attributes["truth_points"]:
+        difference_text = format_error(attributes["truth_pd_difference"])
+        phrases.append(
+            f"time domain at {labels.format_count(attributes['truth_points'], 'point')}: within "
+            f"{difference_text} of it"
+        )
+    phrases.append(f"study {attributes['study_id'][:8]}, model {attributes['model_version']}")
+    return labels.join_sentences(phrases)
+
+
+def open_accuracy_store(store: Location) -> tuple[xr.Dataset, list[MeasuredSetting]]:
+    """Return the store as a dataset, read whole, and its settings; NotAStoreError if it is none."""
+    study_id = read_attributes_of_kind(store, ACCURACY_KIND)["study_id"]
+    with xr.open_zarr(open_verified_store(store, study_id), **OPEN_ZARR_KWARGS) as dataset:
+        loaded = dataset.load()
+    return loaded, read_settings(loaded)
+
+
+def write_sheet_and_tables(
+    store: Location, directory: Path | None = None, picture_format: str = "png"
+) -> list[Path]:
+    """Write the figure as NAME.png (pdf, svg) and the tables as NAME.txt."""
+    dataset, settings = open_accuracy_store(store)
+    stem = store.name.removesuffix(".zarr")
+    folder = output_dir(store) if directory is None else directory
+    table_path = folder / f"{stem}.txt"
+    picture_path = canvas.save_sheet(
+        draw_accuracy_sheet(dataset, settings), folder / f"{stem}.{picture_format}"
+    )
+    table_path.write_text(accuracy_page(dataset, settings).to_text(), encoding="utf-8")
+    return [picture_path, table_path]

@@ -1,0 +1,309 @@
+"""Look up a dataset's coordinates, study and parameters, with units converted."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Iterable, Mapping
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from sweep.spec import GridSpec, SceneSpec, from_stored
+from sweep.spec.axes import read_in_unit
+from sweep.spec.rules import NumericRule
+from sweep.spec.sections import parameter_rules
+from sweep.units import QuantityError, read_number, read_quantity
+
+RELATIVE_TOLERANCE = 1e-9
+"""Relative tolerance for matching a value to one of the grid."""
+
+STUDY_ID = "study_id"
+"""Name of the coordinate, and of the attribute, with the identity of the study."""
+
+JOIN_REMEDY = (
+    "join stores with sweep.open([STORE, STORE], dim='design'), whose answers are per design"
+)
+
+_MARKER_PATTERN = re.compile("study_[0-9a-f]{16}")
+
+SPECS_ATTRIBUTE = "specs"
+"""Attribute of a join of studies: JSON of spec and variable names by study identity."""
+
+
+def marker_name(study_ids: Iterable[str]) -> str:
+    """Return the name of the marker coordinate of a study, or of a join of several.
+
+    xarray drops a conflicting coordinate or keeps the first dataset's, but keeps a coordinate that
+    only one dataset has. The identity is therefore in the name: a merge of two studies has two
+    markers.
+    """
+    study_ids = list(study_ids)
+    if len(study_ids) == 1:
+        return f"study_{study_ids[0][:16]}"
+    return f"study_{hashlib.sha256(' '.join(sorted(study_ids)).encode()).hexdigest()[:16]}"
+
+
+def marker_names(dataset: xr.Dataset | xr.DataTree) -> list[str]:
+    """Return the markers that a dataset has, by :func:`marker_name`."""
+    return [name for name in map(str, dataset.coords) if _MARKER_PATTERN.fullmatch(name)]
+
+
+def spec_of_dataset(dataset: xr.Dataset | xr.DataTree) -> GridSpec | SceneSpec:
+    """Return the spec of the study that a dataset, or a flight's tree, comes from."""
+    spec_text = dataset.attrs.get("spec")
+    _check_marker(dataset)
+    if STUDY_ID in dataset.coords:
+        study_id_coord = dataset.coords[STUDY_ID]
+        if study_id_coord.dims:
+            raise ValueError(
+                f"the dataset has several studies along '{study_id_coord.dims[0]}': select one of "
+                "them, "
+                f"ds.isel({study_id_coord.dims[0]}=0)"
+            )
+        if SPECS_ATTRIBUTE in dataset.attrs:
+            spec_text = (
+                json.loads(dataset.attrs[SPECS_ATTRIBUTE])
+                .get(str(study_id_coord.item()), {})
+                .get("spec")
+            )
+        elif dataset.attrs.get(STUDY_ID) != str(study_id_coord.item()):
+            spec_text = None
+    if not spec_text:
+        raise ValueError(
+            "the dataset lacks the spec of its study, an attribute that an operation has dropped "
+            "or taken from another: use a dataset of sweep.open, or "
+            "xarray.set_options(keep_attrs=True)"
+        )
+    return _parse_stored_spec(spec_text)
+
+
+def _check_marker(dataset: xr.Dataset | xr.DataTree) -> None:
+    """Raise a ValueError if a dataset combines several studies, or lacks its study's marker."""
+    dataset_markers = marker_names(dataset)
+    if len(dataset_markers) > 1:
+        short_ids = ", ".join(name.removeprefix("study_")[:8] for name in dataset_markers)
+        raise ValueError(
+            f"the dataset is put together of the studies {short_ids} and has the spec of the first "
+            f"alone: {JOIN_REMEDY}"
+        )
+    if STUDY_ID in dataset.coords and not dataset.coords[STUDY_ID].dims:
+        study_id = str(dataset.coords[STUDY_ID].item())
+        joined_ids = (
+            json.loads(dataset.attrs[SPECS_ATTRIBUTE])
+            if SPECS_ATTRIBUTE in dataset.attrs
+            else [study_id]
+        )
+        if dataset_markers != [marker_name(joined_ids)]:
+            raise ValueError(
+                f"the dataset lacks the coordinate '{marker_name(joined_ids)}', which proves that "
+                "no "
+                f"other study's variables are in it: take one that sweep.open gave, or "
+                f"{JOIN_REMEDY}"
+            )
+
+
+@lru_cache(maxsize=8)
+def _parse_stored_spec(spec_text: str) -> GridSpec | SceneSpec:
+    """Parse a stored spec; cached, because answers parse that of one dataset repeatedly."""
+    return from_stored(spec_text)
+
+
+def grid_spec_of_dataset(dataset: xr.Dataset) -> GridSpec:
+    """Return the spec of the grid study that a dataset comes from; ValueError for a flight's."""
+    spec = spec_of_dataset(dataset)
+    if not isinstance(spec, GridSpec):
+        raise ValueError("the dataset is a flight's: this answer is one of a grid of points")
+    return spec
+
+
+def require_variables(dataset: xr.Dataset, *names: str) -> None:
+    """Refuse a dataset that lacks variables which an answer needs."""
+    if missing := [name for name in names if name not in dataset]:
+        raise ValueError(
+            f"the dataset lacks {', '.join(missing)}, which this answer needs: take all variables "
+            "that sweep.open gives, or add these to the selection"
+        )
+
+
+def parse_si(raw_value: object, *, si_unit: str, name: str) -> float:
+    """Parse a quantity such as ``"20 Hz"`` to SI; a bare number is in SI already."""
+    if isinstance(raw_value, int | float) and not isinstance(raw_value, bool):
+        return float(raw_value)
+    try:
+        value, unit = read_quantity(raw_value, si_unit=si_unit, example=f"1 {si_unit}")
+    except QuantityError as error:
+        raise ValueError(f"{name} {error}") from None
+    return unit.to_si(value)
+
+
+def parse_pd_level(pd: object) -> float:
+    """Level of pd as a number, ``0.9`` or ``"90 %"``; ValueError unless it is between 0 and 1."""
+    is_number = isinstance(pd, np.number) and np.ndim(pd) == 0
+    try:
+        value, unit = read_number(pd.item() if is_number else pd)  # type: ignore[attr-defined]
+        level = unit.to_si(value)
+    except QuantityError as error:
+        raise ValueError(f"a level of pd, {pd!r:.60}, {error}") from None
+    if not 0 < level < 1:
+        raise ValueError(f"a level of pd lies between 0 and 1, and {pd!r} does not")
+    return level
+
+
+def find_coordinate(dataset: xr.Dataset, name: str) -> xr.DataArray:
+    """Return a coordinate by its name or by the dotted path of its parameter."""
+    for coord_name, coord in dataset.coords.items():
+        if name in (coord_name, coord.attrs.get("path")):
+            return coord
+    names = ", ".join(map(str, dataset.coords)) or "none"
+    raise ValueError(f"'{name}' is no coordinate of this dataset: there is {names}")
+
+
+def to_coordinate_units(coord: xr.DataArray, raw_value: object) -> float | str:
+    """Convert a value such as ``"2 km"`` to a coordinate's units; a bare number is in them."""
+    rule = parameter_rules().get(coord.attrs.get("path", ""))
+    if isinstance(raw_value, int | float | np.number) and not isinstance(raw_value, bool):
+        return float(raw_value)
+    if not isinstance(rule, NumericRule):
+        return str(raw_value)
+    try:
+        return read_in_unit(rule, raw_value, coord.attrs.get("units", ""))
+    except QuantityError as error:
+        raise ValueError(f"{coord.name} {error}") from None
+
+
+def to_si(coord: xr.DataArray) -> xr.DataArray:
+    """Return a coordinate's values in SI, or as strings if they are words."""
+    rule = parameter_rules().get(coord.attrs.get("path", ""))
+    units = coord.attrs.get("units", "")
+    if coord.dtype.kind not in "fiu":
+        return coord.copy(
+            data=np.array([str(v) for v in coord.values.ravel()]).reshape(coord.shape)
+        )
+    if not isinstance(rule, NumericRule) or not units:
+        return coord
+    unit = rule.read_exact(f"1 {units}")[1]
+    if unit.is_logarithmic:
+        return float(unit.factor) * 10 ** (coord / 10)
+    return coord * float(unit.factor) + float(unit.offset)
+
+
+def parameter_in_si(
+    dataset: xr.Dataset, path: str, spec: GridSpec | SceneSpec | None = None
+) -> xr.DataArray:
+    """Return a parameter in SI: over its axis, or as a scalar if it is the same for all points."""
+    coord = parameter_coordinate(dataset, path)
+    if coord is not None:
+        return to_si(coord).drop_vars(list(coord.coords), errors="ignore").assign_coords(
+            {n: c for n, c in coord.coords.items() if n in coord.dims}
+        )  # fmt: skip
+    spec = spec or grid_spec_of_dataset(dataset)
+    if any(axis_parameter.path == path for axis in spec.axes for axis_parameter in axis.parameters):
+        raise ValueError(
+            f"the dataset lacks the coordinate of {path}, an axis of its study: select one value "
+            "and keep it, ds.sweep.sel(...), or isel without drop=True"
+        )
+    return xr.DataArray(spec.parameters()[path])
+
+
+def parameter_coordinate(dataset: xr.Dataset, path: str) -> xr.DataArray | None:
+    """Return the coordinate of a parameter, by its dotted path."""
+    matches = (coord for coord in dataset.coords.values() if coord.attrs.get("path") == path)
+    return next(matches, None)
+
+
+def select_points(
+    dataset: xr.Dataset, selection: Mapping[str, Any], *, method: str | None = None
+) -> xr.Dataset:
+    """Select the points at which coordinates have given values.
+
+    Parameters
+    ----------
+    selection
+        By a coordinate's name or path: a value (``"2 km"``, or a number in the coordinate's own
+        units), a list of values, or a slice with both ends included. A single value of a dimension
+        coordinate removes its dimension. A coordinate along a zipped axis keeps the matching points
+        of that axis.
+    method
+        ``nearest`` takes the nearest value, for one within the coordinate's range; by default the
+        value must match to 1e-9.
+
+    Raises
+    ------
+    ValueError
+        No such coordinate, a value that cannot be read, or one that is not on the grid.
+    """
+    if method not in (None, "nearest"):
+        raise ValueError(f"method '{method}' is unknown: take 'nearest', or none")
+    for name, selected in selection.items():
+        coord = find_coordinate(dataset, name)
+        indices = _indices_of_selection(coord, selected, method)
+        if not coord.dims:
+            continue
+        is_single_value = not isinstance(selected, list | tuple | slice | np.ndarray)
+        if is_single_value and coord.name in coord.dims:
+            dataset = dataset.isel({coord.dims[0]: int(indices[0])})
+        else:
+            dataset = dataset.isel({coord.dims[0]: indices})
+    return dataset
+
+
+def _indices_of_selection(coord: xr.DataArray, selected: Any, method: str | None) -> np.ndarray:
+    """Return the indices of the wanted values; for slices in the coordinate's order."""
+    coord_values = np.atleast_1d(coord.values)
+    if isinstance(selected, slice):
+        low = (
+            -np.inf if selected.start is None else float(to_coordinate_units(coord, selected.start))
+        )
+        high = np.inf if selected.stop is None else float(to_coordinate_units(coord, selected.stop))
+        tolerance = RELATIVE_TOLERANCE * np.abs(coord_values)
+        return np.flatnonzero(
+            (coord_values >= low - tolerance) & (coord_values <= high + tolerance)
+        )
+    selected_values = selected if isinstance(selected, list | tuple | np.ndarray) else [selected]
+    indices = [
+        _indices_of_value(coord, coord_values, to_coordinate_units(coord, value), method)
+        for value in selected_values
+    ]
+    return np.concatenate(indices)
+
+
+def _indices_of_value(
+    coord: xr.DataArray, coord_values: np.ndarray, value: float | str, method: str | None
+) -> np.ndarray:
+    """Return the indices at which a coordinate has one value."""
+    units = coord.attrs.get("units", "")
+    if coord_values.dtype.kind not in "fiu":
+        coord_words = [str(word) for word in coord_values]
+        matches = np.flatnonzero([word == str(value) for word in coord_words])
+        if not matches.size:
+            available = ", ".join(dict.fromkeys(coord_words))
+            raise ValueError(f"{coord.name} '{value}' is not on the grid: there is {available}")
+        return matches
+    distance = np.abs(coord_values - float(value))
+    low, high = float(coord_values.min()), float(coord_values.max())
+    if (
+        not low - RELATIVE_TOLERANCE * abs(low)
+        <= float(value)
+        <= high + RELATIVE_TOLERANCE * abs(high)
+    ):
+        raise ValueError(
+            f"{coord.name} {value:g} {units} lies outside the grid, which reaches from {low:g} to "
+            f"{high:g} {units}"
+        )
+    nearest_value = coord_values[np.argmin(distance)]
+    if method == "nearest":
+        return np.flatnonzero(coord_values == nearest_value)
+    matches = np.flatnonzero(
+        distance <= RELATIVE_TOLERANCE * np.maximum(np.abs(coord_values), abs(float(value)))
+    )
+    if not matches.size:
+        raise ValueError(
+            f"{coord.name} {value:g} {units} is not on the grid: {nearest_value:g} {units} is "
+            "nearest, "
+            "which method='nearest' takes"
+        )
+    return matches

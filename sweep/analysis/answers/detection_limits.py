@@ -1,0 +1,309 @@
+"""Limits along an axis at which pd falls below a level: maximum range, least grazing angle.
+
+Between two points of the grid the place is interpolated in the normal deviate z(pd), pd = Phi(z).
+Q_1(a, b) is near Phi(a - b): z follows the signal's amplitude and is nearly a straight line where
+pd itself bends from 1 to 0. Digits near 1 come from the probability of a miss.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+from contourpy import contour_generator
+from scipy.special import ndtri
+
+from sweep.analysis.answers.dataset_lookup import find_coordinate, parse_pd_level, require_variables
+from sweep.analysis.answers.probability import confidence_attribute, pd_half_width, variable_name
+
+LIMIT_FOUND, NEVER_REACHED, NEVER_LOST, NOT_COMPUTED = range(4)
+REASON_MEANINGS = "found never_reached never_lost not_computed"
+
+_COMPLEMENT_ERROR_MAX = 1e-6
+"""Largest difference of pd + miss from 1 that rounding and means leave."""
+
+_DEVIATE_MAX = 38.0
+"""Normal deviate of the least positive float, in place of those of 0 and 1."""
+
+
+def normal_deviate(pd: xr.DataArray, miss: xr.DataArray | None = None) -> xr.DataArray:
+    """Return the normal deviate z of pd = Phi(z), from the probability of a miss above one half.
+
+    ValueError where the two probabilities do not add to 1 [when the result is computed].
+    """
+    miss_or_complement = 1 - pd if miss is None else miss
+
+    def clipped_deviate(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+        if (np.abs(p + q - 1) > _COMPLEMENT_ERROR_MAX).any():
+            raise ValueError(
+                "the probabilities of detection and of a miss do not add to 1, as after a maximum "
+                "or minimum of the dataset: ask for the answer first, of the whole dataset, and "
+                "compare its values then. A value without a limit is nan, for the reason in "
+                "unbroken_reason (such as never_lost: beyond the last value), and max() and min() "
+                "pass over it"
+            )
+        z = np.where(p < 0.5, p, q)
+        ndtri(z, out=z)
+        np.negative(z, out=z, where=p >= 0.5)
+        return np.clip(z, -_DEVIATE_MAX, _DEVIATE_MAX, out=z)
+
+    return xr.apply_ufunc(
+        clipped_deviate, pd, miss_or_complement, dask="parallelized", output_dtypes=[float]
+    )
+
+
+def limit(
+    dataset: xr.Dataset,
+    along: str,
+    pd: float | str = 0.9,
+    *,
+    segment: str = "shot",
+    from_highest: bool = False,
+) -> xr.Dataset:
+    """Farthest value of a coordinate up to which the probability of detection keeps to a level.
+
+    pd need not fall steadily: scalloping and interference make dips. So there are two answers.
+
+    Parameters
+    ----------
+    along
+        Coordinate, each value of it once; those of a zipped axis after a selection.
+    pd
+        The level, 0 < pd < 1, as 0.9 or "90 %".
+    segment
+        ``shot``, ``up``, ``doppler`` or ``down``.
+    from_highest
+        Whether to go from the largest value to the smallest, as for grazing angles.
+
+    Returns
+    -------
+    xarray.Dataset
+        In the coordinate's units, over what other dimensions there are; lazy:
+
+        - `unbroken`: the farthest value up to which pd is at the level or above all the way;
+        - `farthest`: the farthest value at which pd is at the level at all;
+        - `unbroken_reason`, `farthest_reason`: flags for the reason of a nan. Either pd is below
+          the level at the first value (or at all of them), or it is not below the level up to the
+          last value, or a deciding value is not computed.
+
+        `unbroken_low`, `unbroken_high` and so on are the answers with the lower and the upper ends
+        of pd's intervals, if it is drawn.
+
+    Raises
+    ------
+    ValueError
+        No such coordinate or level, one value only, or one that comes more than once.
+    """
+    level = parse_pd_level(pd)
+    coord = find_coordinate(dataset, along)
+    pd_name = variable_name("pd", segment)
+    require_variables(dataset, pd_name)
+    sorted_dataset, dim = _sort_along(dataset, coord, from_highest)
+    miss = sorted_dataset.get(variable_name("miss", segment))
+    limits = _limits_along(sorted_dataset[pd_name], miss, sorted_dataset[coord.name], dim, level)
+    interval_half_width = pd_half_width(sorted_dataset, segment)
+    if interval_half_width is not None:
+        for end, sign in (("low", -1), ("high", 1)):
+            shifted_pd = (sorted_dataset[pd_name] + sign * interval_half_width).clip(0, 1)
+            shifted_limits = _limits_along(shifted_pd, None, sorted_dataset[coord.name], dim, level)
+            limits |= {
+                f"{key}_{end}": a for key, a in shifted_limits.items() if not key.endswith("reason")
+            }
+    result = xr.Dataset(limits).assign_attrs(dataset.attrs)
+    return _set_attributes(
+        result, coord, segment, level, confidence_attribute(dataset, interval_half_width)
+    )
+
+
+def maximum_range(
+    dataset: xr.Dataset, pd: float | str = 0.9, *, segment: str = "shot"
+) -> xr.Dataset:
+    """Range up to which pd keeps to a level, unbroken and at all: :func:`limit`."""
+    return limit(dataset, "target.range", pd, segment=segment)
+
+
+def minimum_grazing_angle(
+    dataset: xr.Dataset, pd: float | str = 0.9, *, segment: str = "shot"
+) -> xr.Dataset:
+    """Least grazing angle down to which pd keeps to a level: :func:`limit`."""
+    return limit(dataset, "target.grazing_angle", pd, segment=segment, from_highest=True)
+
+
+def _sort_along(
+    dataset: xr.Dataset, coord: xr.DataArray, from_highest: bool
+) -> tuple[xr.Dataset, str]:
+    """Sort a dataset by a coordinate, in the direction of the search; its dimension."""
+    if coord.ndim != 1 or coord.size < 2:
+        raise ValueError(f"{coord.name} has a single value: there is nothing to go along")
+    order = np.argsort(coord.values, kind="stable")
+    values = coord.values[order]
+    if (values[1:] == values[:-1]).any():
+        raise ValueError(
+            f"{coord.name} has a value more than once: select by the other coordinates along "
+            f"'{coord.dims[0]}' first"
+        )
+    order = order[::-1] if from_highest else order
+    if (order == np.arange(order.size)).all():
+        return dataset, str(coord.dims[0])
+    return dataset.isel({coord.dims[0]: order}), str(coord.dims[0])
+
+
+def _limits_along(
+    pd: xr.DataArray, miss: xr.DataArray | None, coord: xr.DataArray, dim: str, level: float
+) -> dict[str, xr.DataArray]:
+    """Both answers and their reasons.
+
+    Places are counted in steps along the axis, so that they rise whichever way it is walked; those
+    that there are none of are infinite.
+    """
+    z = normal_deviate(pd, miss) - float(ndtri(level))
+    steps = xr.DataArray(np.arange(float(coord.size)), dims=[dim])
+    next_z = z.shift({dim: -1})
+    is_falling = (z >= 0) & (next_z < 0)
+    crossings = steps + z / (z - next_z).where(is_falling, 1.0)
+    first_break, first_unknown = (
+        _first_step(crossings, is_falling, dim),
+        _first_step(steps, z.isnull(), dim),
+    )
+    last_break, last_unknown = (
+        -_first_step(-crossings, is_falling, dim),
+        -_first_step(-steps, z.isnull(), dim),
+    )
+    starts_above, ends_above = (z.isel({dim: end}, drop=True) >= 0 for end in (0, -1))
+    unbroken_reason = xr.where(
+        first_unknown < xr.where(starts_above, first_break, 0.5),
+        NOT_COMPUTED,
+        xr.where(
+            ~starts_above, NEVER_REACHED, xr.where(np.isinf(first_break), NEVER_LOST, LIMIT_FOUND)
+        ),
+    )
+    farthest_reason = xr.where(
+        last_unknown > xr.where(ends_above, float(coord.size), last_break),
+        NOT_COMPUTED,
+        xr.where(
+            ends_above, NEVER_LOST, xr.where(np.isinf(last_break), NEVER_REACHED, LIMIT_FOUND)
+        ),
+    )
+    return {
+        "unbroken": _value_at_step(first_break.where(unbroken_reason == LIMIT_FOUND), coord),
+        "farthest": _value_at_step(last_break.where(farthest_reason == LIMIT_FOUND), coord),
+        "unbroken_reason": unbroken_reason.astype("int8"),
+        "farthest_reason": farthest_reason.astype("int8"),
+    }
+
+
+def _first_step(steps: xr.DataArray, is_chosen: xr.DataArray, dim: str) -> xr.DataArray:
+    """Least of the chosen places along a dimension; infinity where none is chosen."""
+    return xr.where(is_chosen, steps, np.inf).min(dim, skipna=False)
+
+
+def _value_at_step(step: xr.DataArray, coord: xr.DataArray) -> xr.DataArray:
+    """Value of a coordinate at a place counted in steps along it; nan stays."""
+    all_steps = np.arange(coord.size, dtype=float)
+    return xr.apply_ufunc(
+        lambda p: np.interp(p, all_steps, coord.values),
+        step,
+        dask="parallelized",
+        output_dtypes=[float],
+    )
+
+
+def _set_attributes(
+    result: xr.Dataset,
+    coord: xr.DataArray,
+    segment: str,
+    level: float,
+    confidence_attributes: dict[str, float],
+) -> xr.Dataset:
+    """Units and words of the answers."""
+    long_names = {
+        "unbroken": (
+            f"farthest {coord.name} up to which pd of the {segment} stays {level:g} or more"
+        ),
+        "farthest": f"farthest {coord.name} at which pd of the {segment} is {level:g} or more",
+    }
+    for name, array in result.data_vars.items():
+        answer_name = str(name).split("_")[0]
+        if str(name).endswith("reason"):
+            array.attrs = {
+                "long_name": f"why there is no {answer_name} value",
+                "units": "1",
+                "flag_values": [LIMIT_FOUND, NEVER_REACHED, NEVER_LOST, NOT_COMPUTED],
+                "flag_meanings": REASON_MEANINGS,
+            }
+        else:
+            end_text = {"low": ", lower end", "high": ", upper end"}.get(
+                str(name).split("_")[-1], ""
+            )
+            array.attrs = {
+                "units": coord.attrs.get("units", ""),
+                "long_name": long_names[answer_name] + end_text,
+            }
+            array.attrs |= confidence_attributes if end_text else {}
+    return result
+
+
+def contour(
+    dataset: xr.Dataset,
+    pd: float | str = 0.9,
+    *,
+    x: str = "range",
+    y: str = "grazing_angle",
+    segment: str = "shot",
+) -> xr.Dataset:
+    """Lines along which the probability of detection is at a level.
+
+    Parameters
+    ----------
+    dataset
+        As `sweep.open` gives it; of any dimension other than the two one value selected.
+    pd
+        The level, 0 < pd < 1, as 0.9 or "90 %".
+    x, y
+        Coordinates, each with a dimension of its own.
+    segment
+        ``shot``, ``y_coord``, ``doppler`` or ``down``.
+
+    Returns
+    -------
+    xarray.Dataset
+        Over `vertex`: the two coordinates in their units, and `line`, the number of the line that
+        the vertex is of, in order along it; none where pd is nowhere at the level. Between the
+        grid's points, places are interpolated in the normal deviate.
+
+    Raises
+    ------
+    ValueError
+        A coordinate that is not there, or further dimensions.
+    """
+    level = parse_pd_level(pd)
+    x_coord, y_coord = find_coordinate(dataset, x), find_coordinate(dataset, y)
+    pd_name = variable_name("pd", segment)
+    require_variables(dataset, pd_name)
+    array = dataset[pd_name]
+    if set(array.dims) != {x_coord.name, y_coord.name}:
+        other_dims = ", ".join(str(d) for d in array.dims if d not in (x_coord.name, y_coord.name))
+        raise ValueError(
+            f"a contour goes over {x_coord.name} and {y_coord.name} as dimensions: "
+            + (
+                f"select one value along {other_dims}"
+                if other_dims
+                else "they share one, or lack it"
+            )
+        )
+    z = normal_deviate(array, dataset.get(variable_name("miss", segment))).transpose(
+        y_coord.name, x_coord.name
+    )
+    contour_lines = contour_generator(
+        x_coord.values, y_coord.values, np.ma.masked_invalid(z.values)
+    ).lines(float(ndtri(level)))  # fmt: skip
+    lines = [np.asarray(line) for line in contour_lines]
+    vertices = np.concatenate(lines) if lines else np.empty((0, 2))
+    line_numbers = np.repeat(np.arange(len(lines)), [len(line) for line in lines])
+    return xr.Dataset(
+        {
+            str(x_coord.name): ("vertex", vertices[:, 0], x_coord.attrs),
+            str(y_coord.name): ("vertex", vertices[:, 1], y_coord.attrs),
+            "line": ("vertex", line_numbers, {"units": "1", "long_name": "number of the line"}),
+        },
+        attrs=dataset.attrs,
+    )

@@ -1,0 +1,338 @@
+"""Errors of range and radial velocity, and the Cramer-Rao bounds on any estimate of them."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import pandas
+import xarray as xr
+from scipy.interpolate import CubicSpline
+
+from sweep.analysis.answers.dataset_lookup import (
+    grid_spec_of_dataset,
+    parameter_in_si,
+    require_variables,
+)
+from sweep.model import estimators, waveform
+from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.effects.catalogue import DEFAULTS, EFFECTS, NAMES, names_of
+from sweep.model.looks import COHERENT
+from sweep.model.shot import prepare
+from sweep.model.wander import mean_wander
+from sweep.model.window import Window, transform, window
+from sweep.spec import GridSpec
+
+_SEGMENTS = ("up", "doppler", "down")
+_INSTRUMENT_PREFIX = "instrument."
+_PATH_BY_PARAMETER = {
+    "architecture": "receiver.architecture", "wavelength": "laser.wavelength",
+    "bandwidth": "chirp.bandwidth", "start_frequency": "chirp.start_frequency",
+    "duration": "chirp.duration", "segments": "chirp.segments", "gap": "chirp.gap",
+    "doppler_slope": "chirp.doppler_slope", "down_slope": "chirp.down_slope",
+    "sample_rate": "processing.sample_rate",
+    "fft_size": "processing.fft_size", "window": "processing.window",
+    "delay": "processing.acquisition_delay", "line_width": "laser.line_width",
+    "line_shape": "laser.line_shape", "looks": "looks.number", "combine": "looks.combine",
+}  # fmt: skip
+_RANDOM_EFFECTS = {effect.name for effect in EFFECTS if effect.is_random}
+"""Effects whose draws do not change an echo's footprint."""
+
+_GROUPING_PARAMETERS = (
+    "architecture",
+    "segments",
+    "window",
+    "fft_size",
+    "duration",
+    "delay",
+    "sample_rate",
+)
+"""Parameters that points have in common whose bounds are worked out together."""
+
+
+def range_error(dataset: xr.Dataset) -> xr.Dataset:
+    """Error of the reported range, and the Cramer-Rao bound on any unbiased estimate of it.
+
+    Returns
+    -------
+    xarray.Dataset
+        [m], lazy. `reported` is the reported less the true range without noise, from whole bins.
+        `resolution` is the mean spread that whole bins make: a bin over sqrt(24), because two
+        peaks share the error. `bound` is the least standard deviation, that of a lone line with
+        the stored SNR in the three segments together (:mod:`sweep.model.estimators`), with what
+        developed speckle adds to echoes that are detected (:mod:`sweep.model.wander`). Below the
+        threshold noise is taken for signal, and no estimate comes near the bound. A study that
+        draws whole spectra has instead what it stores: `bias`, `rmse` and `bound`.
+    """
+    return _error_dataset(dataset, "range")
+
+
+def velocity_error(dataset: xr.Dataset) -> xr.Dataset:
+    """Error of the reported radial velocity, and the Cramer-Rao bound.
+
+    Parameters and results as of :func:`range_error`, in m/s.
+    """
+    return _error_dataset(dataset, "radial_velocity")
+
+
+def _error_dataset(dataset: xr.Dataset, quantity: str) -> xr.Dataset:
+    if f"{quantity}_rmse" in dataset:
+        statistics = {kind: dataset[f"{quantity}_{kind}"] for kind in ("bias", "rmse", "bound")}
+        return xr.Dataset(statistics).assign_attrs(dataset.attrs)
+    spec = grid_spec_of_dataset(dataset)
+    snr_names = [f"snr_{name}" for name in _SEGMENTS]
+    require_variables(dataset, *snr_names, "effects", f"{quantity}_error")
+    parameters = {
+        n: parameter_in_si(dataset, _INSTRUMENT_PREFIX + p, spec)
+        for n, p in _PATH_BY_PARAMETER.items()
+    }
+    parameters |= {
+        name: parameter_in_si(dataset, f"target.{name}", spec)
+        for name in ("range", "radial_velocity")
+    }
+    effect_by_flag = {"walks": "range_walk", "moves": "segment_motion", "late": "overlap"}
+    for name, effect in effect_by_flag.items():
+        parameters[name] = (dataset["effects"] & (1 << NAMES.index(effect))) > 0
+    snr = [dataset[name] for name in snr_names]
+
+    def point_bounds(*arrays: np.ndarray) -> np.ndarray:
+        point_parameters = dict(zip(parameters, arrays[3:], strict=True))
+        quantity_bound: np.ndarray = getattr(
+            _cramer_rao_bounds(arrays[:3], point_parameters), quantity
+        )
+        return quantity_bound
+
+    bounds = xr.apply_ufunc(
+        point_bounds, *snr, *parameters.values(), dask="parallelized", output_dtypes=[float]
+    ).transpose(*snr[0].dims)
+    bounds = np.hypot(bounds, _speckle_deviation(dataset, quantity, spec))
+    bin_frequency = parameters["sample_rate"] / parameters["fft_size"]
+    bin_size = (
+        SPEED_OF_LIGHT / 2 * parameters["duration"] / parameters["bandwidth"] * bin_frequency
+        if quantity == "range"
+        else parameters["wavelength"] / 2 * bin_frequency
+    )
+    # Half sum and half difference of two peaks, each off by a bin over sqrt(12).
+    result = xr.Dataset({
+        "reported": dataset[f"{quantity}_error"],
+        "resolution": bin_size / np.sqrt(24.0) + xr.zeros_like(bounds),
+        "bound": bounds,
+    })  # fmt: skip
+    units, quantity_words = (
+        str(result["reported"].attrs.get("units", "")),
+        quantity.replace("_", " "),
+    )
+    for name, long_name in (
+        ("resolution", f"standard deviation that whole bins give to the {quantity_words}"),
+        ("bound", f"Cramer-Rao bound on the standard deviation of the {quantity_words}"),
+    ):
+        result[name].attrs = {"units": units, "long_name": long_name}
+    return result.assign_attrs(dataset.attrs)
+
+
+def _speckle_deviation(dataset: xr.Dataset, quantity: str, spec: GridSpec) -> xr.DataArray:
+    """Return the deviation that developed speckle adds to an estimate; 0 where nothing fades."""
+    is_fading = (dataset["effects"] & (1 << NAMES.index("fading"))) > 0
+    if (
+        spec.effect_modes()["fading"] == "off"
+        or spec.parameters()["footprint.speckle"] != "developed"
+    ):
+        return xr.zeros_like(is_fading, float)
+    fixed_parameters = DEFAULTS | spec.parameters()
+    varying_parameters = {
+        axis_parameter.path: parameter_in_si(dataset, axis_parameter.path, spec)
+        for axis in spec.axes
+        for axis_parameter in axis.parameters
+    }
+    pds, snrs = ([dataset[f"{kind}_{name}"] for name in _SEGMENTS] for kind in ("pd", "snr"))
+
+    def point_deviation(flags: np.ndarray, *arrays: np.ndarray) -> np.ndarray:
+        shape = np.broadcast_shapes(flags.shape, *(array.shape for array in arrays))
+        columns = [np.broadcast_to(array, shape).ravel() for array in (flags, *arrays)]
+        variance = np.zeros(columns[0].size)
+        for flag_bits in np.unique(columns[0]):
+            rows = np.flatnonzero(columns[0] == flag_bits)
+            effects = [name for name in names_of(int(flag_bits)) if name not in _RANDOM_EFFECTS]
+            if "fading" not in effects:
+                continue
+            varying_values = dict(
+                zip(varying_parameters, (column[rows] for column in columns[7:]), strict=True)
+            )
+            pd, snr = (np.array([c[rows] for c in columns[k : k + 3]]) for k in (1, 4))
+            for batch_rows, shots in prepare(fixed_parameters | varying_values, effects):
+                estimate_variances = mean_wander(shots, pd[:, batch_rows], snr[:, batch_rows])
+                variance[rows[batch_rows]] = estimate_variances[0 if quantity == "range" else 1]
+        return np.sqrt(variance).reshape(shape)
+
+    return xr.apply_ufunc(
+        point_deviation, dataset["effects"], *pds, *snrs, *varying_parameters.values(),
+        dask="parallelized", output_dtypes=[float],
+    )  # fmt: skip
+
+
+def _cramer_rao_bounds(
+    snr: tuple[np.ndarray, ...], parameters: dict[str, np.ndarray]
+) -> estimators.Deviation:
+    """Bounds of points that share no more than their order; words and sizes one by one."""
+    shape = np.broadcast_shapes(*(np.shape(a) for a in (*snr, *parameters.values())))
+    flat_parameters = {name: np.broadcast_to(a, shape).ravel() for name, a in parameters.items()}
+    flat_snr = [np.broadcast_to(a, shape).ravel() for a in snr]
+    grouping_frame = pandas.DataFrame(
+        {name: flat_parameters[name] for name in _GROUPING_PARAMETERS}
+    )
+    deviations = np.empty((2, len(grouping_frame)))
+    for rows in grouping_frame.groupby(
+        list(grouping_frame), sort=False, dropna=False
+    ).indices.values():
+        group_parameters = {name: a[rows] for name, a in flat_parameters.items()}
+        deviations[:, rows] = _bounds_of_group([s[rows] for s in flat_snr], group_parameters)
+    return estimators.Deviation(*deviations.reshape(2, *shape))
+
+
+def _bounds_of_group(
+    snr: list[np.ndarray], parameters: dict[str, np.ndarray]
+) -> estimators.Deviation:
+    """Bounds of points of one architecture, waveform, window and record."""
+    fft_size, sample_rate = int(parameters["fft_size"][0]), float(parameters["sample_rate"][0])
+    record_parameters = {
+        "fft_size": fft_size,
+        "sample_rate": sample_rate,
+        "acquisition_delay": parameters["delay"][0],
+    }
+    record_parameters = {
+        f"instrument.processing.{name}": value for name, value in record_parameters.items()
+    }
+    record_length = int(
+        waveform.record_length(
+            record_parameters | {"instrument.chirp.duration": parameters["duration"][0]}
+        )
+    )
+    taper = window(str(parameters["window"][0]), record_length)
+    slopes = (
+        np.ones_like(parameters["down_slope"]),
+        parameters["doppler_slope"],
+        parameters["down_slope"],
+    )
+    carriers = waveform.carrier_frequencies(
+        str(parameters["architecture"][0]),
+        wavelength=parameters["wavelength"],
+        start_frequency=parameters["start_frequency"],
+        bandwidth=parameters["bandwidth"],
+        slopes=slopes,
+    )
+    chirp_rate = parameters["bandwidth"] / parameters["duration"]
+    deviations = []
+    segment_order = waveform.order_of(
+        str(parameters["architecture"][0]), str(parameters["segments"][0])
+    )
+    segment_starts = waveform.segment_starts(
+        segment_order, duration=parameters["duration"], gap=parameters["gap"]
+    )
+    middle_look_time = (
+        0.5
+        * (parameters["looks"] - 1)
+        * len(segment_order)
+        * (parameters["duration"] + parameters["gap"])
+    )
+    for segment, slope in enumerate(slopes):
+        carrier, segment_snr = carriers[segment], snr[segment]
+        distance_moved = np.where(
+            parameters["moves"],
+            (segment_starts[segment] + middle_look_time) * parameters["radial_velocity"],
+            0.0,
+        )
+        beat_frequency = waveform.beat_frequency(
+            slope,
+            carrier=carrier,
+            chirp_rate=chirp_rate,
+            range=parameters["range"] - distance_moved,
+            radial_velocity=parameters["radial_velocity"],
+        )
+        # the frequency drifts by 2 s S beta a second: by half of that by the record's middle
+        walk_frequency = (
+            slope
+            * chirp_rate
+            * (2 * parameters["radial_velocity"] / SPEED_OF_LIGHT)
+            * record_length
+            / sample_rate
+        )
+        beat_frequency = np.where(
+            parameters["walks"], beat_frequency + walk_frequency, beat_frequency
+        )
+        beat_bin = waveform.fold(beat_frequency, parameters["sample_rate"]) / sample_rate * fft_size
+        # in bins of fs/L: a padded FFT's bins are finer than the window's
+        missing_samples = waveform.samples_before_echo(
+            delay=2 / SPEED_OF_LIGHT * (parameters["range"] - distance_moved),
+            beta=0.0,
+            start=parameters["delay"],
+            sample_rate=parameters["sample_rate"],
+            length=record_length,
+        )
+        remaining_samples = record_length - np.where(
+            parameters["late"], missing_samples, 0
+        )  # samples that the echo has
+        remaining_sum, relative_width = tail_sum_and_width(taper)
+        bin_offset = (
+            (beat_bin - np.rint(beat_bin))
+            * relative_width[remaining_samples]
+            * record_length
+            / fft_size
+        )
+        # of less of the window the line stands lower, over the noise of all of it
+        amplitude_loss = (
+            main_lobe_spline(taper.name, record_length)(np.abs(bin_offset))
+            * remaining_sum[remaining_samples]
+        )
+        with np.errstate(divide="ignore", invalid="ignore"):
+            cnr = estimators.carrier_to_noise_ratio(
+                snr=segment_snr / amplitude_loss**2, window=taper
+            )
+            deviation = estimators.beat_deviation(
+                cnr=cnr, samples=remaining_samples, sample_rate=sample_rate
+            )
+        phase_noise_deviation = estimators.phase_deviation(
+            line_width=np.where(
+                parameters["line_shape"] == "lorentzian", parameters["line_width"], 0.0
+            ),
+            delay=2 * parameters["range"] / SPEED_OF_LIGHT,
+            duration=np.maximum(remaining_samples, 1) / sample_rate,
+        )
+        # The stored SNR is that of a sum of looks, or of each of those that tell by themselves.
+        deviation = deviation / np.sqrt(
+            np.where(parameters["combine"] == COHERENT, 1.0, parameters["looks"])
+        )
+        deviation = np.hypot(deviation, phase_noise_deviation / np.sqrt(parameters["looks"]))
+        deviations.append(np.where(np.isnan(deviation), np.inf, deviation))
+    up, doppler, down = deviations
+    resolved = estimators.resolved_deviation(
+        up=up, doppler=doppler, down=down, carriers=carriers, chirp_rate=chirp_rate,
+        range=parameters["range"], radial_velocity=parameters["radial_velocity"], slopes=slopes,
+    )  # fmt: skip
+    has_no_echo = np.isnan(snr[0]) | np.isnan(snr[2])
+    return estimators.Deviation(*(np.where(has_no_echo, np.nan, b) for b in resolved))
+
+
+@lru_cache(maxsize=8)
+def tail_sum_and_width(taper: Window) -> tuple[np.ndarray, np.ndarray]:
+    """Sum, and width in time, of a window's last samples over those of all, (L + 1,) each.
+
+    By the number of samples. The width is the standard deviation of the places under the window,
+    by which its main lobe is narrow.
+    """
+    samples, times = taper.samples()[::-1], np.arange(taper.length) / taper.length
+    cumulative_sum, first_moment, second_moment = (
+        np.append(0.0, np.cumsum(samples * times**k)) for k in range(3)
+    )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        width = np.sqrt(
+            np.maximum(second_moment / cumulative_sum - (first_moment / cumulative_sum) ** 2, 0.0)
+        )
+    width = np.where(np.isfinite(width), width, 0.0)
+    return cumulative_sum / cumulative_sum[-1], np.minimum(width / width[-1], 1.0)
+
+
+@lru_cache(maxsize=32)
+def main_lobe_spline(window_name: str, length: int) -> CubicSpline:
+    """|W(delta)| / W(0) over delta from 0 to half a bin of fs/L, to 1e-8."""
+    taper, bin_offsets = window(window_name, length), np.linspace(0.0, 0.5, 33)
+    return CubicSpline(bin_offsets, np.abs(transform(taper, bin_offsets)) / taper.sum)

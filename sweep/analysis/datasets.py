@@ -1,0 +1,394 @@
+"""Stores as xarray Datasets and DataTrees; `ds.sweep` and `tree.sweep`, answers from them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from datetime import UTC, datetime
+from functools import wraps
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from sweep.analysis.answers import (
+    comparison,
+    dataset_lookup,
+    detection_limits,
+    measurement_errors,
+    probability,
+    provenance,
+)
+from sweep.analysis.answers.dataset_lookup import STUDY_ID, marker_name
+from sweep.messages import suggestion
+from sweep.model.outputs import RUNNING
+from sweep.spec import GridSpec, SceneSpec
+from sweep.storage import store_format
+from sweep.storage.locations import JOURNAL_DIR, Location, parse_location
+from sweep.storage.store_format import (
+    MAP_GROUP,
+    OPEN_ZARR_KWARGS,
+    NotAStoreError,
+    format_versions,
+    iter_records,
+    read_receipt_totals,
+)
+from sweep.storage.verified_store import open_verified_store
+
+BATCH_DIM = "batch"
+VALUES_PER_READ = 2**20
+"""Values of an array that are read at a time: few enough for any memory, and enough that Dask's
+list of what is to be read stays short (some 7 kB a piece; a piece of floats has 8 MB)."""
+
+SHOTS_PER_READ = 8192
+"""Shots, times draws, that are read at a time."""
+
+COUNT_MISSING = -1
+"""Value of a count in a block that is not computed."""
+
+GRID_KIND, SCENE_KIND, ACCURACY_KIND = "grid", "scene", "accuracy"
+_DESCRIPTION_BY_KIND = {
+    GRID_KIND: "a grid of points: sweep.open() opens it",
+    SCENE_KIND: "a scene's point clouds: sweep.open_scene() opens it",
+    ACCURACY_KIND: "what accuracy costs: xarray.open_zarr() opens it, sweep figures draws it",
+    "eyepoints": "the eyepoints of a flight, which point clouds are made of: open one of those",
+}
+"""Contents of the kinds of stores, and the functions that open them."""
+
+
+def open(
+    path: str | Location | Sequence[str | Location] | Mapping[str, str | Location],
+    *,
+    dim: str = "design",
+) -> xr.Dataset:
+    """Open the store of a study as a dataset, or those of several as one, a design each.
+
+    Dimensions bear the names of the study's axes, coordinates are in the units that the study was
+    written in, and every variable has its units and what it is. Arrays are read when they are
+    needed, as Dask arrays in pieces of whole chunks of the store. Points not computed yet are nan;
+    -1 for counts of draws, which are summed over their batches, and for their number `n_draws`.
+
+    Parameters
+    ----------
+    path
+        The store, complete or not. A list of stores, or a mapping from names of designs to stores,
+        is joined along a new dimension; designs of a list are named by the titles of their studies.
+        Answers of `ds.sweep` from the result are per design, from each design's own spec.
+    dim
+        Name of that dimension.
+
+    Returns
+    -------
+    xarray.Dataset
+        Its coordinate `study_id` is the id of the study. With the marker, a coordinate named by
+        that id, it proves to `ds.sweep` that a part of the dataset is of one study. Its
+        attributes are the store's and: `started`, `finished` (UTC; empty where there is nothing to
+        tell), `points`, `points_committed`, `blocks` and `blocks_committed`.
+
+    Raises
+    ------
+    NotAStoreError
+        Where there is no store of a study, or one whose coordinates are lost or damaged.
+    ReplacedError
+        Later, where values are read that are not read yet, and another study's store is in the
+        place by then: the store was extended, or run anew.
+    ValueError
+        Studies that can't be joined: `dim` is taken, one comes twice, or zipped axes differ.
+
+    Examples
+    --------
+    >>> ds = sweep.open({"25 mm": "small.zarr", "50 mm": "large.zarr"})  # doctest: +SKIP
+    >>> ds.sweep.maximum_range(pd=0.9).unbroken                          # doctest: +SKIP
+    """
+    if isinstance(path, Mapping) and path:
+        return provenance.join_designs(
+            {str(name): open(store) for name, store in path.items()}, dim
+        )
+    if isinstance(path, Sequence | Mapping) and not isinstance(path, str):
+        return provenance.join_designs(_name_by_title([open(store) for store in path]), dim)
+    path = parse_location(path)
+    attributes = read_attributes_of_kind(path, GRID_KIND)
+    refuse_lost_coordinates(path)
+    dataset = xr.open_zarr(
+        open_verified_store(path, attributes["study_id"]), chunks=None, **OPEN_ZARR_KWARGS
+    )
+    effect_flags = dataset["effects"]
+    n_blocks = _count_chunks(effect_flags)
+    dataset = rechunk_for_reading(dataset.drop_vars(RUNNING, errors="ignore"))
+    if BATCH_DIM in dataset.dims:
+        dataset = sum_batches(dataset)
+    dataset = _add_study_id(_load_coordinates(dataset), attributes["study_id"])
+    return dataset.assign_attrs(progress_attributes(path, effect_flags.size, n_blocks))
+
+
+def _name_by_title(datasets: Sequence[xr.Dataset]) -> dict[str, xr.Dataset]:
+    """Return datasets by the titles of their studies, with the ids of those that share a title."""
+    titles = [str(dataset.attrs["title"]) for dataset in datasets]
+    dataset_by_name = {
+        comparison.title_with_id(dataset) if titles.count(title) > 1 else title: dataset
+        for title, dataset in zip(titles, datasets, strict=True)
+    }
+    if not dataset_by_name:
+        raise ValueError("the list of stores to join is empty: name two or more")
+    if len(dataset_by_name) < len(datasets):
+        raise ValueError("the list of stores to join has one study twice: leave one out")
+    return dataset_by_name
+
+
+def _load_coordinates(dataset: xr.Dataset) -> xr.Dataset:
+    """Load coordinates, words as numpy's own type of text, which xarray plots and writes."""
+    loaded = {name: array.compute() for name, array in dataset.coords.items()}
+    return dataset.assign_coords({
+        name: array.copy(data=np.array(array.values.tolist(), str))
+        if array.dtype.kind in "OT" else array
+        for name, array in loaded.items()
+    })  # fmt: skip
+
+
+def _add_study_id(dataset: xr.Dataset, study_id: str) -> xr.Dataset:
+    """Return a dataset with its study's id and marker as coordinates, and flat attributes."""
+    id_attributes = {"long_name": "id of the study"}
+    marker_attributes = {
+        "long_name": "marker of the study, which shows where another's points join"
+    }
+    dataset = dataset.assign_coords({
+        STUDY_ID: xr.DataArray(study_id, attrs=id_attributes),
+        marker_name([study_id]): xr.DataArray(True, attrs=marker_attributes),
+    })  # fmt: skip
+    return dataset.assign_attrs({name: format_versions(v) for name, v in dataset.attrs.items()})
+
+
+def open_scene(path: str | Location) -> xr.DataTree:
+    """Open the store of a scene's point clouds as a tree: a group for each scanner.
+
+    Arrays are read when they are needed, as Dask arrays in the chunks of the store. Values not
+    computed yet are nan, -1 for numbers of beams, surfaces and cycles, 0 for flags.
+
+    Parameters
+    ----------
+    path
+        The store, complete or not.
+
+    Returns
+    -------
+    xarray.DataTree
+        Its attributes are the store's and: `started`, `finished` (UTC; empty where there is
+        nothing to tell), `points`, `points_committed` (shots times draws), `blocks` and
+        `blocks_committed`.
+
+    Raises
+    ------
+    NotAStoreError
+        Where there is no store of a scene.
+    """
+    return open_tree(parse_location(path), chunks={})
+
+
+def open_tree(store_path: Location, chunks: dict[str, int] | None = None) -> xr.DataTree:
+    """As :func:`open_scene`; without chunks, arrays are plain ones that are read where sliced."""
+    attributes = read_attributes_of_kind(store_path, SCENE_KIND)
+    refuse_lost_coordinates(store_path)
+    store = open_verified_store(store_path, attributes["study_id"])
+    whole_tree = xr.open_datatree(store, engine="zarr", chunks=chunks, **OPEN_ZARR_KWARGS)
+    groups = {name: group.to_dataset(inherit=False) for name, group in whole_tree.children.items()}
+    root = whole_tree.to_dataset()
+    if _OLD_MAP_NAMES.keys() <= root.variables.keys():  # where earlier versions have it
+        groups[MAP_GROUP] = root[list(_OLD_MAP_NAMES)].rename(_OLD_MAP_NAMES)
+        root = root.drop_vars(list(_OLD_MAP_NAMES))
+    for name in attributes["scanners"]:
+        groups[name] = _add_study_id(_load_coordinates(groups[name]), attributes["study_id"])
+    tree = xr.DataTree.from_dict({"/": _add_study_id(root, attributes["study_id"]), **groups})
+    tree.encoding["source"] = str(store_path)
+    flags = [tree[scanner].to_dataset()["flags"] for scanner in attributes["scanners"]]
+    n_points = sum(
+        int(flag_array.size) // flag_array.sizes["return_number"] for flag_array in flags
+    )
+    n_blocks = sum(_count_chunks(flag_array) for flag_array in flags)
+    tree.attrs |= progress_attributes(store_path, n_points, n_blocks)
+    return tree
+
+
+_OLD_MAP_NAMES = {"map_x": "x", "map_y": "y", "map_height": "height"}
+"""Names of the scene's map in the root of stores of earlier versions, and in its group."""
+
+
+def _count_chunks(array: xr.DataArray) -> int:
+    """Return the number of chunks that an array is stored in."""
+    return math.prod(map(math.ceil, np.divide(array.shape, array.encoding["chunks"])))
+
+
+def chunk_length(array: xr.DataArray, dim: str) -> int:
+    """Length along a dimension of the chunks that an array is stored in."""
+    return int(array.encoding.get("preferred_chunks", {}).get(dim, array.sizes[dim]))
+
+
+def read_slices(
+    array: xr.DataArray, dim: str, slice_length_max: int = SHOTS_PER_READ
+) -> list[slice]:
+    """Slices along a dimension: whole chunks of the array in each, and few of them."""
+    length, stored_chunk = array.sizes[dim], chunk_length(array, dim)
+    step = stored_chunk * max(1, slice_length_max // stored_chunk)
+    return [slice(start, min(start + step, length)) for start in range(0, length, step)]
+
+
+def refuse_lost_coordinates(store_path: Location) -> None:
+    """Refuse a store whose coordinates are lost or changed; of a lost one Zarr reads zeros."""
+    document = store_format.read_root_metadata(store_path)
+    nodes = {"": document, **document["consolidated_metadata"]["metadata"]}
+    coordinate_paths = set()
+    for name, node in nodes.items():
+        parent, coordinate_names = name, node["attributes"].get("coordinates", "").split()
+        if "dimension_names" in node:
+            parent, coordinate_names = name.rpartition("/")[0], node["dimension_names"]
+        coordinate_paths |= {
+            f"{parent}/{coordinate_name}".lstrip("/") for coordinate_name in coordinate_names
+        }
+    for record in iter_records(store_path / JOURNAL_DIR / store_format.MANIFEST_FILE):
+        name = record.get("object", "")
+        if f"{name}/".partition("/c/")[0] in coordinate_paths:
+            with suppress(OSError):
+                if store_format.has_digest(store_path, [name], record["digest"]):
+                    continue
+            raise NotAStoreError(
+                f"{store_path} has lost {name}, of a coordinate: "
+                f"{suggestion('verify', store_path, repair=True)} puts it back"
+            )
+
+
+def read_attributes_of_kind(store_path: Location, kind: str = "") -> dict[str, Any]:
+    """Attributes of a store, which must hold a ``grid`` or a ``scene`` where that is asked for."""
+    attributes = store_format.read_attributes(store_path)
+    if kind and attributes["kind"] != kind:
+        raise NotAStoreError(f"{store_path} holds {_DESCRIPTION_BY_KIND[attributes['kind']]}")
+    return attributes
+
+
+def rechunk_for_reading(dataset: xr.Dataset) -> xr.Dataset:
+    """Arrays as Dask arrays, in pieces of whole stored chunks of no more than `PIECE` values.
+
+    A piece grows along the last dimension first, in which values lie next to each other.
+    """
+    largest_array = max(dataset.data_vars.values(), key=lambda array: array.ndim)
+    chunk_sizes = dict(zip(largest_array.dims, largest_array.encoding["chunks"], strict=True))
+    for dim in reversed(largest_array.dims):
+        growth = VALUES_PER_READ // math.prod(chunk_sizes.values())
+        chunk_sizes[dim] = min(largest_array.sizes[dim], chunk_sizes[dim] * max(1, growth))
+    return dataset.chunk(chunk_sizes)
+
+
+def sum_batches(dataset: xr.Dataset) -> xr.Dataset:
+    """Sum counts of draws over their batches; -1 if any of these is."""
+    batched_counts = {
+        name: array for name, array in dataset.data_vars.items() if BATCH_DIM in array.dims
+    }
+    sums = {
+        name: array.sum(BATCH_DIM, keep_attrs=True).where(
+            (array != COUNT_MISSING).all(BATCH_DIM), COUNT_MISSING
+        )
+        for name, array in batched_counts.items()
+    }
+    return dataset.drop_dims(BATCH_DIM).assign(sums)
+
+
+def progress_attributes(store_path: Location, n_points: int, n_blocks: int) -> dict[str, Any]:
+    """Return times and amount of what is committed of all points and blocks, as attributes."""
+    receipts = read_receipt_totals(store_path, n_blocks)
+    sessions = iter_records(store_path / JOURNAL_DIR / "sessions.jsonl")
+    start_times = [s["time"] for s in sessions if s.get("event") == "begun" and "time" in s]
+    start_times += [receipts.first_time] if receipts.n_committed_blocks and not start_times else []
+    return {
+        "started": _format_utc(min(start_times)) if start_times else "",
+        "finished": _format_utc(receipts.last_time)
+        if receipts.n_committed_blocks >= n_blocks
+        else "",
+        "points": n_points,
+        "points_committed": int(receipts.points_by_block.sum()),
+        "blocks": n_blocks,
+        "blocks_committed": receipts.n_committed_blocks,
+    }
+
+
+def _format_utc(time: float) -> str:
+    return datetime.fromtimestamp(time, UTC).isoformat(timespec="seconds")
+
+
+def _as_accessor_method(
+    answer: Callable[..., Any], *, require_axes: bool = False
+) -> Callable[..., Any]:
+    """Return a function of a dataset as a method, with its words and arguments.
+
+    The dataset has to prove that it is one study's; of a join of several the method answers per
+    design. ``require_axes``: the answer needs the coordinates of all axes.
+    """
+
+    @wraps(answer)
+    def method(self: SweepAccessor, *arguments: Any, **options: Any) -> Any:
+        def answer_of_study(dataset: xr.Dataset) -> Any:
+            return answer(dataset, *arguments, **options)
+
+        return provenance.compute_answer_per_study(
+            self._dataset, answer_of_study, require_axes=require_axes
+        )
+
+    return method
+
+
+@xr.register_dataset_accessor("sweep")
+class SweepAccessor:
+    """Answers from a dataset of `sweep.open`, or a part of one.
+
+    All but `roc` and `contour` are lazy: `.compute()` works them out.
+    """
+
+    def __init__(self, dataset: xr.Dataset) -> None:
+        self._dataset = dataset
+
+    @property
+    def spec(self) -> GridSpec:
+        """The study."""
+        return dataset_lookup.grid_spec_of_dataset(
+            provenance.check_single_study(self._dataset, require_axes=False)
+        )
+
+    def sel(self, *, method: str | None = None, **coordinates: Any) -> xr.Dataset:
+        """Points by physical value: ``ds.sweep.sel(range="2 km", grazing_angle="20 deg")``.
+
+        Values, and what is raised, are those of :func:`.dataset_lookup.select_points`.
+        """
+        return dataset_lookup.select_points(self._dataset, coordinates, method=method)
+
+    detection_probability = _as_accessor_method(probability.detection_probability)
+    roc = _as_accessor_method(probability.roc, require_axes=True)
+    limit = _as_accessor_method(detection_limits.limit)
+    maximum_range = _as_accessor_method(detection_limits.maximum_range)
+    minimum_grazing_angle = _as_accessor_method(detection_limits.minimum_grazing_angle)
+    contour = _as_accessor_method(detection_limits.contour)
+    false_alarms_per_second = _as_accessor_method(
+        probability.false_alarms_per_second, require_axes=True
+    )
+    false_alarms_per_kilometre = _as_accessor_method(
+        probability.false_alarms_per_kilometre, require_axes=True
+    )
+    range_error = _as_accessor_method(measurement_errors.range_error, require_axes=True)
+    velocity_error = _as_accessor_method(measurement_errors.velocity_error, require_axes=True)
+    summary = _as_accessor_method(probability.summary)
+    compare = _as_accessor_method(comparison.compare, require_axes=True)
+
+
+@xr.register_datatree_accessor("sweep")
+class FlightAccessor:
+    """Answers from a tree of `sweep.open_scene`, lazy but for the matching of shots."""
+
+    def __init__(self, tree: xr.DataTree) -> None:
+        self._tree = tree
+
+    @property
+    def spec(self) -> GridSpec | SceneSpec:
+        """The study."""
+        return dataset_lookup.spec_of_dataset(self._tree)
+
+    @wraps(comparison.compare_flights)
+    def compare(self, other: xr.DataTree) -> xr.DataTree:
+        """Compare two flights; as :func:`.comparison.compare_flights`."""
+        return comparison.compare_flights(self._tree, other)

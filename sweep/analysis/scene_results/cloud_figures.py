@@ -1,0 +1,576 @@
+"""Sheets of point clouds, at an angle or along one of the world's axes, and of scatters."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+import xarray as xr
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure as Sheet
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from mpl_toolkits.mplot3d import proj3d
+
+from sweep.analysis import canvas, labels
+from sweep.analysis.scene_results import point_styles
+from sweep.analysis.scene_results.point_styles import PictureSheet
+from sweep.analysis.scene_results.recordings import (
+    CATEGORICAL_QUANTITIES,
+    LOG_QUANTITIES,
+    SIGNED_QUANTITIES,
+    WORLD_AXES,
+    ColumnArrays,
+    PointCloud,
+    ThinnedRows,
+    is_within,
+    quantity_label,
+    to_shown_units,
+)
+from sweep.model.pairing import TRUE
+from sweep.storage.store_format import MAP_GROUP
+
+SUN_AZIMUTH_DEG, SUN_ELEVATION_DEG = 315.0, 40.0
+"""Direction of the light that shades the ground [deg], from north by east; and its height."""
+
+DRAWN_SLOPE_MAX = 1.5
+"""Slope above which ground is left open: at the edges of crowns and walls, which hide points."""
+
+
+@dataclass(frozen=True)
+class HeightMap:
+    """Heights of the ground (rows, columns) on an even grid; nan where there is none.
+
+    World coordinates x (columns,) and y (rows,) rise; all in metres.
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    height: np.ndarray
+
+    @classmethod
+    def from_tree(cls, tree: xr.DataTree) -> HeightMap | None:
+        """Return the map of a store, or None if it has none, or nothing is on it."""
+        if MAP_GROUP not in tree.children:
+            return None
+        x, y, height = (np.asarray(tree[MAP_GROUP][name].values) for name in ("x", "y", "height"))
+        return cls(x, y, height) if np.isfinite(height).any() else None
+
+    def crop(
+        self, x: tuple[float, float], y: tuple[float, float], nodes_max: int = 120
+    ) -> HeightMap | None:
+        """Return the ground within limits, interpolated; None where these miss the map."""
+        overlaps = [
+            (max(float(coordinates[0]), low), min(float(coordinates[-1]), high))
+            for coordinates, (low, high) in ((self.x, x), (self.y, y))
+        ]
+        if any(high <= low for low, high in overlaps):
+            return None
+        step = max(high - low for low, high in overlaps) / (nodes_max - 1)
+        x_nodes, y_nodes = (np.linspace(low, high, max(2, round((high - low) / step) + 1))
+                      for low, high in overlaps)  # fmt: skip
+        height = xr.DataArray(self.height, [("y", self.y), ("x", self.x)]).interp(
+            x=x_nodes, y=y_nodes
+        )
+        return HeightMap(x_nodes, y_nodes, height.values)
+
+    def mask_walls(self) -> HeightMap:
+        """Return the ground without what is too steep to be drawn as a surface."""
+        is_steep = np.hypot(*np.gradient(self.height, self.y, self.x)) > DRAWN_SLOPE_MAX
+        return HeightMap(self.x, self.y, np.where(is_steep, np.nan, self.height))
+
+    def hillshade(self) -> np.ndarray:
+        """Brightness of the ground under a low sun, 0..1; slopes are stretched to stand out."""
+        slope_y, slope_x = np.gradient(self.height, self.y, self.x)
+        slope = np.hypot(slope_y, slope_x)
+        finite_slopes = slope[np.isfinite(slope)]
+        typical_slope = float(np.percentile(finite_slopes, 80)) if finite_slopes.size else 0.0
+        stretch = 0.6 / typical_slope if typical_slope > 0 else 1.0
+        azimuth, elevation = np.radians(90.0 - SUN_AZIMUTH_DEG), np.radians(SUN_ELEVATION_DEG)
+        sunward_slope = (
+            np.cos(elevation) * (np.cos(azimuth) * slope_x + np.sin(azimuth) * slope_y) * stretch
+        )
+        brightness = (np.sin(elevation) - sunward_slope) / np.sqrt(1 + (stretch * slope) ** 2)
+        return np.clip(np.where(np.isfinite(brightness), brightness, 1.0), 0.0, 1.0)
+
+
+DROPOUT_COLOUR, PATH_COLOUR, GROUND_COLOUR = "#C1121F", "#1A1A1A", "0.86"
+
+OBLIQUE_WIDTH_MAX_INCHES, OBLIQUE_HEIGHT_MAX_INCHES = 7.6, 6.4
+"""Sizes of the box as drawn [inches]."""
+
+OBLIQUE_MARGINS_INCHES = (0.55, 0.75, 0.85, 0.1)
+"""Room for ticks and labels to its left, below, to its right and above [inches]."""
+
+_TRIAL_SIDE_INCHES = 10.0
+
+
+class ObliqueView:
+    """A picture at an angle: azimuth of the eye from x towards y, elevation above it [deg]."""
+
+    scatter_options: ClassVar[dict[str, Any]] = {"depthshade": False}
+
+    def __init__(
+        self, cloud: PointCloud, azimuth: float, elevation: float, *, title: str, caption: str
+    ) -> None:
+        self.cloud = cloud
+        self.draw_order = np.arange(cloud.is_true.size)
+        low, high = self._projected_box(azimuth, elevation)
+        inches_per_unit = min(
+            OBLIQUE_WIDTH_MAX_INCHES / (high[0] - low[0]),
+            OBLIQUE_HEIGHT_MAX_INCHES / (high[1] - low[1]),
+        )
+        self.inches_per_unit = inches_per_unit
+        self.size_inches = (
+            inches_per_unit * (high[0] - low[0]),
+            inches_per_unit * (high[1] - low[1]),
+        )
+        left, below, right, above = OBLIQUE_MARGINS_INCHES
+        self.picture_sheet = PictureSheet(
+            self.size_inches[0] + left + right,
+            self.size_inches[1] + below + above,
+            title=title,
+            caption=caption,
+        )
+        # The square that the library draws in may reach beyond the sheet: the box within does not.
+        self.axes: Any = self.picture_sheet.add_axes(
+            left - inches_per_unit * low[0],
+            below - inches_per_unit * low[1],
+            inches_per_unit,
+            inches_per_unit,
+            projection="3d",
+            computed_zorder=False,
+        )
+        self._set_axes(self.axes, azimuth, elevation)
+        side_ratios = self._side_ratios()
+        for name, side_ratio in zip(WORLD_AXES, side_ratios, strict=True):
+            side_inches = 0.62 * inches_per_unit * side_ratio
+            axis = getattr(self.axes, f"{name}axis")
+            tick_spacing = (
+                point_styles.TICK_SPACING_Y_INCHES
+                if name == "z"
+                else point_styles.TICK_SPACING_X_INCHES
+            )
+            point_styles.set_length_axis(axis, name, cloud.box[name], side_inches, tick_spacing)
+            axis.labelpad = 2 if side_inches < 0.8 else 9 + 4 * (name == "z")
+            axis.set_tick_params(pad=2 + 4 * (name == "z") * side_ratio)
+
+    def _side_ratios(self) -> np.ndarray:
+        """Sides of the box in its longest."""
+        sides = np.array([self.cloud.box[axis][1] - self.cloud.box[axis][0] for axis in WORLD_AXES])
+        return sides / sides.max()
+
+    def _set_axes(self, axes: Any, azimuth: float, elevation: float) -> None:
+        """Projection, limits, walls and grid."""
+        axes.patch.set_visible(False)
+        axes.set_proj_type("ortho")
+        axes.view_init(elev=elevation, azim=azimuth)
+        axes.set_box_aspect(self._side_ratios())
+        for name in WORLD_AXES:
+            getattr(axes, f"set_{name}lim")(*self.cloud.box[name])
+            axis = getattr(axes, f"{name}axis")
+            axis.pane.set_facecolor("white")
+            axis.pane.set_edgecolor("0.8")
+
+    def _projected_box(self, azimuth: float, elevation: float) -> tuple[np.ndarray, np.ndarray]:
+        """Lower left and upper right corner of the box, in shares of the library's square."""
+        trial_sheet = PictureSheet(_TRIAL_SIDE_INCHES, _TRIAL_SIDE_INCHES, title="", caption="")
+        axes = trial_sheet.add_axes(0, 0, _TRIAL_SIDE_INCHES, _TRIAL_SIDE_INCHES, projection="3d")
+        self._set_axes(axes, azimuth, elevation)
+        corners = np.array(list(product(*(self.cloud.box[axis] for axis in WORLD_AXES)))).T
+        projected = self._project(axes, corners)
+        return projected.min(axis=1), projected.max(axis=1)
+
+    @staticmethod
+    def _project(axes: Any, positions: np.ndarray) -> np.ndarray:
+        """World positions (3, n) as they appear, in shares of the library's square (2, n)."""
+        x, y, _ = proj3d.proj_transform(*positions, axes.get_proj())
+        view_limits = axes.viewLim
+        return np.array(
+            [(x - view_limits.x0) / view_limits.width, (y - view_limits.y0) / view_limits.height]
+        )
+
+    def plot_coordinates(self, positions: np.ndarray) -> Sequence[np.ndarray]:
+        """World positions (3, n) as the axes take them."""
+        return list(positions)
+
+    def to_inches(self, positions: np.ndarray) -> np.ndarray:
+        """World positions (3, n) on the picture (2, n) [inches]."""
+        return self.inches_per_unit * self._project(self.axes, positions)
+
+    def draw_ground(self, height_map: HeightMap) -> bool:
+        """Shaded relief, cut at the box and open at walls."""
+        cropped = height_map.crop(self.cloud.box["x"], self.cloud.box["y"])
+        if cropped is None:
+            return False
+        low, high = self.cloud.box["z"]
+        cropped = cropped.mask_walls()
+        is_in_box = (cropped.height >= low) & (cropped.height <= high)
+        x, y = np.meshgrid(cropped.x, cropped.y)
+        self.axes.plot_surface(
+            x,
+            y,
+            np.where(is_in_box, cropped.height, np.nan),
+            facecolors=_shaded_colours(cropped),
+            rcount=200,
+            ccount=200,
+            shade=False,
+            linewidth=0,
+            antialiased=False,
+            zorder=1,
+        )
+        return False
+
+
+AXIS_MARGINS_INCHES = 0.8, 0.55
+"""Room for ticks and labels at the left and at the foot [inches]."""
+
+AXIS_VIEW_WIDTH_MAX_INCHES, AXIS_VIEW_HEIGHT_MAX_INCHES, AXIS_VIEW_SIDE_MIN_INCHES = 7.4, 7.0, 1.5
+"""Sizes of the picture [inches]."""
+
+
+class AxisView:
+    """A picture along one of the world's axes: those across, up and along the look.
+
+    `nearest` is 1 where the eye is at the upper end of the last, -1 at its lower one.
+    """
+
+    scatter_options: ClassVar[dict[str, Any]] = {}
+
+    def __init__(
+        self,
+        cloud: PointCloud,
+        axis_names: tuple[str, str, str],
+        nearest_sign: int,
+        *,
+        title: str,
+        caption: str,
+    ) -> None:
+        self.cloud, self.axis_names = cloud, axis_names
+        self.draw_order = np.argsort(nearest_sign * cloud.points[axis_names[2]], kind="stable")
+        sides = [cloud.box[axis][1] - cloud.box[axis][0] for axis in axis_names[:2]]
+        self.inches_per_unit = min(
+            AXIS_VIEW_WIDTH_MAX_INCHES / sides[0], AXIS_VIEW_HEIGHT_MAX_INCHES / sides[1]
+        )
+        self.size_inches = (
+            max(self.inches_per_unit * sides[0], AXIS_VIEW_SIDE_MIN_INCHES),
+            max(self.inches_per_unit * sides[1], AXIS_VIEW_SIDE_MIN_INCHES),
+        )
+        self.picture_sheet = PictureSheet(
+            self.size_inches[0] + AXIS_MARGINS_INCHES[0],
+            self.size_inches[1] + AXIS_MARGINS_INCHES[1],
+            title=title,
+            caption=caption,
+        )
+        self.axes = self.picture_sheet.add_axes(*AXIS_MARGINS_INCHES, *self.size_inches)
+        self.axes.set_aspect("equal")
+        x_name, y_name = axis_names[:2]
+        point_styles.set_length_axis(
+            self.axes.xaxis, x_name, cloud.box[x_name], self.size_inches[0]
+        )
+        point_styles.set_length_axis(
+            self.axes.yaxis,
+            y_name,
+            cloud.box[y_name],
+            self.size_inches[1],
+            point_styles.TICK_SPACING_Y_INCHES,
+        )
+        self._set_limits()
+
+    def _set_limits(self) -> None:
+        """Limits as they are meant to be, whatever is drawn."""
+        self.axes.set(
+            xlim=self.cloud.box[self.axis_names[0]], ylim=self.cloud.box[self.axis_names[1]]
+        )
+
+    def plot_coordinates(self, positions: np.ndarray) -> Sequence[np.ndarray]:
+        """World positions (3, n) as the axes take them."""
+        return [positions[WORLD_AXES.index(axis)] for axis in self.axis_names[:2]]
+
+    def to_inches(self, positions: np.ndarray) -> np.ndarray:
+        """World positions (3, n) on the picture (2, n) [inches]."""
+        return self.inches_per_unit * np.array(self.plot_coordinates(positions))
+
+    def draw_ground(self, height_map: HeightMap) -> bool:
+        """Shaded relief with contours from above; the heights that there are from the side."""
+        cropped = height_map.crop(self.cloud.box["x"], self.cloud.box["y"], nodes_max=480)
+        if cropped is None:
+            return False
+        if self.axis_names[2] == "z":
+            self._draw_relief(cropped.mask_walls())
+        else:
+            self._draw_profile(cropped)
+        self._set_limits()
+        return self.axis_names[2] != "z"
+
+    def _draw_relief(self, height_map: HeightMap) -> None:
+        half_dx, half_dy = ((nodes[1] - nodes[0]) / 2 for nodes in (height_map.x, height_map.y))
+        extent = (
+            height_map.x[0] - half_dx,
+            height_map.x[-1] + half_dx,
+            height_map.y[0] - half_dy,
+            height_map.y[-1] + half_dy,
+        )
+        self.axes.imshow(
+            _shaded_colours(height_map),
+            extent=extent,
+            origin="lower",
+            zorder=0,
+            interpolation="bilinear",
+        )
+        finite_heights = height_map.height[np.isfinite(height_map.height)]
+        if finite_heights.size and finite_heights.max() > finite_heights.min():
+            contours = self.axes.contour(
+                height_map.x,
+                height_map.y,
+                height_map.height,
+                levels=7,
+                colors="0.42",
+                linewidths=0.5,
+                zorder=1,
+            )
+            self.axes.clabel(contours, fontsize=7, fmt="%g m")
+
+    def _draw_profile(self, height_map: HeightMap) -> None:
+        coordinates, collapsed_axis = (
+            (height_map.x, 0) if self.axis_names[0] == "x" else (height_map.y, 1)
+        )
+        is_known = np.isfinite(height_map.height)
+        low = np.where(is_known, height_map.height, np.inf).min(axis=collapsed_axis)
+        high = np.where(is_known, height_map.height, -np.inf).max(axis=collapsed_axis)
+        self.axes.fill_between(
+            coordinates,
+            low,
+            high,
+            where=is_known.any(axis=collapsed_axis),
+            color=GROUND_COLOUR,
+            linewidth=0,
+            zorder=0,
+        )
+
+
+def _draw_cloud(picture: AxisView | ObliqueView, point_colours: np.ndarray) -> None:
+    """Points, false ones as crosses; dropouts and path."""
+    axes: Any = picture.axes
+    cloud, to_columns = picture.cloud, picture.plot_coordinates
+    positions = np.array([cloud.points[axis] for axis in WORLD_AXES])
+    area = point_styles.mark_area(picture.to_inches(positions), *picture.size_inches)
+    is_true = cloud.is_true[picture.draw_order]
+    true_indices, false_indices = picture.draw_order[is_true], picture.draw_order[~is_true]
+    axes.scatter(
+        *to_columns(positions[:, true_indices]),
+        s=area,
+        c=point_colours[true_indices],
+        linewidths=0,
+        zorder=3,
+        **picture.scatter_options,
+    )
+    if false_indices.size:
+        axes.scatter(
+            *to_columns(positions[:, false_indices]),
+            c=point_colours[false_indices],
+            zorder=4,
+            **picture.scatter_options,
+            **point_styles.false_mark_style(area),
+        )
+    if cloud.dropouts:
+        axes.scatter(
+            *to_columns(_positions_in_box(cloud, cloud.dropouts)),
+            s=max(1.6 * area, 10.0),
+            facecolors="none",
+            edgecolors=DROPOUT_COLOUR,
+            linewidths=0.8,
+            zorder=5,
+            **picture.scatter_options,
+        )
+    if cloud.path:
+        path_columns = to_columns(_positions_in_box(cloud, cloud.path))
+        axes.plot(*path_columns, color=PATH_COLOUR, linewidth=1.5, zorder=6)
+        axes.plot(
+            *(column[:1] for column in path_columns), "o", color=PATH_COLOUR, markersize=5, zorder=6
+        )
+
+
+def _positions_in_box(cloud: PointCloud, column_arrays: ColumnArrays) -> np.ndarray:
+    """Places (3, n), nan outside of the box."""
+    positions = np.array([column_arrays[axis] for axis in WORLD_AXES])
+    return np.where(is_within(column_arrays, cloud.box), positions, np.nan)
+
+
+def _shaded_colours(height_map: HeightMap) -> np.ndarray:
+    """Pale shades of the ground, (rows, columns, 4); see-through where there is none."""
+    rgba = np.array(colormaps["gray"](0.62 + 0.36 * height_map.hillshade()))
+    rgba[~np.isfinite(height_map.height)] = 0.0
+    return rgba
+
+
+AXIS_VIEWS = {
+    "above": (("x", "y", "z"), 1),
+    "side": (("x", "z", "y"), -1),
+    "front": (("y", "z", "x"), 1),
+}
+"""Views along an axis: axes across, up and along the look, and which end of the last is nearest."""
+
+OBLIQUE_ANGLES_DEG = -60.0, 28.0
+"""Azimuth and elevation of the usual view at an angle [deg]."""
+
+
+def draw_cloud_sheet(
+    cloud: PointCloud,
+    *,
+    quantity: str,
+    surfaces: Sequence[str],
+    view: str | tuple[float, float],
+    height_map: HeightMap | None,
+    title: str,
+    remarks: Sequence[str],
+) -> Sheet:
+    """Draw a cloud, coloured by a quantity."""
+    values = to_shown_units(quantity, cloud.points[quantity])
+    colouring = point_styles.choose_colours(
+        quantity, values, is_trusted=cloud.is_true, surfaces=surfaces
+    )
+    caption = labels.join_sentences([*cloud.remarks, *remarks])
+    picture: AxisView | ObliqueView
+    if isinstance(view, str) and view in AXIS_VIEWS:
+        picture = AxisView(cloud, *AXIS_VIEWS[view], title=title, caption=caption)
+    else:
+        angles = OBLIQUE_ANGLES_DEG if isinstance(view, str) else view
+        picture = ObliqueView(cloud, *angles, title=title, caption=caption)
+    ground_in_legend = height_map is not None and picture.draw_ground(height_map)
+    _draw_cloud(picture, colouring.map_values(values))
+    picture.picture_sheet.draw_legends(
+        colouring, _legend_handles(cloud, shows_ground=ground_in_legend)
+    )
+    return picture.picture_sheet.sheet
+
+
+def _legend_handles(cloud: PointCloud, *, shows_ground: bool) -> list[Any]:
+    """Return a legend's entries for the marks of a picture."""
+    handles: list[Any] = []
+    if not cloud.is_true.all():
+        handles.append(point_styles.false_point_mark())
+    if cloud.dropouts and cloud.dropouts["x"].size:
+        style = {"markerfacecolor": "none", "markeredgecolor": DROPOUT_COLOUR, "markersize": 5}
+        handles.append(point_styles.legend_mark("o", "shot without\na point", **style))
+    if cloud.path:
+        handles.append(
+            Line2D([], [], color=PATH_COLOUR, linewidth=1.6, label="flight path,\ndot: start")
+        )
+    if shows_ground:
+        handles.append(Patch(color=GROUND_COLOUR, label="heights of\nthe scene"))
+    return handles
+
+
+SCATTER_SIZE_INCHES = 7.6, 4.6
+"""Size of a scatter [inches]."""
+
+
+def draw_scatter_sheet(
+    thinned_rows: ThinnedRows,
+    *,
+    x: str,
+    y: str,
+    colour: str,
+    surfaces: Sequence[str],
+    title: str,
+    remarks: Sequence[str],
+) -> Sheet:
+    """Draw one quantity over another."""
+    column_arrays = thinned_rows.to_columns()
+    is_true = (
+        (column_arrays["flags"] & TRUE) > 0
+        if "flags" in column_arrays
+        else np.ones(len(column_arrays[x]), bool)
+    )
+    values = to_shown_units(colour, column_arrays[colour])
+    colouring = point_styles.choose_colours(colour, values, is_trusted=is_true, surfaces=surfaces)
+    columns = {name: to_shown_units(name, column_arrays[name]) for name in (x, y)}
+    limits = {name: _axis_limits(name, columns[name], is_true) for name in (x, y)}
+    is_inside = is_within(columns, limits)
+    count_texts = [thinned_rows.describe_count("point" if "flags" in column_arrays else "shot")]
+    if n_outside := int((~is_inside & ~is_true).sum()) * thinned_rows.step:
+        count_texts.append(
+            f"{labels.format_count(n_outside, 'false point')} outside of the picture"
+        )
+    picture_sheet = PictureSheet(
+        SCATTER_SIZE_INCHES[0] + AXIS_MARGINS_INCHES[0],
+        SCATTER_SIZE_INCHES[1] + AXIS_MARGINS_INCHES[1],
+        title=title,
+        caption=labels.join_sentences([*count_texts, *remarks]),
+    )
+    axes = picture_sheet.add_axes(*AXIS_MARGINS_INCHES, *SCATTER_SIZE_INCHES)
+    _set_axes(axes, limits, (x, y))
+    rgba = colouring.map_values(values)
+    positions = np.array([columns[x], columns[y]])
+    area = point_styles.mark_area(
+        axes.transData.transform(positions[:, is_inside].T).T / canvas.DPI, *SCATTER_SIZE_INCHES
+    )
+    is_true_inside, is_false_inside = is_inside & is_true, is_inside & ~is_true
+    x_values, y_values = positions
+    axes.scatter(
+        x_values[is_true_inside],
+        y_values[is_true_inside],
+        s=area,
+        c=rgba[is_true_inside],
+        linewidths=0,
+        zorder=3,
+    )
+    false_style = point_styles.false_mark_style(area)
+    axes.scatter(
+        x_values[is_false_inside],
+        y_values[is_false_inside],
+        c=rgba[is_false_inside],
+        zorder=2,
+        **false_style,
+    )
+    picture_sheet.draw_legends(
+        colouring, [point_styles.false_point_mark()] if is_false_inside.any() else []
+    )
+    return picture_sheet.sheet
+
+
+def _axis_limits(quantity: str, values: np.ndarray, is_true: np.ndarray) -> tuple[float, float]:
+    """Return ends of an axis: those of true points, with a margin; infinite where that must be."""
+    finite_values = values[is_true & np.isfinite(values)]
+    finite_values = finite_values if finite_values.size else values[np.isfinite(values)]
+    finite_values = (
+        finite_values[finite_values > 0] if quantity in LOG_QUANTITIES else finite_values
+    )
+    if not finite_values.size:
+        return 0.0, 1.0
+    low, high = float(finite_values.min()), float(finite_values.max())
+    if quantity in LOG_QUANTITIES:
+        return low / 1.3, high * 1.3
+    margin = 0.04 * (high - low) or 0.05 * abs(high) or 0.5
+    return low - margin, high + margin
+
+
+def _set_axes(
+    axes: Axes, limits: dict[str, tuple[float, float]], quantities: tuple[str, str]
+) -> None:
+    """Limits, scales, labels and grid."""
+    axis_names: tuple[Literal["x", "y"], ...] = ("x", "y")
+    for axis_name, quantity in zip(axis_names, quantities, strict=True):
+        axes.set(**{f"{axis_name}scale": "log" if quantity in LOG_QUANTITIES else "linear"})
+        axes.set(
+            **{
+                f"{axis_name}label": textwrap.fill(quantity_label(quantity), 52),
+                f"{axis_name}lim": limits[quantity],
+            }
+        )
+        if quantity in CATEGORICAL_QUANTITIES:
+            axes.locator_params(axis=axis_name, integer=True)
+    axes.grid(True)
+    axes.set_axisbelow(True)
+    axes.tick_params(labelsize=8)
+    if (
+        quantities[1] in SIGNED_QUANTITIES
+        and limits[quantities[1]][0] < 0 < limits[quantities[1]][1]
+    ):
+        axes.axhline(0.0, color="0.6", linewidth=0.8, zorder=1)

@@ -1,0 +1,211 @@
+"""Errors against standard errors of a flight, by the truth in its store.
+
+A flight's store has the truth. Errors of its true points over their standard errors, and errors of
+velocity and altitude over their covariances, should be of size 1. Far larger ones
+come from effects that the standard errors leave out, such as unstated relief or speckle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+import numpy as np
+import xarray as xr
+
+from sweep.model.navigation import EXCLUDED
+from sweep.model.pairing import TRUE
+from sweep.storage.locations import Location
+
+ERROR_RATIO_MAX = 2.0
+"""Errors over standard errors that still count as consistent."""
+
+_ERRORS_MIN = 20
+"""Errors that must be there to be judged."""
+
+_SAMPLED_SHOTS, _SAMPLED_DRAWS, _SAMPLED_VALUES_PER_AXIS = 1 << 15, 16, 6
+"""Shots, draws, and places along each axis that are looked at, evenly apart if there are more."""
+
+_SAMPLED_INTERVALS = 16
+"""Parts along a flight that are read of a long one."""
+
+_ERROR_QUANTILES = 0.6827, 0.9545
+"""Shares of errors whose size is held against that of normal errors."""
+
+_SCALAR_REFERENCE, _VECTOR_REFERENCE = (1.0, 2.0), (1.8780, 2.8328)
+"""Multiples of the standard error that hold these shares, of a number and of a vector of three."""
+
+
+_REMEDIES = {
+    "range": "Ground steeper than navigation.terrain_slope, or targets that move otherwise than "
+    "navigation.target_speed and target_acceleration state, may be the cause.",
+    "radial velocity": "Targets that move otherwise than navigation.target_speed and "
+    "target_acceleration state may be the cause.",
+    "altitude": "Relief other than navigation.relief states may be the cause.",
+}
+"""What may lie behind errors far larger than stated, by quantity."""
+
+
+class ConsistencyResult(NamedTuple):
+    """Errors of one quantity of a scanner over the standard errors that are stated."""
+
+    scanner: str
+    quantity: str
+    error_ratio: float
+    """Errors over what normal errors of the stated size would be; 1 where they are true."""
+    n_errors: int
+    """Errors that were looked at."""
+
+    @property
+    def is_consistent(self) -> bool:
+        """Tell whether errors are about as large as stated, or too few to say."""
+        return self.n_errors < _ERRORS_MIN or not self.error_ratio > ERROR_RATIO_MAX
+
+    @property
+    def message(self) -> str:
+        """Sentence on errors that are far larger than stated."""
+        return (
+            f"{self.scanner}: {self.quantity} is inconsistent: residuals are "
+            f"{self.error_ratio:.3g} "
+            f"times the stated errors. {_REMEDIES.get(self.quantity, '')}".rstrip()
+        )
+
+
+def check_consistency(tree: xr.DataTree) -> list[ConsistencyResult]:
+    """Return the ratio of errors to standard errors of each scanner and quantity of a flight."""
+    results = []
+    for scanner in map(str, tree.attrs["scanners"]):
+        errors_by_sample = [
+            _normalised_errors(sample) for sample in _iter_samples(tree[scanner].to_dataset())
+        ]
+        for quantity in dict.fromkeys(key for sample in errors_by_sample for key in sample):
+            normalised_errors = np.concatenate(
+                [sample[quantity] for sample in errors_by_sample if quantity in sample]
+            )
+            error_ratio = float("nan")
+            if normalised_errors.size:
+                reference_quantiles = (
+                    _VECTOR_REFERENCE if quantity == _VELOCITY else _SCALAR_REFERENCE
+                )
+                error_ratio = np.max(
+                    np.quantile(normalised_errors, _ERROR_QUANTILES) / reference_quantiles
+                )
+            results.append(
+                ConsistencyResult(scanner, quantity, float(error_ratio), normalised_errors.size)
+            )
+    return results
+
+
+def inconsistency_messages(store: str | Location, scanner: str | None = None) -> list[str]:
+    """Return a sentence for each quantity whose errors are far larger than the store states.
+
+    Of one scanner, or of all; none for a grid's store.
+    """
+    from sweep.analysis.datasets import open_tree
+    from sweep.storage.locations import parse_location
+
+    tree = open_tree(parse_location(store))
+    if "scanners" not in tree.attrs:
+        return []
+    return [
+        result.message
+        for result in check_consistency(tree)
+        if not result.is_consistent and scanner in (None, result.scanner)
+    ]
+
+
+def _iter_samples(group: xr.Dataset) -> Iterator[xr.Dataset]:
+    """Parts of a scanner's arrays, in memory: all of a small one, or parts evenly along it."""
+    n_shots, shots_per_cycle = group.sizes["shot"], int(group.attrs["shots_a_cycle"])
+    axis_indices = {
+        str(dim): np.unique(
+            np.linspace(0, size - 1, min(size, _SAMPLED_VALUES_PER_AXIS)).astype(int)
+        )
+        for dim, size in group["pd_shot"].sizes.items()
+        if dim != "shot"
+    }
+    group = group.isel({"draw": slice(_SAMPLED_DRAWS), **axis_indices})
+    n_cycles = n_shots // shots_per_cycle
+    n_sampled_cycles = min(n_cycles, max(1, _SAMPLED_SHOTS // shots_per_cycle))
+    n_intervals = 1 if n_sampled_cycles == n_cycles else _SAMPLED_INTERVALS
+    cycles_per_interval = max(1, n_sampled_cycles // n_intervals)
+    for first_cycle in np.unique(
+        np.linspace(0, n_cycles - cycles_per_interval, n_intervals).astype(int)
+    ).tolist():
+        sample = group.isel(
+            shot=slice(
+                first_cycle * shots_per_cycle, (first_cycle + cycles_per_interval) * shots_per_cycle
+            )
+        )
+        if "cycle" in sample.dims:
+            sample = sample.isel(cycle=slice(first_cycle, first_cycle + cycles_per_interval))
+        variables = [name for name in _NEEDED_VARIABLES if name in sample]
+        yield sample[variables].load()
+
+
+_VELOCITY = "velocity"
+_VARIABLE_BY_QUANTITY = {"range": "range", "radial velocity": "radial_velocity"}
+_NEEDED_VARIABLES = (
+    "flags",
+    "velocity",
+    "velocity_covariance",
+    "velocity_status",
+    "true_velocity",
+    "altitude",
+    "altitude_variance",
+    "altitude_status",
+    "true_altitude",
+    *(
+        f"{q}_interpolated{end}"
+        for q in _VARIABLE_BY_QUANTITY.values()
+        for end in ("", "_standard_error")
+    ),
+    *(f"true_{q}" for q in _VARIABLE_BY_QUANTITY.values()),
+)
+
+
+def _normalised_errors(sample: xr.Dataset) -> Mapping[str, np.ndarray]:
+    """Return the errors over standard errors by quantity, without sign; only those there are."""
+    is_true = (sample["flags"] & TRUE).values > 0
+    errors_by_quantity: dict[str, np.ndarray] = {}
+    for quantity, variable in _VARIABLE_BY_QUANTITY.items():
+        reported = sample[f"{variable}_interpolated"].values[is_true]
+        error = np.abs(reported - sample[f"true_{variable}"].values[is_true])
+        standard_error = sample[f"{variable}_interpolated_standard_error"].values[is_true]
+        # A millionth of the value is what interpolation between bins is good to.
+        errors_by_quantity[quantity] = _finite_only(
+            error / np.maximum(standard_error, 1e-9 * np.abs(reported))
+        )
+    if "velocity" in sample:
+        is_solved = _is_solved(sample["velocity_status"])
+        dims = (*sample["velocity_status"].dims, "xyz")
+        error = (sample["velocity"] - sample["true_velocity"]).transpose(*dims).values[is_solved]
+        covariance = sample["velocity_covariance"].values[is_solved]
+        errors_by_quantity[_VELOCITY] = _mahalanobis_distances(error, covariance)
+        is_solved = _is_solved(sample["altitude_status"])
+        dims = sample["altitude_status"].dims
+        altitude_error = (
+            (sample["altitude"] - sample["true_altitude"]).transpose(*dims).values[is_solved]
+        )
+        errors_by_quantity["altitude"] = _finite_only(
+            np.abs(altitude_error) / np.sqrt(sample["altitude_variance"].values[is_solved])
+        )
+    return errors_by_quantity
+
+
+def _is_solved(status: xr.DataArray) -> np.ndarray:
+    """Return the mask of solutions that there are; -1 stands for those not computed yet."""
+    return ((status >= 0) & (status <= EXCLUDED)).values
+
+
+def _mahalanobis_distances(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Return the lengths of vectors (n, 3) in standard errors, by their covariances (n, 3, 3)."""
+    is_finite = np.isfinite(error).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
+    error, covariance = error[is_finite], covariance[is_finite]
+    inverse_covariance = np.linalg.pinv(covariance, hermitian=True)
+    chi_square = np.einsum("ni,nij,nj->n", error, inverse_covariance, error)
+    return np.asarray(np.sqrt(np.maximum(chi_square, 0.0)))
+
+
+def _finite_only(values: np.ndarray) -> np.ndarray:
+    return values[np.isfinite(values)]

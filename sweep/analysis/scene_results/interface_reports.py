@@ -1,0 +1,262 @@
+"""Reports of a unit's interface: quantised, clipped, flagged, at its rate and late.
+
+They are made of stored points and change none of them. A shot is valid where it has a return that a
+Doppler peak confirms, as far as the instrument can tell; without a Doppler segment, where it has
+one. Its first return is taken. Each beam has one report in every period of the interface's rate,
+valid or not: of the mean or the last of the period's valid shots.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pandas
+import xarray as xr
+
+from sweep.analysis import labels
+from sweep.analysis.scene_results.point_export import resolve_recording
+from sweep.analysis.scene_results.recordings import INTERPOLATED, Recording, array_name
+from sweep.analysis.study_figures import SceneResults
+from sweep.messages import STORE_PLACEHOLDER, suggestion
+from sweep.model.pairing import UNCONFIRMED
+from sweep.spec import Mistake, SpecError
+from sweep.spec.scene_sections import Interface
+from sweep.storage.locations import Location, atomic_path
+
+MEASURED_QUANTITIES = ("range", "radial_velocity")
+REPORT_COLUMNS = {
+    "time": ("s", "time stamp: that of the measurement, and the latency"),
+    "beam": ("1", "number of the beam"),
+    "range": ("m", "range as reported"),
+    "radial_velocity": ("m s-1", "radial velocity as reported, positive when closing"),
+    "range_standard_error": ("m", "standard error of the range, its quantum's among it"),
+    "radial_velocity_standard_error": (
+        "m s-1", "standard error of the radial velocity, its quantum's among it"
+    ),
+    "valid": ("1", "1: enough valid shots, and neither value beyond its limits"),
+    "range_saturated": ("1", "1: range beyond its limits, and clipped to them"),
+    "radial_velocity_saturated": ("1", "1: radial velocity beyond its limits, and clipped to them"),
+    "shots": ("1", "valid shots in the report's period"),
+    "true_range": ("m", "true range of the beam's axis at the time stamp"),
+    "true_radial_velocity": ("m s-1", "true radial velocity of the beam's axis at the time stamp"),
+}  # fmt: skip
+"""Units and words of each column of reports."""
+
+_TRUTH_VARIABLES = {"true_range": "beam_range", "true_radial_velocity": "beam_radial_velocity"}
+_PERIOD_EDGE_FRACTION = 1e-6
+"""Share of a period before its end from which on a shot counts to the next: for rounded times."""
+_REPORTS_PER_SHOT_MAX = 10
+"""Reports for each shot from which on an interface's rate is refused: most would be empty."""
+
+ColumnArrays = dict[str, np.ndarray]
+
+
+def reports(
+    store: str | Location,
+    file: str | Path | None = None,
+    *,
+    scanner: str | None = None,
+    draw: int = 0,
+    ranges: str = INTERPOLATED,
+    where: Mapping[str, object] | None = None,
+    interface: Mapping[str, object] | None = None,
+) -> xr.Dataset:
+    """Return what a unit with a stated interface reports of a flight.
+
+    Parameters
+    ----------
+    store, scanner, draw, ranges, where
+        As of :func:`sweep.export`.
+    file
+        CSV file to write the reports to as well, names and units in its first line.
+    interface
+        Fields of the spec's section ``interface`` to be set anew, written as in a spec:
+        ``{"rate": "10 Hz"}``.
+
+    Returns
+    -------
+    xarray.Dataset
+        Variables along ``report``, by period and beam, with units and words. Values of a report
+        without a valid shot are nan, and so are standard errors of clipped values.
+
+    Raises
+    ------
+    NotAStoreError
+        Where there is no store of a scene.
+    SpecError
+        With every mistake in what is asked for.
+    OSError
+        Where the file can't be written.
+    """
+    results, mistakes = SceneResults.from_store(store), []
+    if file is not None and Path(file).suffix.lower() != ".csv":
+        remedy = "name a .csv, or export points"
+        mistakes.append(Mistake("file", "must end in .csv to hold reports", str(file), remedy))
+    recording, _ = resolve_recording(results, scanner, draw, ranges, where or {}, mistakes)
+    shot_columns = _read_shots(recording, draw, ranges)
+    report_columns = make_reports(shot_columns, results.spec.interface_with(interface or {}))
+    if file is not None:
+        with atomic_path(Path(file), replace=True) as draft_path:
+            headers = {
+                name: labels.column_label(name, u) for name, (u, _) in REPORT_COLUMNS.items()
+            }
+            frame = pandas.DataFrame(
+                {header: report_columns[name] for name, header in headers.items()}
+            )
+            frame.to_csv(draft_path, index=False, na_rep="nan", lineterminator="\r\n")
+    arrays = {
+        name: ("report", report_columns[name], {"units": units, "long_name": words})
+        for name, (units, words) in REPORT_COLUMNS.items()
+    }
+    return xr.Dataset(arrays)
+
+
+def _read_shots(recording: Recording, draw: int, ranges: str) -> ColumnArrays:
+    """Columns over the computed shots of a draw: geometry, and the first return of each."""
+    stored_by_name = {
+        name: array_name(name, ranges)
+        for name in (*MEASURED_QUANTITIES, *map(_standard_error_name, MEASURED_QUANTITIES))
+    }
+    column_parts: list[ColumnArrays] = []
+    for part in recording.shot_slices():
+        is_computed = recording.computed_shots(part, draw)
+        names = ("time", "beam", *_TRUTH_VARIABLES.values())
+        column_arrays = {name: recording.read(name, part)[is_computed] for name in names}
+        for name, stored_name in (stored_by_name | {"flags": "flags"}).items():
+            column_arrays[name] = recording.read(stored_name, part, draw)[is_computed, 0]
+        column_parts.append(column_arrays)
+    if not any(part["time"].size for part in column_parts):
+        problem = f"holds no shot of {recording.scanner} and draw {draw} yet"
+        remedy = f"{suggestion('resume', STORE_PLACEHOLDER)} goes on with it"
+        raise SpecError([Mistake("store", problem, "", remedy)])
+    return {name: np.concatenate([part[name] for part in column_parts]) for name in column_parts[0]}
+
+
+def make_reports(shot_columns: ColumnArrays, interface: Interface) -> ColumnArrays:
+    """Columns of reports, (m,) each, from those of shots in the order of time, (n,) each.
+
+    Shots have ``time``, ``beam``, ``flags``, the values and standard errors of their first return,
+    and the truth on the beam's axis, ``beam_range`` and ``beam_radial_velocity``.
+    """
+    is_valid_shot = (shot_columns["flags"] > 0) & (shot_columns["flags"] & UNCONFIRMED == 0)
+    report_index, report_periods = _assign_periods(shot_columns, interface.rate)
+    n_valid = np.bincount(report_index[is_valid_shot], minlength=report_periods["beam"].size)
+    weights = _shot_weights(report_index, is_valid_shot, n_valid, interface.value)
+
+    def weighted_sum(values: np.ndarray) -> np.ndarray:
+        total = np.bincount(
+            report_index[is_valid_shot], (weights * values)[is_valid_shot], n_valid.size
+        )
+        return np.where(n_valid > 0, total, np.nan)
+
+    measurement_time = np.where(
+        n_valid > 0, weighted_sum(shot_columns["time"]), report_periods["time"]
+    )
+    columns = {"time": measurement_time + interface.latency, "beam": report_periods["beam"]}
+    is_valid_report = n_valid >= interface.valid_shots
+    for name in MEASURED_QUANTITIES:
+        quantisation_step = getattr(interface, f"{name}_quantum")
+        limits = getattr(interface, f"min_{name}"), getattr(interface, f"max_{name}")
+        columns[name], is_saturated = quantise(
+            weighted_sum(shot_columns[name]), quantisation_step, *limits
+        )
+        variance = (
+            weighted_sum(weights * shot_columns[_standard_error_name(name)] ** 2)
+            + (quantisation_step or 0.0) ** 2 / 12
+        )
+        columns[_standard_error_name(name)] = np.where(is_saturated, np.nan, np.sqrt(variance))
+        columns[f"{name}_saturated"] = is_saturated.astype(np.int8)
+        is_valid_report &= ~is_saturated
+    columns |= {"valid": is_valid_report.astype(np.int8), "shots": n_valid}
+    for name, truth_name in _TRUTH_VARIABLES.items():
+        columns[name] = _interpolate_truth(
+            columns["time"], columns["beam"], shot_columns, truth_name
+        )
+    return {name: columns[name] for name in REPORT_COLUMNS}
+
+
+def quantise(
+    values: np.ndarray, quantisation_step: float | None, low: float | None, high: float | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Values in whole quanta, clipped to the limits, and a mask of those beyond; none for no rule.
+
+    Limits are clipped to their nearest whole quantum, so that what lies within them is off by half
+    a quantum at the most.
+
+    >>> values, beyond = quantised(np.array([0.3, 2.6, 9.0]), 0.5, None, 4.0)
+    >>> values.tolist(), beyond.tolist()
+    ([0.5, 2.5, 4.0], [False, False, True])
+    """
+    low, high = -np.inf if low is None else low, np.inf if high is None else high
+    is_beyond = (values < low) | (values > high)
+    if quantisation_step is None:
+        return np.clip(values, low, high), is_beyond
+    steps = np.clip(
+        np.rint(values / quantisation_step),
+        np.rint(low / quantisation_step),
+        np.rint(high / quantisation_step),
+    )
+    return steps * quantisation_step, is_beyond
+
+
+def _standard_error_name(quantity: str) -> str:
+    return f"{quantity}_standard_error"
+
+
+def _assign_periods(
+    shot_columns: ColumnArrays, rate: float | None
+) -> tuple[np.ndarray, ColumnArrays]:
+    """Report of each shot, (n,); beam and middle of the period of each report, (m,)."""
+    if rate is None:
+        return np.arange(shot_columns["time"].size), {
+            name: shot_columns[name] for name in ("time", "beam")
+        }
+    start = shot_columns["time"][0]
+    beams, beam_index = np.unique(shot_columns["beam"], return_inverse=True)
+    period_index = np.floor((shot_columns["time"] - start) * rate + _PERIOD_EDGE_FRACTION).astype(
+        np.int64
+    )
+    if (period_index[-1] + 1) * beams.size > _REPORTS_PER_SHOT_MAX * (beam_index.size + beams.size):
+        beam_rate = beam_index.size / beams.size / max(np.ptp(shot_columns["time"]), 1 / rate)
+        problem = (
+            f"must be at most some {_REPORTS_PER_SHOT_MAX * beam_rate:.3g} Hz: beams are measured "
+            "less often"
+        )
+        remedy = f"write e.g. '{beam_rate:.3g} Hz', or leave it out for a report of each shot"
+        raise SpecError([Mistake("interface.rate", problem, f"{rate:.10g} Hz", remedy)])
+    periods = np.arange(period_index[-1] + 1)
+    return period_index * beams.size + beam_index, {
+        "time": np.repeat(start + (periods + 0.5) / rate, beams.size),
+        "beam": np.tile(beams, periods.size),
+    }
+
+
+def _shot_weights(
+    report_index: np.ndarray, is_valid_shot: np.ndarray, n_valid: np.ndarray, reported_value: str
+) -> np.ndarray:
+    """Weight of each shot in its report, (n,): as much as any, or all to the last."""
+    if reported_value == "mean":
+        return np.where(is_valid_shot, 1 / np.maximum(n_valid[report_index], 1), 0.0)
+    last_shot = np.full(n_valid.size, -1)
+    np.maximum.at(last_shot, report_index[is_valid_shot], np.flatnonzero(is_valid_shot))
+    return (last_shot[report_index] == np.arange(report_index.size)).astype(float)
+
+
+def _interpolate_truth(
+    time: np.ndarray, beam: np.ndarray, shot_columns: ColumnArrays, name: str
+) -> np.ndarray:
+    """Truth of beams at times, linear between their shots; nan outside of them and of nothing."""
+    truth_at_times = np.full(time.size, np.nan)
+    truth = np.where(np.isfinite(shot_columns[name]), shot_columns[name], np.nan)
+    for beam_number in np.unique(beam):
+        is_of_beam, is_shot_of_beam = beam == beam_number, shot_columns["beam"] == beam_number
+        truth_at_times[is_of_beam] = np.interp(
+            time[is_of_beam],
+            shot_columns["time"][is_shot_of_beam],
+            truth[is_shot_of_beam],
+            np.nan,
+            np.nan,
+        )
+    return truth_at_times

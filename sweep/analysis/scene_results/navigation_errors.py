@@ -1,0 +1,401 @@
+"""Errors of navigation by altitude: availability, bias and scatter; their chart and table."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import dask
+import numpy as np
+import xarray as xr
+
+from sweep.analysis import labels
+from sweep.analysis.charts import LINEAR, LOG, Chart, ChartAxis, ChartLine, Panel
+from sweep.analysis.datasets import chunk_length, read_slices
+from sweep.analysis.scene_results.recordings import Recording
+from sweep.analysis.tables import Cell, PageTable, TablePage
+from sweep.model.navigation import EXCLUDED, SOLVED
+
+VELOCITY, ALTITUDE = "velocity", "altitude"
+
+SOLUTIONS_PER_READ = 65_536
+"""Solutions that are read at a time, about."""
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorTally:
+    """Errors of a vector of m components, by bin of altitude; parts add up to the whole.
+
+    Solutions asked for, and those that there were (bins,); their mean error, the sum of squares of
+    deviations from it, and the mean of the variances that they came with (bins, m).
+    """
+
+    attempts: np.ndarray
+    n_solutions: np.ndarray
+    mean_error: np.ndarray
+    squared_deviation: np.ndarray
+    mean_stated_variance: np.ndarray
+
+    def __add__(self, other: ErrorTally) -> ErrorTally:
+        """Tally of both, by Chan, Golub and LeVeque (1983), which never subtracts large sums."""
+        n_solutions = self.n_solutions + other.n_solutions
+        other_fraction = (other.n_solutions / np.maximum(n_solutions, 1))[..., None]
+        mean_difference = other.mean_error - self.mean_error
+        between_squares = (
+            self.n_solutions[..., None] * other_fraction * mean_difference * mean_difference
+        )
+        return ErrorTally(
+            self.attempts + other.attempts,
+            n_solutions,
+            self.mean_error + other_fraction * mean_difference,
+            self.squared_deviation + other.squared_deviation + between_squares,
+            self.mean_stated_variance
+            + other_fraction * (other.mean_stated_variance - self.mean_stated_variance),
+        )
+
+    @property
+    def availability(self) -> np.ndarray:
+        """Share of attempts with a solution (...,), 0..1; nan without attempts."""
+        return _quotient_or_nan(self.n_solutions, self.attempts)
+
+    @property
+    def bias(self) -> np.ndarray:
+        """Mean error (..., m); nan without solutions."""
+        return np.where(self.n_solutions[..., None] > 0, self.mean_error, np.nan)
+
+    @property
+    def rmse(self) -> np.ndarray:
+        """Root mean square error of each component (..., m), bias included; nan without any."""
+        return np.sqrt(
+            _quotient_or_nan(self.squared_deviation, self.n_solutions[..., None])
+            + self.mean_error**2
+        )
+
+    @property
+    def variance(self) -> np.ndarray:
+        """Unbiased variance of the errors (..., m); nan with fewer than two solutions."""
+        return _quotient_or_nan(self.squared_deviation, self.n_solutions[..., None] - 1)
+
+    @property
+    def stated_variance(self) -> np.ndarray:
+        """Mean variance that the solutions stated (..., m); nan without any."""
+        return np.where(self.n_solutions[..., None] > 0, self.mean_stated_variance, np.nan)
+
+
+@dataclass(frozen=True)
+class ErrorCurve:
+    """Errors of one scanner's velocity or altitude, by bins between edges of true altitude [m]."""
+
+    scanner: str
+    quantity: str
+    altitude_edges: np.ndarray
+    tally: ErrorTally
+
+    @property
+    def label(self) -> str:
+        """Name for a reader."""
+        return labels.coordinate_label(self.scanner) or "measured"
+
+    @property
+    def bin_centres(self) -> np.ndarray:
+        """Altitudes in the middle of the bins [m]."""
+        return (self.altitude_edges[1:] + self.altitude_edges[:-1]) / 2
+
+    @property
+    def bias_standard_error(self) -> np.ndarray:
+        """Standard error of the bias (bins, m); nan with fewer than two solutions."""
+        return np.sqrt(self.tally.variance / np.maximum(self.tally.n_solutions, 1)[:, None])
+
+    @property
+    def rmse(self) -> np.ndarray:
+        """Root mean square error of each component and of the vector's length, (bins, m [+ 1])."""
+        return _append_length(self.tally.rmse)
+
+    @property
+    def stated_deviation(self) -> np.ndarray:
+        """Standard deviation that solutions state of themselves, as `rmse`: root of the mean."""
+        return _append_length(np.sqrt(self.tally.stated_variance))
+
+
+def _append_length(components: np.ndarray) -> np.ndarray:
+    """Components (..., m), and of vectors the root of the sum of their squares after them."""
+    if components.shape[-1] == 1:
+        return components
+    return np.concatenate([components, np.linalg.norm(components, axis=-1, keepdims=True)], axis=-1)
+
+
+def navigation_curves(
+    named_recordings: Sequence[tuple[str, Recording]], *, quantity: str, n_bins: int
+) -> list[ErrorCurve]:
+    """Errors of scanners that navigate, all over the same bins of altitude."""
+    navigating = [
+        (name, recording.dataset)
+        for name, recording in named_recordings
+        if "velocity_status" in recording.dataset
+    ]
+    altitude_edges = _altitude_edges([dataset for _, dataset in navigating], n_bins)
+    if altitude_edges is None:
+        return []
+    return [
+        ErrorCurve(
+            name,
+            quantity,
+            altitude_edges,
+            merge_tallies(list(_iter_tallies(dataset, quantity, altitude_edges))),
+        )
+        for name, dataset in navigating
+    ]
+
+
+def _altitude_edges(datasets: Sequence[xr.Dataset], n_bins: int) -> np.ndarray | None:
+    """Edges of the bins; none where no cycle's altitude is known."""
+    altitudes = [dataset["true_altitude"].chunk(cycle=SOLUTIONS_PER_READ) for dataset in datasets]
+    extremes = dask.compute([altitude.min() for altitude in altitudes],
+                        [altitude.max() for altitude in altitudes])  # fmt: skip
+    if not np.isfinite(extremes).any():
+        return None
+    low, high = float(np.nanmin(extremes[0])), float(np.nanmax(extremes[1]))
+    if high - low < 1e-6 * max(abs(high), 1.0):
+        low, high, n_bins = low - 0.5, high + 0.5, 1
+    edges = np.linspace(low, high, n_bins + 1)
+    edges[-1] = np.nextafter(high, np.inf)  # the highest cycle is in the last bin
+    return edges
+
+
+def _iter_tallies(
+    dataset: xr.Dataset, quantity: str, altitude_edges: np.ndarray
+) -> Iterator[ErrorTally]:
+    status = dataset[f"{quantity}_status"]
+    draws_per_chunk = chunk_length(status, "draw")
+    draw_slices = read_slices(status, "draw", draws_per_chunk)
+    cycle_slices = read_slices(status, "cycle", max(1, SOLUTIONS_PER_READ // draws_per_chunk))
+    for cycle_slice, draw_slice in product(cycle_slices, draw_slices):
+        part = dataset.isel(cycle=cycle_slice, draw=draw_slice)
+        status_values, solution = part[f"{quantity}_status"].values, part[quantity].values
+        altitude = np.broadcast_to(part["true_altitude"].values[:, None], status_values.shape)
+        altitude_bin = np.digitize(np.nan_to_num(altitude.ravel(), nan=-np.inf), altitude_edges) - 1
+        altitude_bin = np.where(status_values.ravel() >= SOLVED, altitude_bin, -1)
+        if quantity == ALTITUDE:
+            variance = part["altitude_variance"].values
+        else:
+            variance = np.diagonal(part["velocity_covariance"].values, axis1=-2, axis2=-1)
+        error = solution - part[f"true_{quantity}"].values[:, None]
+        component_shape = -1, len(COMPONENTS[quantity])
+        yield tally_errors(
+            error.reshape(component_shape),
+            variance.reshape(component_shape),
+            (status_values.ravel() >= SOLVED) & (status_values.ravel() <= EXCLUDED),
+            altitude_bin,
+            altitude_edges.size - 1,
+        )
+
+
+def tally_errors(
+    error: np.ndarray,
+    variance: np.ndarray,
+    is_available: np.ndarray,
+    altitude_bin: np.ndarray,
+    n_bins: int,
+) -> ErrorTally:
+    """Tally of n solutions by cell, in two passes for the digits' sake.
+
+    Of each its error and the variance that it states (n, m), and its cell.
+    """
+    is_in_range = (altitude_bin >= 0) & (altitude_bin < n_bins)
+    attempts = np.bincount(altitude_bin[is_in_range], minlength=n_bins)
+    is_counted = is_in_range & is_available
+    error, variance, altitude_bin = (
+        error[is_counted],
+        variance[is_counted],
+        altitude_bin[is_counted],
+    )
+    n_solutions = np.bincount(altitude_bin, minlength=n_bins)
+    divisor = np.maximum(n_solutions, 1)[:, None]
+    mean_error = _sum_by_bin(error, altitude_bin, n_bins) / divisor
+    residual = error - mean_error[altitude_bin]
+    mean_correction = (
+        _sum_by_bin(residual, altitude_bin, n_bins) / divisor
+    )  # what rounding left in the mean
+    squared_deviation = _sum_by_bin(residual * residual, altitude_bin, n_bins)
+    mean_stated_variance = _sum_by_bin(variance, altitude_bin, n_bins) / divisor
+    return ErrorTally(
+        attempts, n_solutions, mean_error + mean_correction, squared_deviation, mean_stated_variance
+    )
+
+
+def merge_tallies(tallies: Sequence[ErrorTally]) -> ErrorTally:
+    """Tally of all, added pair by pair, then pairs of pairs: the same bits for the same order."""
+    if not tallies:
+        raise ValueError("there is no tally to merge")
+    remaining_tallies = list(tallies)
+    while len(remaining_tallies) > 1:
+        pair_sums = [
+            a + b for a, b in zip(remaining_tallies[::2], remaining_tallies[1::2], strict=False)
+        ]
+        remaining_tallies = pair_sums + remaining_tallies[2 * len(pair_sums) :]
+    return remaining_tallies[0]
+
+
+def _sum_by_bin(values: np.ndarray, bin_index: np.ndarray, n_bins: int) -> np.ndarray:
+    """Return sums of values (n, m) by cell (size, m), each in the order of the rows."""
+    return np.stack([np.bincount(bin_index, column, n_bins) for column in values.T], axis=-1)
+
+
+def _quotient_or_nan(total: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """Quotient, nan where the number is not positive."""
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+AVAILABILITY, BIAS, RMSE = "availability", "bias", "rmse"
+COMPONENTS = {VELOCITY: ("x", "y", "z"), ALTITUDE: ("",)}
+UNIT_BY_QUANTITY = {VELOCITY: "m/s", ALTITUDE: "m"}
+LENGTH_NAME = "vector"
+
+ComponentStatistic = tuple[str, int]
+"""A statistic, and the number of the component that it is of; one past the last is the length."""
+
+
+def navigation_chart(curves: Sequence[ErrorCurve], show: str) -> Chart:
+    """Errors over altitude, a panel for each statistic and a line for each curve."""
+    panels, panels_per_row = [], []
+    for quantity in dict.fromkeys(curve.quantity for curve in curves):
+        quantity_curves = [curve for curve in curves if curve.quantity == quantity]
+        panel_rows = _panel_rows(quantity, show)
+        panels_per_row += [len(row) for row in panel_rows]
+        panels += [
+            _statistic_panel(quantity_curves, quantity, *statistic)
+            for row in panel_rows
+            for statistic in row
+        ]
+    titles = [panel.title for panel in panels]
+    caption = [f"{curves[0].altitude_edges.size - 1} bins of altitude, over all draws"]
+    if any("bias" in title for title in titles):
+        caption[0] += "; bars: standard error of the bias"
+    if any("error" in title for title in titles):
+        caption.append("as stated: root of the mean variance that solutions give for themselves")
+    return Chart(
+        "Navigation", f"Lines of navigation's errors over altitude: {', '.join(titles)}.", caption,
+        panels, {"statistic": "Shown"}, panels_per_row=panels_per_row,
+    )  # fmt: skip
+
+
+def _panel_rows(quantity: str, show: str) -> list[list[ComponentStatistic]]:
+    """Panels row by row: what there is over all components first, then component by component."""
+    n_components = len(COMPONENTS[quantity])
+    component_indices = list(range(n_components))
+    if n_components == 1:
+        statistics = [AVAILABILITY, BIAS, RMSE] if show == "all" else [show]
+        return [[(statistic, 0) for statistic in statistics]]
+    if show == "all":
+        first_row = [(AVAILABILITY, 0), (RMSE, n_components)]
+        return [
+            first_row,
+            [(BIAS, i) for i in component_indices],
+            [(RMSE, i) for i in component_indices],
+        ]
+    if show == RMSE:
+        return [[(RMSE, n_components), (RMSE, 0)], [(RMSE, i) for i in component_indices[1:]]]
+    return [[(show, i) for i in (component_indices if show == BIAS else [0])]]
+
+
+def _statistic_panel(
+    curves: Sequence[ErrorCurve], quantity: str, statistic: str, component_index: int
+) -> Panel:
+    component_names = COMPONENTS[quantity]
+    component = (
+        component_names[component_index] if component_index < len(component_names) else LENGTH_NAME
+    )
+    phrase = f"of the {quantity}" + (f", {component}" if len(component_names) > 1 else "")
+    units, altitudes = UNIT_BY_QUANTITY[quantity], curves[0].bin_centres
+    lines: list[ChartLine] = []
+    if statistic == AVAILABILITY:
+        title, y_axis = f"{quantity} available", ChartAxis("share of cycles (%)", limits=(-4, 104))
+        lines += [ChartLine(altitudes, 100 * curve.tally.availability, curve.label, k)
+                  for k, curve in enumerate(curves)]  # fmt: skip
+    elif statistic == BIAS:
+        title, y_axis = f"bias {phrase}", ChartAxis(f"bias ({units})")
+        lines.append(ChartLine(altitudes[[0, -1]], np.zeros(2), style="level"))
+        for k, curve in enumerate(curves):
+            bias, error = (
+                curve.tally.bias[:, component_index],
+                curve.bias_standard_error[:, component_index],
+            )
+            lines.append(
+                ChartLine(altitudes, bias, curve.label, k, low=bias - error, high=bias + error,
+                     style="bars")
+            )  # fmt: skip
+    else:
+        values = np.concatenate(
+            [c[:, component_index] for k in curves for c in (k.rmse, k.stated_deviation)]
+        )
+        positive_values = values[np.isfinite(values) & (values > 0)]
+        is_wide = positive_values.size > 0 and positive_values.max() > 4 * positive_values.min()
+        title = f"RMS error {phrase}"
+        y_axis = ChartAxis(
+            f"error ({units})", LOG if is_wide else LINEAR, None if is_wide else (0.0, None)
+        )
+        for k, curve in enumerate(curves):
+            lines.append(ChartLine(altitudes, curve.rmse[:, component_index], curve.label, k))
+            stated_name = f"{curve.label}, as stated"
+            lines.append(
+                ChartLine(
+                    altitudes,
+                    curve.stated_deviation[:, component_index],
+                    stated_name,
+                    k,
+                    style="stated",
+                )
+            )
+    if statistic != AVAILABILITY and not any(curve.tally.n_solutions.any() for curve in curves):
+        title += ": no solution"
+    return Panel({"statistic": title}, ChartAxis("altitude above ground (m)"), y_axis, lines)
+
+
+def navigation_page(
+    curves: Sequence[ErrorCurve], *, show: str, title: str, remarks: Sequence[str]
+) -> TablePage:
+    """Return a block for each curve of a quantity, a row for each bin of altitude."""
+    statistics = (AVAILABILITY, BIAS, RMSE) if show == "all" else (show,)
+    page_tables, records = [], []
+    for curve in curves:
+        curve_records = [
+            _bin_record(curve, i, statistics) for i in range(curve.altitude_edges.size - 1)
+        ]
+        columns = [name for name in curve_records[0] if name != "scanner"]
+        rows = [[record[name] for name in columns] for record in curve_records]
+        page_tables.append(PageTable(f"{curve.label}: {curve.quantity}", columns, rows))
+        records += curve_records
+    units = ", ".join(dict.fromkeys(UNIT_BY_QUANTITY[curve.quantity] for curve in curves))
+    notes = [
+        "from, to: true altitude above ground [m]; cycles: measurement cycles times draws.",
+        f"bias, rmse, stated: in {units}; stated: root of the mean variance that",
+        "  solutions give for themselves; error of bias: its standard error.",
+        *remarks,
+    ]
+    return TablePage(title, page_tables, notes, records)
+
+
+def _bin_record(curve: ErrorCurve, bin_index: int, statistics: Sequence[str]) -> dict[str, Cell]:
+    """One line of the CSV file."""
+    record: dict[str, Cell] = {
+        "scanner": curve.scanner,
+        "from": float(curve.altitude_edges[bin_index]),
+        "to": float(curve.altitude_edges[bin_index + 1]),
+        "cycles": int(curve.tally.attempts[bin_index]),
+        "solved": int(curve.tally.n_solutions[bin_index]),
+    }
+    component_names = COMPONENTS[curve.quantity]
+    if AVAILABILITY in statistics:
+        record["available"] = float(curve.tally.availability[bin_index])
+    if BIAS in statistics:
+        for k, name in enumerate(component_names):
+            record[f"bias {name}".strip()] = float(curve.tally.bias[bin_index, k])
+            record[f"error of bias {name}".strip()] = float(curve.bias_standard_error[bin_index, k])
+    if RMSE in statistics:
+        for k, name in enumerate(
+            (*component_names, LENGTH_NAME) if len(component_names) > 1 else component_names
+        ):
+            record[f"rmse {name}".strip()] = float(curve.rmse[bin_index, k])
+            record[f"stated {name}".strip()] = float(curve.stated_deviation[bin_index, k])
+    return record

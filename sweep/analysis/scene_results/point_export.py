@@ -1,0 +1,446 @@
+"""Point clouds as files for other programs: CloudCompare, PyVista, GIS, spreadsheets."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from sweep.analysis import labels
+from sweep.analysis.scene_results.consistency import check_consistency
+from sweep.analysis.scene_results.recordings import (
+    INTERPOLATED,
+    QUANTISED,
+    QUANTITY_BY_NAME,
+    AxisPosition,
+    Recording,
+    find_axis_position,
+)
+from sweep.analysis.study_figures import SceneResults
+from sweep.model.outputs import CLOSING
+from sweep.model.pairing import FLAGS, TRUE
+from sweep.spec import Mistake, SpecError
+from sweep.spec.rules import suggest_similar_name
+from sweep.storage.locations import Location, atomic_path
+
+POINT_DTYPE = np.dtype(
+    [
+        *((name, "<f8") for name in (
+            "x", "y", "z", "time", "range", "radial_velocity", "range_standard_error",
+            "radial_velocity_standard_error", "snr", "pd", "true_range", "true_radial_velocity",
+        )),
+        ("surface", "<i2"), ("flags", "|u1"), ("beam", "<i4"), ("shot", "<u4"),
+        ("return_number", "|u1"), ("number_of_returns", "|u1"), ("scan_angle", "<f8"),
+    ]
+)  # fmt: skip
+"""Every column, in the order of files; returns of a shot and draw are numbered from 1 as stored,
+confirmed and strong ones first. The scan angle is that of the beam from nadir [deg], below 0 on the
+left of the way that the platform goes over the ground (of the x axis where it goes nowhere)."""
+
+POINT_COLUMNS: tuple[str, ...] = POINT_DTYPE.names or ()
+UNIT_BY_COLUMN = {
+    n: QUANTITY_BY_NAME[n].units
+    for n in POINT_COLUMNS
+    if n in QUANTITY_BY_NAME and QUANTITY_BY_NAME[n].units != "1"
+}
+"""Units of the columns that have any."""
+UNIT_BY_COLUMN["scan_angle"] = "deg"
+
+REMARK_BY_COLUMN = dict.fromkeys(("radial_velocity", "true_radial_velocity"), CLOSING)
+"""What a value of a column means beyond its units."""
+
+DESCRIPTION_BY_COLUMN = {
+    name: "; ".join(filter(None, [UNIT_BY_COLUMN.get(name), REMARK_BY_COLUMN.get(name)]))
+    for name in POINT_COLUMNS
+}
+"""Units and remark of each column; empty for a pure number."""
+
+
+@dataclass(frozen=True)
+class PointTable:
+    """Points of one draw of a recording, in the coordinates and times of the scene's files."""
+
+    recording: Recording
+    draw: int
+    ranges: str
+    origin: np.ndarray
+    """(3,): added to the coordinates in the store [m]."""
+    time_origin: float = 0.0
+    """Added to the times in the store [s]."""
+    projection_wkt: str = ""
+    """WKT of the coordinates' map projection; empty where none is known."""
+
+    def iter_rows(self) -> Iterator[np.ndarray]:
+        """Rows (m,) of ROW, part by part."""
+        stored_columns = [
+            name for name in POINT_COLUMNS if name not in ("number_of_returns", "scan_angle")
+        ]
+        for shot_slice in self.recording.shot_slices():
+            column_arrays = self.recording.point_columns(
+                [*stored_columns, "returns"], shot_slice, self.draw, self.ranges
+            )
+            rows = np.zeros(column_arrays["x"].size, POINT_DTYPE)
+            for name in stored_columns:
+                rows[name] = column_arrays[name]
+            rows["return_number"] += 1
+            rows["number_of_returns"] = column_arrays["returns"]
+            rows["scan_angle"] = self._scan_angles(shot_slice)[rows["shot"] - shot_slice.start]
+            rows["time"] += self.time_origin
+            for axis, origin_offset in zip("xyz", self.origin, strict=True):
+                rows[axis] += origin_offset
+            yield rows
+
+    def _scan_angles(self, shot_slice: slice) -> np.ndarray:
+        """Angle of each shot's beam from nadir [deg], (k,), below 0 on the left."""
+        beam_directions, velocities = (
+            self.recording.read(name, shot_slice)
+            for name in ("beam_direction", "platform_velocity")
+        )
+        is_still = np.hypot(velocities[:, 0], velocities[:, 1]) < 1e-9 * np.linalg.norm(
+            velocities, axis=1
+        )
+        headings = np.where(is_still[:, None], [1.0, 0.0, 0.0], velocities)
+        right_component = (
+            beam_directions[:, 0] * headings[:, 1] - beam_directions[:, 1] * headings[:, 0]
+        )
+        nadir_angle = np.degrees(
+            np.arctan2(
+                np.hypot(beam_directions[:, 0], beam_directions[:, 1]), -beam_directions[:, 2]
+            )
+        )
+        return np.where(right_component < 0, -nadir_angle, nadir_angle)
+
+    def count_points(self) -> int:
+        """Return the number of points."""
+        return sum(
+            int((self.recording.read("flags", shot_slice, self.draw) > 0).sum())
+            for shot_slice in self.recording.shot_slices()
+        )
+
+    def coordinate_limits(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest coordinates, (3,) each [m]; infinite without a point."""
+        low, high = np.full(3, np.inf), np.full(3, -np.inf)
+        for shot_slice in self.recording.shot_slices():
+            column_arrays = self.recording.point_columns("xyz", shot_slice, self.draw, self.ranges)
+            coordinates = np.array([*column_arrays.values()]) + self.origin[:, None]
+            low = np.minimum(low, coordinates.min(axis=1, initial=np.inf))
+            high = np.maximum(high, coordinates.max(axis=1, initial=-np.inf))
+        return low, high
+
+
+Remarks = Sequence[str]
+
+_PLY_TYPE_BY_DTYPE = {
+    "<f8": "double", "<i2": "short", "|u1": "uchar", "<i4": "int", "<u4": "uint",
+}  # fmt: skip
+
+
+def write_ply(table: PointTable, file_path: Path, remarks: Remarks) -> int:
+    """Write a binary PLY file with the columns as properties; return the number of points."""
+    n_points = table.count_points()
+    comments = [*remarks, *(f"{name}: {remark}" for name, remark in REMARK_BY_COLUMN.items())]
+    for unit in dict.fromkeys(UNIT_BY_COLUMN.values()):
+        comments.append(
+            f"{' '.join(n for n, column_unit in UNIT_BY_COLUMN.items() if column_unit == unit)} in "
+            f"{unit}"
+        )
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        *(f"comment {' '.join(text.split())}" for text in comments),
+        f"element vertex {n_points}",
+        *(f"property {_PLY_TYPE_BY_DTYPE[POINT_DTYPE[name].str]} {name}" for name in POINT_COLUMNS),
+        "end_header",
+    ]
+    with file_path.open("wb") as file:
+        file.write(("\n".join(header) + "\n").encode("ascii", "replace"))
+        for rows in table.iter_rows():
+            file.write(rows.tobytes())
+    return n_points
+
+
+def write_csv(table: PointTable, file_path: Path, remarks: Remarks) -> int:
+    """Write a CSV file with names and units in its first line, and all digits."""
+    n_points = 0
+    with file_path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(labels.column_label(n, DESCRIPTION_BY_COLUMN[n]) for n in POINT_COLUMNS)
+        for rows in table.iter_rows():
+            writer.writerows(rows.tolist())
+            n_points += rows.size
+    return n_points
+
+
+LAS_STEP_MIN = 1e-4
+"""Step of coordinates in a LAS file [m]; coarser where the points lie too far apart for it."""
+
+LAS_COORDINATE_MAX = 2.0**31 - 1
+LAS_RETURN_NUMBER_MAX = 15
+"""Largest coordinates, in steps from the offset, and numbers of returns in a LAS file."""
+
+_LAS_STANDARD_COLUMNS = {"x", "y", "z", "time", "return_number", "number_of_returns", "scan_angle"}
+
+_LAS_SCAN_ANGLE_STEP_DEG = 0.006
+"""Step of scan angles in a LAS file [deg]."""
+
+_STORED_RETURN_FIELD = "stored_return"
+"""Extra byte that holds the number of a return in the store, from 1."""
+
+_LAS_BEAM_MAX = 255
+"""Largest number of a beam that a LAS file's user data can hold."""
+
+LAS_UNCLASSIFIED, LAS_NOISE = 1, 7
+"""Classes of LAS: points as they are, and points known to be false."""
+
+
+def write_las(
+    table: PointTable, file_path: Path, remarks: Remarks, *, compressed: bool = False
+) -> int:
+    """Write a LAS 1.4 file, point format 6, with the other columns as extra bytes.
+
+    True returns of a shot are numbered by rising range, as the format asks. False points have the
+    class of noise and are numbered apart. The number of the beam stands as user data too (255 from
+    there on), times as GPS times; intensity is the signal-to-noise ratio in hundredths of a
+    decibel. The coordinates' projection is stated where it is known.
+    """
+    import laspy
+
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    extra_columns = [name for name in POINT_COLUMNS if name not in _LAS_STANDARD_COLUMNS]
+    header.add_extra_dims(
+        [
+            *(
+                laspy.ExtraBytesParams(n, POINT_DTYPE[n], description=DESCRIPTION_BY_COLUMN[n])
+                for n in extra_columns
+            ),
+            laspy.ExtraBytesParams(
+                _STORED_RETURN_FIELD, "|u1", description="return_number in the store"
+            ),
+        ]
+    )
+    low, high = table.coordinate_limits()
+    has_points = bool(np.isfinite(low).all())
+    header.global_encoding.wkt = bool(table.projection_wkt)
+    if table.projection_wkt:
+        header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(table.projection_wkt))
+    header.offsets = np.round((low + high) / 2) + 0.0 if has_points else np.zeros(3)
+    header.scales = np.full(3, _las_step(float((high - low).max()) if has_points else 0.0))
+    header.generating_software = "sweep"
+    header.system_identifier = "simulated FMCW Doppler lidar"[:32]
+    n_points = 0
+    with laspy.open(file_path, mode="w", header=header, do_compress=compressed) as writer:
+        for rows in table.iter_rows():
+            writer.write_points(_las_points(rows, header, extra_columns))
+            n_points += rows.size
+    return n_points
+
+
+def _las_step(extent: float) -> float:
+    """Step of coordinates that reach so far [m]: a power of ten."""
+    return LAS_STEP_MIN * 10.0 ** max(
+        0, math.ceil(math.log10((extent / 2 + 1) / (LAS_STEP_MIN * LAS_COORDINATE_MAX)))
+    )
+
+
+def _las_points(rows: np.ndarray, header, extra_columns: Sequence[str]):  # type: ignore[no-untyped-def]
+    import laspy
+
+    points = laspy.ScaleAwarePointRecord.zeros(rows.size, header=header)
+    for axis in "xyz":
+        points[axis] = rows[axis]
+    points["gps_time"] = rows["time"]
+    for name, return_numbers in zip(
+        ("return_number", "number_of_returns"), _number_by_range(rows), strict=True
+    ):
+        points[name] = np.minimum(return_numbers, LAS_RETURN_NUMBER_MAX)
+    points[_STORED_RETURN_FIELD] = rows["return_number"]
+    points["user_data"] = np.minimum(rows["beam"], _LAS_BEAM_MAX)
+    points["scan_angle"] = np.round(rows["scan_angle"] / _LAS_SCAN_ANGLE_STEP_DEG)
+    points["classification"] = np.where(rows["flags"] & TRUE, LAS_UNCLASSIFIED, LAS_NOISE)
+    snr_db = 10 * np.log10(np.maximum(rows["snr"], 1e-30))
+    points["intensity"] = np.clip(np.round(100 * np.nan_to_num(snr_db)), 0, 65535)
+    for name in extra_columns:
+        points[name] = rows[name]
+    return points
+
+
+def _number_by_range(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return numbers by rising range, from 1, and how many there are, of true points and of false.
+
+    Rows of a shot all come together.
+    """
+    is_false = (rows["flags"] & TRUE) == 0
+    order = np.lexsort((rows["range"], is_false, rows["shot"]))
+    starts_group = np.ones(rows.size, bool)
+    starts_group[1:] = np.diff(rows["shot"][order].astype(np.int64)) != 0
+    starts_group[1:] |= np.diff(is_false[order].astype(np.int8)) != 0
+    group_starts = np.flatnonzero(starts_group)
+    group_sizes = np.diff(group_starts, append=rows.size)
+    return_numbers, return_counts = np.empty((2, rows.size), np.int64)
+    return_numbers[order] = np.arange(rows.size) - np.repeat(group_starts, group_sizes) + 1
+    return_counts[order] = np.repeat(group_sizes, group_sizes)
+    return return_numbers, return_counts
+
+
+WRITER_BY_SUFFIX: dict[str, Callable[[PointTable, Path, Remarks], int]] = {
+    ".ply": write_ply,
+    ".las": write_las,
+    ".laz": partial(write_las, compressed=True),
+    ".csv": write_csv,
+}
+"""Writers of the kinds of files, by suffix."""
+
+
+def export(
+    store: str | Location,
+    file: str | Path,
+    *,
+    scanner: str | None = None,
+    draw: int = 0,
+    ranges: str = INTERPOLATED,
+    where: Mapping[str, object] | None = None,
+) -> int:
+    """Write the points of one scanner and draw to a file.
+
+    Coordinates are those of the scene's files in metres: the scene's origin is added to what is
+    stored. Of a raster in feet they are its own times the length of a foot. Times are those of the
+    platform's table of waypoints, or begin with the flight. Radial velocities are positive when
+    closing. Points are written in the order of shots and returns, part by part; those not computed
+    yet are left out. Nothing is at the file's place before it is whole.
+
+    Parameters
+    ----------
+    store
+        Store of a scene's point clouds, complete or not.
+    file
+        Where to; its suffix says what it is: ``.ply``, ``.las``, ``.laz`` or ``.csv``.
+    scanner
+        Name of the scanner; may be left out where there is only one.
+    draw
+        Number of the draw, from 0.
+    ranges
+        ``interpolated`` or ``quantised``: which ranges, velocities, positions and standard
+        errors to write.
+    where
+        Value, as written in a spec, of every coordinate that has several.
+
+    Returns
+    -------
+    int
+        Number of points.
+
+    Raises
+    ------
+    NotAStoreError
+        Where there is no store of a scene.
+    SpecError
+        With every mistake in what is asked for.
+    OSError
+        Where the file can't be written.
+    """
+    results, file, mistakes = SceneResults.from_store(store), Path(file), []
+    if file.suffix.lower() not in WRITER_BY_SUFFIX:
+        remedy = f"take one of {', '.join(WRITER_BY_SUFFIX)}"
+        problem = "must have a suffix that says its format"
+        mistakes.append(Mistake("file", problem, str(file), remedy))
+    recording, axis_position = resolve_recording(
+        results, scanner, draw, ranges, where or {}, mistakes
+    )
+    origin = np.asarray(results.tree.attrs.get("origin", np.zeros(3)), float)
+    attributes = results.tree.attrs
+    table = PointTable(
+        recording, draw, ranges, origin,
+        float(attributes.get("time_origin", 0.0)), str(attributes.get("projection", "")),
+    )  # fmt: skip
+    with atomic_path(file, replace=True) as draft_path:
+        return WRITER_BY_SUFFIX[file.suffix.lower()](
+            table, draft_path, _file_remarks(results, table, axis_position)
+        )
+
+
+def resolve_recording(
+    results: SceneResults,
+    scanner: str | None,
+    draw: int,
+    ranges: str,
+    where: Mapping[str, object],
+    mistakes: Sequence[Mistake] = (),
+) -> tuple[Recording, AxisPosition]:
+    """Return the recording that is asked for, and its place along the axes.
+
+    Raises
+    ------
+    SpecError
+        With every mistake in what is asked for, and those known before.
+    """
+    axis_position = find_axis_position(results.spec, where)
+    if all_mistakes := [*mistakes, *_find_mistakes(results, scanner, draw, ranges, axis_position)]:
+        raise SpecError(all_mistakes)
+    return axis_position.recording(results.tree, scanner or results.scanners[0]), axis_position
+
+
+def _find_mistakes(
+    results: SceneResults, scanner: str | None, draw: int, ranges: str, axis_position: AxisPosition
+) -> list[Mistake]:
+    """Mistakes in what is asked for of a study."""
+    mistakes = []
+    scanner_list = ", ".join(results.scanners)
+    if scanner is None and len(results.scanners) > 1:
+        mistakes.append(
+            Mistake("scanner", "must be named where there are several", "", f"{scanner_list}")
+        )
+    elif scanner is not None and scanner not in results.scanners:
+        remedy = suggest_similar_name(
+            scanner, results.scanners, fallback=f"there is {scanner_list}"
+        )
+        mistakes.append(Mistake("scanner", "is no scanner of this study", scanner, remedy))
+    n_draws = int(results.spec.draws.number)
+    if not 0 <= draw < n_draws:
+        problem, remedy = "is no draw of this study", f"they are numbered 0 to {n_draws - 1}"
+        mistakes.append(Mistake("draw", problem, str(draw), remedy))
+    if ranges not in (INTERPOLATED, QUANTISED):
+        problem = f"must be {INTERPOLATED} or {QUANTISED}"
+        remedy = suggest_similar_name(ranges, (INTERPOLATED, QUANTISED))
+        mistakes.append(Mistake("ranges", problem, ranges, remedy))
+    for axis in results.spec.axes:
+        if axis.name in axis_position.open_axes:  # several values, and none is chosen
+            axis_parameter = axis.parameters[0]
+            value_list = ", ".join(
+                labels.format_quantity(v, axis_parameter.units)
+                for v in axis_parameter.display_values[:5]
+            )
+            problem = f"has {axis.size} values, and a file holds the points of one"
+            remedy = (
+                f"choose {axis_parameter.coordinate} from "
+                f"{value_list}{', ...' if axis.size > 5 else ''}"
+            )
+            mistakes.append(Mistake(f"where.{axis_parameter.coordinate}", problem, "", remedy))
+    return mistakes
+
+
+def _file_remarks(
+    results: SceneResults, table: PointTable, axis_position: AxisPosition
+) -> list[str]:
+    """Remarks in a file on its contents."""
+    surface_remarks = [f"surface {i}: {name}" for i, name in enumerate(results.surface_labels)]
+    flag_remarks = [f"flag {bit}: {labels.coordinate_label(name)}" for name, bit in FLAGS.items()]
+    selection_remark = (
+        f"scanner {table.recording.scanner}, draw {table.draw}, {table.ranges} ranges"
+    )
+    consistency_messages = [
+        result.message
+        for result in check_consistency(results.tree)
+        if not result.is_consistent and result.scanner == table.recording.scanner
+    ]
+    return [
+        results.source_note,
+        *consistency_messages,
+        ", ".join(filter(None, [selection_remark, axis_position.label])),
+        *surface_remarks,
+        *flag_remarks,
+    ]

@@ -1,0 +1,276 @@
+"""Sheets of points: colours for amounts and names, marks, legends and ticks."""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Colormap, LinearSegmentedColormap, LogNorm, Normalize, to_rgba
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, MaxNLocator
+from scipy.spatial import cKDTree
+
+from sweep.analysis import canvas, labels
+from sweep.analysis.scene_results.recordings import (
+    CATEGORICAL_QUANTITIES,
+    LOG_QUANTITIES,
+    POINT_KINDS,
+    SIGNED_QUANTITIES,
+    quantity_label,
+)
+
+DIVERGING_COLOUR_MAP = LinearSegmentedColormap.from_list(
+    "both_signs",
+    [(0.0, "#7CC6EE"), (0.36, "#0072B2"), (0.5, "#2B2B33"), (0.64, "#D55E00"), (1.0, "#F5B26B")],
+)
+"""Dark at zero, blue and orange to its sides: apart for the colour-blind, and on a pale ground.
+
+Small values have their sign's colour already; larger ones are paler.
+"""
+
+MISSING_POINT_COLOUR = "0.6"
+"""Colour of what has no value or name."""
+
+OUTLIER_MARGIN_FRACTION = 0.25
+"""Share of a scale's length by which a few values may lie beyond the others and still be on it."""
+
+
+@dataclass(frozen=True)
+class ContinuousColours:
+    """Colours of amounts."""
+
+    cmap: Colormap
+    norm: Normalize
+    label: str
+    extend: str = "neither"
+
+    def map_values(self, values: np.ndarray) -> np.ndarray:
+        """Colours of values, (n, 4)."""
+        is_finite = np.isfinite(values)
+        colours = np.asarray(self.cmap(self.norm(np.where(is_finite, values, 1.0))))
+        colours[~is_finite] = to_rgba(MISSING_POINT_COLOUR)
+        return colours
+
+
+@dataclass(frozen=True)
+class CategoryColours:
+    """Colours of names, by number."""
+
+    title: str
+    label_by_number: Mapping[int, str]
+
+    @property
+    def colour_by_number(self) -> dict[int, str]:
+        """Colour of each number; what has none is grey."""
+        named_numbers = [number for number in self.label_by_number if number >= 0]
+        return dict(zip(named_numbers, canvas.LINE_COLOURS, strict=False))
+
+    def map_values(self, values: np.ndarray) -> np.ndarray:
+        """Colours of numbers, (n, 4)."""
+        rgba = np.tile(to_rgba(MISSING_POINT_COLOUR), (np.size(values), 1))
+        for number, colour in self.colour_by_number.items():
+            rgba[np.asarray(values) == number] = to_rgba(colour)
+        return rgba
+
+    def legend_handles(self) -> list[Line2D]:
+        """Entries of a legend."""
+        return [
+            legend_mark("o", name, color=self.colour_by_number.get(number, MISSING_POINT_COLOUR))
+            for number, name in self.label_by_number.items()
+        ]
+
+
+def legend_mark(marker: str, label: str, **style: Any) -> Line2D:
+    """Return a legend's entry for a mark."""
+    return Line2D([], [], linestyle="", marker=marker, label=label, **{"markersize": 6} | style)
+
+
+def false_point_mark() -> Line2D:
+    """Return a legend's entry for false points."""
+    return legend_mark("x", "false point", color="0.2", markersize=5)
+
+
+def choose_colours(
+    quantity: str, values: np.ndarray, *, is_trusted: np.ndarray, surfaces: Sequence[str]
+) -> ContinuousColours | CategoryColours:
+    """Colours for values of a quantity."""
+    if quantity in CATEGORICAL_QUANTITIES:
+        numbers = [int(n) for n in np.unique(values[np.isfinite(values)])]
+        if quantity == "flags":
+            return CategoryColours(
+                "point", {n: labels.coordinate_label(list(POINT_KINDS)[n]) for n in numbers}
+            )
+        if len(numbers) <= len(canvas.LINE_COLOURS):
+            surface_by_number = dict(enumerate(surfaces)) if quantity == "surface" else {}
+            label_by_number = {
+                n: surface_by_number.get(n, "none" if n < 0 else f"{n}") for n in numbers
+            }
+            return CategoryColours(labels.coordinate_label(quantity), label_by_number)
+    return _continuous_colours(quantity, values, is_trusted)
+
+
+def _scale_ends(values: np.ndarray) -> tuple[float, float]:
+    """Return the ends of a scale: lowest and highest value, without a few outliers."""
+    if not values.size:
+        return 1.0, 1.0
+    low, low_quantile, high_quantile, high = (
+        float(q) for q in np.quantile(values, [0.0, 0.005, 0.995, 1.0])
+    )
+    outlier_distance = OUTLIER_MARGIN_FRACTION * (high_quantile - low_quantile)
+    return (low_quantile if low_quantile - low > outlier_distance else low), (
+        high_quantile if high - high_quantile > outlier_distance else high
+    )
+
+
+def _continuous_colours(
+    quantity: str, values: np.ndarray, is_trusted: np.ndarray
+) -> ContinuousColours:
+    finite_values = values[np.isfinite(values)]
+    trusted_values = values[is_trusted & np.isfinite(values)]
+    trusted_values = trusted_values if trusted_values.size else finite_values
+    is_log = quantity in LOG_QUANTITIES
+    low, high = _scale_ends(trusted_values[trusted_values > 0] if is_log else trusted_values)
+    cmap = colormaps[canvas.COLOUR_MAP_NAME]
+    if quantity in SIGNED_QUANTITIES and low < 0 < high:
+        cmap, low, high = DIVERGING_COLOUR_MAP, -max(-low, high), max(-low, high)
+    if high <= low:
+        low, high = (low / 2, high * 2) if is_log else (low - 0.5, high + 0.5)
+    has_below, has_above = bool((finite_values < low).any()), bool((finite_values > high).any())
+    return ContinuousColours(
+        cmap,
+        LogNorm(low, high) if is_log else Normalize(low, high),
+        textwrap.fill(quantity_label(quantity), 44),
+        {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[has_below, has_above],
+    )
+
+
+LEGEND_WIDTH_INCHES = 1.75
+"""Width of what stands at the right [inches]."""
+
+TITLE_HEIGHT_INCHES, CAPTION_HEIGHT_INCHES, CAPTION_LINE_HEIGHT_INCHES = 0.75, 0.55, 0.17
+"""Heights of the title and of the small print's first line and of each further one [inches]."""
+
+
+class PictureSheet:
+    """A sheet with a picture of a given size, and what its colours and marks mean at its right."""
+
+    def __init__(self, width: float, height: float, *, title: str, caption: str) -> None:
+        self.width, self.height = width, height
+        head_height = TITLE_HEIGHT_INCHES + 0.18 * title.count("\n")
+        total_width = width + LEGEND_WIDTH_INCHES
+        self.foot_height = CAPTION_HEIGHT_INCHES + CAPTION_LINE_HEIGHT_INCHES * (
+            len(caption) // int(15 * total_width)
+        )
+        self.sheet = canvas.blank_sheet(total_width, height + head_height + self.foot_height)
+        self.sheet.set_layout_engine("none")
+        canvas.set_title(self.sheet, title)
+        canvas.set_caption(self.sheet, caption)
+
+    def to_sheet_fractions(
+        self, left: float, bottom: float, width: float, height: float
+    ) -> tuple[float, float, float, float]:
+        """Convert a rectangle in inches from the lower left corner to shares of the sheet."""
+        sheet_width, sheet_height = self.sheet.get_size_inches()
+        return (
+            left / sheet_width,
+            (self.foot_height + bottom) / sheet_height,
+            width / sheet_width,
+            height / sheet_height,
+        )
+
+    def add_axes(self, *rectangle_inches: float, **options: Any) -> Axes:
+        """Axes in a rectangle in inches from the picture's lower left corner."""
+        return self.sheet.add_axes(self.to_sheet_fractions(*rectangle_inches), **options)
+
+    def draw_legends(
+        self, colouring: ContinuousColours | CategoryColours, handles: Sequence[Artist]
+    ) -> None:
+        """Return the colours' scale or names, and the marks' meaning."""
+        if isinstance(colouring, ContinuousColours):
+            bar_height = min(0.72 * self.height, 4.2)
+            axes = self.add_axes(
+                self.width + 0.15, (self.height - bar_height) * 0.62, 0.17, bar_height
+            )
+            colour_bar = self.sheet.colorbar(
+                ScalarMappable(colouring.norm, colouring.cmap), cax=axes, extend=colouring.extend
+            )
+            colour_bar.set_label(colouring.label, fontsize=9)
+            colour_bar.ax.tick_params(labelsize=8)
+            if not isinstance(colouring.norm, LogNorm):
+                colour_bar.ax.ticklabel_format(useOffset=False)
+        elif colouring.label_by_number:
+            self._draw_legend(
+                colouring.legend_handles(), 0.86 * self.height, colouring.title, "upper left"
+            )
+        if handles:
+            self._draw_legend(handles, 0.0, "", "lower left")
+
+    def _draw_legend(self, handles: Sequence[Artist], bottom: float, title: str, loc: Any) -> None:
+        x, y, *_ = self.to_sheet_fractions(self.width + 0.02, bottom, 0, 0)
+        self.sheet.legend(
+            handles=list(handles), title=title or None, loc=loc, bbox_to_anchor=(x, y),
+            frameon=False, fontsize=8, handletextpad=0.5, borderaxespad=0.0,
+        )  # fmt: skip
+
+
+MARK_AREA_MAX = 24.0
+"""Area of the largest marks of points [square points]."""
+
+MARK_AREA_MIN_BY_POINTS = ((2000, 9.0), (8000, 5.0), (30_000, 2.0), (math.inf, 0.7))
+"""Areas below which marks of so many points are not made [square points]."""
+
+TICK_SPACING_X_INCHES, TICK_SPACING_Y_INCHES = 0.42, 0.25
+"""Distances of ticks that can still be read, on level and on upright axes [inches]."""
+
+OFFSET_COORDINATE_MIN = 1e5
+"""Coordinates [m] from which on axes show them relative to a round number."""
+
+
+def mark_area(positions: np.ndarray, width: float, height: float) -> float:
+    """Area of a mark [square points] that leaves points (2, n) apart on a picture [inches]."""
+    n_points = positions.shape[1]
+    if n_points < 2:
+        return MARK_AREA_MAX
+    neighbour_distances = cKDTree(positions.T).query(positions.T[:: max(1, n_points // 1000)], k=2)[
+        0
+    ][:, 1]
+    separate_area = (0.85 * 72 * float(np.median(neighbour_distances))) ** 2
+    covering_area = 0.1 * 72 * 72 * width * height / n_points
+    area_min = next(area for points_max, area in MARK_AREA_MIN_BY_POINTS if n_points <= points_max)
+    return min(max(min(separate_area, covering_area), area_min), MARK_AREA_MAX)
+
+
+def false_mark_style(area: float) -> dict[str, Any]:
+    """Look of false points among true ones of a size."""
+    return {"marker": "x", "s": max(1.2 * area, 9.0), "linewidths": 0.7}
+
+
+def set_length_axis(
+    axis: Any,
+    name: str,
+    limits: tuple[float, float],
+    axis_inches: float,
+    tick_spacing: float = TICK_SPACING_X_INCHES,
+) -> None:
+    """Name, units and ticks of an axis of metres; far-off ones relative to a round number."""
+    low, high = limits
+    offset = 0.0
+    if max(abs(low), abs(high)) > OFFSET_COORDINATE_MIN:
+        rounding_unit = 10.0 ** max(math.ceil(math.log10(high - low)), 0)
+        offset = rounding_unit * round((low + high) / 2 / rounding_unit)
+    n_ticks = min(max(int(axis_inches / tick_spacing), 1), 8)
+    axis.set_major_locator(MaxNLocator(n_ticks, steps=[1, 2, 2.5, 5, 10], min_n_ticks=1))
+    if offset:
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value - offset:g}"))
+        name = f"{name} {'-' if offset > 0 else '+'} {abs(offset):.0f}"
+    axis.set_label_text(labels.axis_label(name, "m"))
+    axis.label.set_size(9)
+    axis.set_tick_params(labelsize=8)

@@ -1,0 +1,598 @@
+"""Recordings of scanners: quantities of shots and points, read part by part; clouds of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import xarray as xr
+
+from sweep.analysis import labels
+from sweep.analysis.datasets import chunk_length, read_attributes_of_kind, read_slices
+from sweep.analysis.selection import matches_any
+from sweep.model.eyepoints import Eyepoints
+from sweep.model.outputs import BEAMLETS, CYCLES, POINTS, SHOTS, STATISTICS, XYZ
+from sweep.model.pairing import FLAGS, TRUE
+from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
+from sweep.spec import Mistake, SpecError
+from sweep.spec.rules import suggest_similar_name
+from sweep.storage.locations import PACKED_ATTRIBUTE, Location, eyepoints_path, parse_location
+from sweep.storage.store_format import OPEN_ZARR_KWARGS, NotAStoreError
+from sweep.storage.verified_store import open_verified_store
+from sweep.units import QuantityError
+
+if TYPE_CHECKING:
+    from sweep.spec import SceneSpec
+
+
+WORLD_AXES = ("x", "y", "z")
+
+QUANTISED, INTERPOLATED = "quantised", "interpolated"
+
+_INTERPOLATED_NAMES = {
+    f"{name}{error}": f"{name}_interpolated{error}"
+    for name in ("range", "radial_velocity")
+    for error in ("", "_standard_error")
+}
+
+
+def array_name(name: str, ranges: str) -> str:
+    """Name of the array of a quantity: between bins, where that is asked for and there is one."""
+    return _INTERPOLATED_NAMES.get(name, name) if ranges == INTERPOLATED else name
+
+
+CATEGORICAL_QUANTITIES = ("beam", "surface", "flags")
+"""Quantities whose values are names rather than amounts."""
+
+SIGNED_QUANTITIES = ("radial_velocity", "beam_radial_velocity", "true_radial_velocity")
+"""Velocities, whose sign is shown."""
+
+DECIBEL_QUANTITIES = ("snr", "snr_up")
+"""Ratios of powers, which are shown in decibels."""
+
+LOG_QUANTITIES = ("pfa_up", "pfa_down")
+"""Quantities that go over orders of magnitude, and are above 0."""
+
+POINT_KINDS = {name: bit for name, bit in FLAGS.items() if name != "unconfirmed"}
+"""Flags of which a point has exactly one."""
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A quantity of each shot or of each point."""
+
+    long_name: str
+    units: str
+    is_per_point: bool
+
+
+def _list_quantities() -> dict[str, Quantity]:
+    quantities = {}
+    for table, is_per_point in ((SHOTS, False), (STATISTICS, False), (POINTS, True)):
+        for name, output in table.items():
+            if XYZ not in output.dims:
+                quantities[name] = Quantity(output.long_name, output.units, is_per_point)
+    short_names = {
+        "range": "range", "radial_velocity": "radial velocity", "snr": "signal-to-noise ratio",
+        "pd": "probability of detection", "time": "time", "beam": "beam", "surface": "surface",
+    }  # fmt: skip
+    for name, long_name in short_names.items():
+        quantities[name] = replace(quantities[name], long_name=long_name)
+    altitude = CYCLES["true_altitude"]
+    quantities["altitude"] = Quantity("altitude above ground", altitude.units, False)
+    quantities |= {axis: Quantity(axis, "m", True) for axis in WORLD_AXES}
+    return quantities | {"shot": Quantity("number of the shot", "1", False)}
+
+
+QUANTITY_BY_NAME = _list_quantities()
+"""Every quantity by its name."""
+
+
+def quantity_label(name: str) -> str:
+    """Return a quantity in words with the units in which it is shown."""
+    quantity = QUANTITY_BY_NAME[name]
+    return labels.axis_label(
+        quantity.long_name, "dB" if name in DECIBEL_QUANTITIES else quantity.units
+    )
+
+
+def to_shown_units(name: str, values: np.ndarray) -> np.ndarray:
+    """Values as they are shown: decibels of ratios, and of flags which kind of point they say."""
+    values = np.asarray(values)
+    if name == "flags":
+        return np.asarray(point_kinds(values.astype(int)), float)
+    if name in DECIBEL_QUANTITIES:
+        is_positive = values > 0
+        return np.where(is_positive, 10 * np.log10(np.where(is_positive, values, 1.0)), np.nan)
+    return values.astype(float)
+
+
+def point_kinds(flags: np.ndarray) -> np.ndarray:
+    """Index of each point's kind in KINDS, from its flags; -1 where there is no point."""
+    kind_indices = np.full(np.shape(flags), -1)
+    for i, bit in enumerate(POINT_KINDS.values()):
+        kind_indices[(flags & bit) > 0] = i
+    return kind_indices
+
+
+ColumnArrays = dict[str, np.ndarray]
+
+
+ValueLimits = tuple[float, ...]
+"""Lowest and highest value of a quantity."""
+
+UNLIMITED: ValueLimits = (-np.inf, np.inf)
+
+
+def is_within(column_arrays: ColumnArrays, limits: Mapping[str, ValueLimits]) -> np.ndarray:
+    """Mask of the rows in which all quantities that have limits lie within them; nan does not."""
+    masks = [
+        (column_arrays[n] >= low) & (column_arrays[n] <= high) for n, (low, high) in limits.items()
+    ]
+    return np.asarray(np.logical_and.reduce(masks))
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Shots and points of one scanner, at one place along the axes; chunks of its flags' folder."""
+
+    scanner: str
+    dataset: xr.Dataset
+    flags_chunk_folder: Location | None = None
+
+    @property
+    def n_shots(self) -> int:
+        """Number of shots."""
+        return int(self.dataset.sizes["shot"])
+
+    def shot_slices(self, time_limits: ValueLimits = UNLIMITED) -> Iterator[slice]:
+        """Ranges of shots, without those that are not computed or lie outside of limits."""
+        for shot_slice in read_slices(self.dataset["flags"], "shot"):
+            if is_within({"time": self.read("time", shot_slice)}, {"time": time_limits}).any():
+                yield shot_slice
+
+    def computed_shots(self, shot_slice: slice, draw: int = 0) -> np.ndarray:
+        """Mask (k,) of the shots of a range of which the points of a draw are computed.
+
+        Geometry is stored with a study's first place and draw, and no point looks like none
+        found: only the chunk tells.
+        """
+        has_geometry = np.isfinite(self.read("time", shot_slice))
+        if self.flags_chunk_folder is None:
+            return has_geometry
+        shots_per_chunk, draws_per_chunk = (
+            chunk_length(self.dataset["flags"], dim) for dim in ("shot", "draw")
+        )
+        is_chunk_stored = [
+            (
+                self.flags_chunk_folder / f"{chunk_number}" / f"{draw // draws_per_chunk}" / "0"
+            ).exists()
+            for chunk_number in range(
+                shot_slice.start // shots_per_chunk, (shot_slice.stop - 1) // shots_per_chunk + 1
+            )
+        ]
+        chunk_of_shot = (
+            np.arange(shot_slice.start, shot_slice.stop) // shots_per_chunk
+            - shot_slice.start // shots_per_chunk
+        )
+        return has_geometry & np.array(is_chunk_stored)[chunk_of_shot]
+
+    def read(self, name: str, shot_slice: slice, draw: int | None = None) -> np.ndarray:
+        """Return an array's values over a range of shots, of one draw if it has any."""
+        array = self.dataset[name].isel(shot=shot_slice)
+        return np.asarray((array if draw is None else array.isel(draw=draw)).values)
+
+    def point_columns(
+        self, names: Sequence[str], shot_slice: slice, draw: int = 0, ranges: str = QUANTISED
+    ) -> ColumnArrays:
+        """Quantities of every point of a range of shots, (m,) each, in order.
+
+        Names are those of :data:`QUANTITY_BY_NAME`, ``return_number``, and ``returns`` (points of
+        the same shot).
+        """
+        has_point = self.read("flags", shot_slice, draw) > 0
+        shot_index, return_number = np.nonzero(has_point)
+        column_arrays: ColumnArrays = {}
+        for name in names:
+            if name in ("x", "y", "z"):
+                if name not in column_arrays:
+                    positions = self._point_positions(
+                        shot_slice, has_point, shot_index, draw, ranges
+                    )
+                    column_arrays |= dict(zip("xyz", positions.T, strict=True))
+            elif name == "return_number":
+                column_arrays[name] = return_number
+            elif name == "returns":
+                column_arrays[name] = has_point.sum(axis=1)[shot_index]
+            elif QUANTITY_BY_NAME[name].is_per_point:
+                column_arrays[name] = self.read(array_name(name, ranges), shot_slice, draw)[
+                    has_point
+                ]
+            else:
+                column_arrays[name] = self.shot_values(name, shot_slice)[shot_index]
+        return {name: column_arrays[name] for name in names}
+
+    def thinned_rows(
+        self,
+        names: Sequence[str],
+        rows_max: int,
+        *,
+        draw: int = 0,
+        ranges: str = QUANTISED,
+        time_limits: ValueLimits | None = None,
+    ) -> ThinnedRows:
+        """Quantities of every point, or of every computed shot if all are a shot's; thinned."""
+        is_per_point = any(QUANTITY_BY_NAME[name].is_per_point for name in names)
+        limits = {"time": time_limits} if time_limits else {}
+        thinned = ThinnedRows(rows_max)
+        for shot_slice in self.shot_slices(time_limits or UNLIMITED):
+            if is_per_point:
+                names_read = list(dict.fromkeys([*names, "flags", "time"]))
+                column_arrays = self.point_columns(names_read, shot_slice, draw, ranges)
+            else:
+                is_computed = self.computed_shots(shot_slice)
+                names_read = list(dict.fromkeys([*names, "time"]))
+                column_arrays = {
+                    name: self.shot_values(name, shot_slice)[is_computed] for name in names_read
+                }
+            thinned.append(select_within(column_arrays, limits))
+        return thinned
+
+    def _point_positions(
+        self,
+        shot_slice: slice,
+        has_point: np.ndarray,
+        shot_index: np.ndarray,
+        draw: int,
+        ranges: str,
+    ) -> np.ndarray:
+        """World positions of points, (m, 3)."""
+        position = self.read("position", shot_slice, draw)[has_point]
+        if ranges == QUANTISED:
+            range_change = self.read("range", shot_slice, draw) - self.read(
+                "range_interpolated", shot_slice, draw
+            )
+            position = (
+                position
+                + range_change[has_point][:, None]
+                * self.read("beam_direction", shot_slice)[shot_index]
+            )
+        return position
+
+    def shot_values(self, name: str, shot_slice: slice) -> np.ndarray:
+        """Return a quantity of every shot of a range, (k,)."""
+        if name == "shot":
+            return np.arange(shot_slice.start, shot_slice.stop)
+        if name == "altitude":
+            cycle = np.arange(shot_slice.start, shot_slice.stop) // int(
+                self.dataset.attrs["shots_a_cycle"]
+            )
+            altitudes = self.dataset["true_altitude"].isel(cycle=slice(cycle[0], cycle[-1] + 1))
+            return np.asarray(altitudes.values)[cycle - cycle[0]]
+        return self.read(name, shot_slice)
+
+    def aim_points(self, shot_slice: slice) -> np.ndarray:
+        """World positions that beams truly point at, (k, 3); nan where a beam meets nothing."""
+        beam_range = self.read("beam_range", shot_slice)
+        beam_range = np.where(np.isfinite(beam_range), beam_range, np.nan)[:, None]
+        return self.read("platform_position", shot_slice) + beam_range * self.read(
+            "beam_direction", shot_slice
+        )
+
+
+def find_multi_surface_shot(recording: Recording, draw: int = 0) -> int | None:
+    """Return the number of the first shot with true points of two surfaces in a draw.
+
+    Else the first with two groups of bins above the threshold; or None.
+    """
+    fallback_shot = None
+    for shot_slice in recording.shot_slices():
+        surface_numbers = np.where(
+            (recording.read("flags", shot_slice, draw) & TRUE) > 0,
+            recording.read("surface", shot_slice, draw).astype(float), np.nan,
+        )  # fmt: skip
+        low = np.where(np.isnan(surface_numbers), np.inf, surface_numbers).min(axis=1)
+        high = np.where(np.isnan(surface_numbers), -np.inf, surface_numbers).max(axis=1)
+        multi_surface_shots = np.flatnonzero(high > low)
+        if multi_surface_shots.size:
+            return shot_slice.start + int(multi_surface_shots[0])
+        if fallback_shot is None:
+            multi_group_shots = np.flatnonzero(recording.read("surfaces_seen", shot_slice) >= 2)
+            fallback_shot = (
+                shot_slice.start + int(multi_group_shots[0]) if multi_group_shots.size else None
+            )
+    return fallback_shot
+
+
+def select_within(column_arrays: ColumnArrays, limits: Mapping[str, ValueLimits]) -> ColumnArrays:
+    """Rows of a table that lie within limits."""
+    if not limits:
+        return column_arrays
+    is_inside = is_within(column_arrays, limits)
+    return {name: values[is_inside] for name, values in column_arrays.items()}
+
+
+class ThinnedRows:
+    """Rows of tables in order: all, then every second, every fourth, ... until few enough."""
+
+    def __init__(self, rows_max: int) -> None:
+        self.rows_max, self.step, self.n_total = rows_max, 1, 0
+        self._tables: list[ColumnArrays] = []
+
+    def append(self, column_arrays: ColumnArrays) -> None:
+        """Rows that follow."""
+        start = -self.n_total % self.step
+        self.n_total += len(next(iter(column_arrays.values())))
+        self._tables.append(
+            {n: values[start :: self.step].copy() for n, values in column_arrays.items()}
+        )
+        while self.n_total > self.rows_max * self.step:
+            self.step *= 2
+            self._tables = [{n: values[::2].copy() for n, values in self.to_columns().items()}]
+
+    def describe_count(self, noun: str, qualifier: str = "") -> str:
+        """Return the number of all rows in words, and how many of them are kept."""
+        kept_note = f", one in {self.step} of them shown" if self.step > 1 else ""
+        return labels.format_count(self.n_total, noun) + qualifier + kept_note
+
+    def to_columns(self) -> ColumnArrays:
+        """Return the rows kept; empty where none were added."""
+        if not self._tables:
+            return {}
+        return {n: np.concatenate([part[n] for part in self._tables]) for n in self._tables[0]}
+
+
+@dataclass(frozen=True)
+class AxisPosition:
+    """A place along the axes of a study: the number of the value along each, and words.
+
+    Axes left open have other values that would do as well.
+    """
+
+    axis_indices: dict[str, int]
+    label: str
+    open_axes: tuple[str, ...]
+
+    def recording(self, tree: xr.DataTree, scanner: str) -> Recording:
+        """Return the recording of a scanner there."""
+        group = tree.children[scanner].to_dataset(inherit=False)
+        if PACKED_ATTRIBUTE in tree.attrs:
+            return Recording(scanner, group.isel(self.axis_indices))
+        flags_folder = parse_location(str(tree.encoding["source"])) / scanner / "flags" / "c"
+        return Recording(
+            scanner,
+            group.isel(self.axis_indices),
+            flags_folder.joinpath(*map(str, self.axis_indices.values())),
+        )
+
+
+def find_axis_position(spec: SceneSpec, where: Mapping[str, object]) -> AxisPosition:
+    """Return the first place at which coordinates have the values asked for.
+
+    Values are written as in a spec, one or several of each coordinate; of an axis with a name
+    of its own, the number along it. SpecError tells of all that are no coordinate or value of
+    it.
+    """
+    allowed_by_axis = {axis.name: np.ones(axis.size, bool) for axis in spec.axes}
+    mistakes = []
+    for name, raw_value in where.items():
+        wanted_values = list(raw_value) if isinstance(raw_value, tuple | list) else [raw_value]
+        try:
+            axis, is_wanted, available = _match_axis_values(spec, name, wanted_values)
+            allowed_by_axis[axis] &= is_wanted
+            if not allowed_by_axis[axis].any():
+                raise QuantityError("is no value of this study", available)
+        except QuantityError as error:
+            mistakes.append(Mistake(f"where.{name}", error.rule, f"{raw_value}", error.suggestion))
+    if mistakes:
+        raise SpecError(mistakes)
+    axis_indices = {name: int(np.argmax(is_wanted)) for name, is_wanted in allowed_by_axis.items()}
+    open_axes = tuple(name for name, is_wanted in allowed_by_axis.items() if is_wanted.sum() > 1)
+    return AxisPosition(axis_indices, _axis_position_label(spec, axis_indices), open_axes)
+
+
+def axis_position_at(spec: SceneSpec, value_numbers: Sequence[int]) -> AxisPosition:
+    """Return the place at some numbers along the axes."""
+    axis_indices = {
+        axis.name: number for axis, number in zip(spec.axes, value_numbers, strict=True)
+    }
+    return AxisPosition(axis_indices, _axis_position_label(spec, axis_indices), ())
+
+
+def _match_axis_values(
+    spec: SceneSpec, name: str, wanted_values: list[object]
+) -> tuple[str, np.ndarray, str]:
+    """Return the axis of a coordinate, which of its values are asked for, and them in words."""
+    for axis in spec.axes:
+        for axis_parameter in axis.parameters:
+            if name == axis_parameter.coordinate:
+                coordinate_values: list[object] = [
+                    spec.read_coordinate(name, value) for value in wanted_values
+                ]
+                value_texts = [
+                    labels.format_quantity(value, axis_parameter.units)
+                    for value in axis_parameter.display_values[:8]
+                ]
+                available = f"it has {', '.join(value_texts)}" + (", ..." if axis.size > 8 else "")
+                return (
+                    axis.name,
+                    matches_any(np.asarray(axis_parameter.display_values), coordinate_values),
+                    available,
+                )
+        if name == axis.name:
+            is_wanted = np.isin(np.arange(axis.size), [int(str(v)) for v in wanted_values])
+            return axis.name, is_wanted, f"they are numbered 0 to {axis.size - 1}"
+    coordinate_names = [
+        axis_parameter.coordinate for axis in spec.axes for axis_parameter in axis.parameters
+    ]
+    otherwise = (
+        f"the coordinates are {', '.join(coordinate_names)}"
+        if coordinate_names
+        else "it has no axes"
+    )
+    raise QuantityError(
+        "is no coordinate of this study",
+        suggest_similar_name(name, coordinate_names, fallback=otherwise),
+    )
+
+
+def _axis_position_label(spec: SceneSpec, axis_indices: Mapping[str, int]) -> str:
+    return ", ".join(
+        labels.format_coordinate_value(
+            axis_parameter.coordinate,
+            axis_parameter.display_values[axis_indices[axis.name]],
+            axis_parameter.units,
+        )
+        for axis in spec.axes
+        if axis.size > 1
+        for axis_parameter in axis.parameters
+    )
+
+
+CLOUD_POINTS_MAX, CLOUD_DROPOUTS_MAX, CLOUD_PATH_POINTS_MAX = 120_000, 20_000, 2000
+"""Most points, dropouts and places of the path in a picture; more is thinned."""
+
+BOX_MARGIN_FRACTION = 0.04
+"""Room around the points, as a share of the longest side of the box that holds them."""
+
+CoordinateBox = dict[str, tuple[float, float]]
+"""Lowest and highest value of x, y and z [m]."""
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """Points of a picture, and what else is in it.
+
+    Of the rows within the limits, false points `outside` of the box of the picture [m] are left
+    out. Lost are shots without a point, and dropouts what they aimed at.
+    """
+
+    points: ColumnArrays
+    path: ColumnArrays
+    thinned_points: ThinnedRows
+    thinned_dropouts: ThinnedRows
+    n_outside: int
+    box: CoordinateBox
+
+    @property
+    def dropouts(self) -> ColumnArrays:
+        """Places that shots without a point aimed at; empty where none were looked for."""
+        return self.thinned_dropouts.to_columns()
+
+    @property
+    def is_true(self) -> np.ndarray:
+        """Mask of the true points."""
+        return np.asarray((self.points["flags"] & TRUE) > 0)
+
+    @property
+    def remarks(self) -> list[str]:
+        """Numbers of points, dropouts and false points outside, and how many of them are shown."""
+        count_texts = [self.thinned_points.describe_count("point")]
+        if self.dropouts:
+            count_texts.append(self.thinned_dropouts.describe_count("shot", " without a point"))
+        if self.n_outside:
+            count_texts.append(
+                f"{labels.format_count(self.n_outside, 'false point')} outside of the picture"
+            )
+        return count_texts
+
+
+def gather_cloud(
+    recording: Recording,
+    names: Sequence[str],
+    *,
+    ranges: str,
+    draw: int = 0,
+    crops: Mapping[str, ValueLimits] | None = None,
+    with_dropouts: bool = False,
+    with_path: bool = False,
+    points_max: int = CLOUD_POINTS_MAX,
+) -> PointCloud | None:
+    """Points within limits; none where there is none."""
+    crops = dict(crops or {})
+    coordinate_crops = {name: crop for name, crop in crops.items() if name in WORLD_AXES}
+    kept_names = list(dict.fromkeys([*WORLD_AXES, "flags", *names]))
+    thinned_points, thinned_dropouts, thinned_path = (
+        ThinnedRows(points_max),
+        ThinnedRows(CLOUD_DROPOUTS_MAX),
+        ThinnedRows(CLOUD_PATH_POINTS_MAX),
+    )
+    time_limits = crops.get("time", UNLIMITED)
+    for shot_slice in recording.shot_slices(time_limits):
+        point_columns = recording.point_columns(
+            list(dict.fromkeys([*kept_names, *crops])), shot_slice, draw, ranges
+        )
+        cropped_columns = select_within(point_columns, crops)
+        thinned_points.append({name: cropped_columns[name] for name in kept_names})
+        time = recording.read("time", shot_slice)
+        is_in_time = is_within({"time": time}, {"time": time_limits})
+        if with_dropouts:
+            has_no_point = ~(recording.read("flags", shot_slice, draw) > 0).any(axis=-1)
+            has_no_point &= recording.computed_shots(shot_slice, draw) & (
+                is_in_time | ("time" not in crops)
+            )
+            aim_points = recording.aim_points(shot_slice)[has_no_point]
+            aim_points = aim_points[np.isfinite(aim_points[:, 0])]
+            thinned_dropouts.append(
+                select_within(dict(zip(WORLD_AXES, aim_points.T, strict=True)), coordinate_crops)
+            )
+        if with_path:
+            positions = recording.read("platform_position", shot_slice)[is_in_time]
+            thinned_path.append(dict(zip(WORLD_AXES, positions.T, strict=True)))
+    if not thinned_points.n_total:
+        return None
+    column_arrays = thinned_points.to_columns()
+    box = _bounding_box(
+        column_arrays, thinned_dropouts.to_columns(), thinned_path.to_columns(), coordinate_crops
+    )
+    is_in_box = is_within(column_arrays, box)
+    return PointCloud(
+        points={name: values[is_in_box] for name, values in column_arrays.items()},
+        path=thinned_path.to_columns(),
+        thinned_points=thinned_points,
+        thinned_dropouts=thinned_dropouts,
+        n_outside=int((~is_in_box).sum()) * thinned_points.step,
+        box=box,
+    )
+
+
+def _bounding_box(
+    point_columns: ColumnArrays,
+    dropout_columns: ColumnArrays,
+    path_columns: ColumnArrays,
+    coordinate_crops: Mapping[str, ValueLimits],
+) -> CoordinateBox:
+    """Box around what a figure shows: asked limits, else true points, dropouts and the path."""
+    is_true = (point_columns["flags"] & TRUE) > 0
+    box: CoordinateBox = {}
+    for axis in WORLD_AXES:
+        values = point_columns[axis][is_true] if is_true.any() else point_columns[axis]
+        value_arrays = [values, *(t[axis] for t in (dropout_columns, path_columns) if t)]
+        crop_low, crop_high = coordinate_crops.get(axis, UNLIMITED)
+        low = min(float(v.min()) for v in value_arrays if v.size)
+        high = max(float(v.max()) for v in value_arrays if v.size)
+        box[axis] = (max(low, crop_low), min(high, crop_high))
+    margin = BOX_MARGIN_FRACTION * max(max(high - low for low, high in box.values()), 1.0)
+    return {axis: (low - margin, high + margin) for axis, (low, high) in box.items()}
+
+
+def read_eyepoints(
+    store_path: Location, scanner_dataset: xr.Dataset, shot_indices: np.ndarray
+) -> Eyepoints:
+    """Eyepoints of some shots that a scanner's clouds in a store were made of."""
+    eyepoints_store = eyepoints_path(store_path, str(scanner_dataset.attrs["geometry_id"]))
+    if not eyepoints_store.exists():
+        raise NotAStoreError(
+            f"the eyepoints of the study are not at {eyepoints_store}: they are kept beside its "
+            "store; "
+            "running the study again casts them anew"
+        )
+    study_id = read_attributes_of_kind(eyepoints_store, "eyepoints")["study_id"]
+    dataset = xr.open_zarr(
+        open_verified_store(eyepoints_store, study_id), chunks=None, **OPEN_ZARR_KWARGS
+    )
+    selected = dataset.isel(shot=np.asarray(shot_indices))
+    arrays = {name: np.asarray(selected[name].values) for name in (*SHOTS, *BEAMLETS)}
+    return eyepoints_from_arrays(arrays, np.asarray(dataset["weight"].values))

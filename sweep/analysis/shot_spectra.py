@@ -1,0 +1,683 @@
+"""One shot of a grid or of a scene: spectra with what is detected in them, drawn and told."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure as Sheet
+
+from sweep.analysis import canvas, labels
+from sweep.analysis.selection import GRAZING_ANGLE_PATH
+from sweep.analysis.tables import PageTable, TablePage
+from sweep.model import shot as shot_model
+from sweep.model import waveform, window
+from sweep.model.beam import DIVERGENCE, WAIST
+from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.effects.catalogue import CORE, EFFECTS
+from sweep.model.eyepoints import Eyepoints
+from sweep.model.returns import beamlet_lines
+from sweep.model.segments import whole_spectrum
+from sweep.model.shot import prepare
+from sweep.model.threshold import WAYS
+from sweep.spec import GridSpec, SpecError
+from sweep.spec.rules import Mistake
+from sweep.spec.sections import parameter_rules
+from sweep.units import percent
+
+Parameters = Mapping[str, float | int | str]
+
+SEGMENT_NAMES = ("up-chirp", "Doppler", "down-chirp")
+
+
+@dataclass(frozen=True)
+class BinGroup:
+    """Places of adjacent bins above the threshold: the first, the last, and the strongest."""
+
+    first_index: int
+    last_index: int
+    peak_index: int
+
+
+@dataclass(frozen=True)
+class SegmentSpectrum:
+    """Spectrum of a segment and what is found in it.
+
+    Bins are in the order of their frequencies, those of a complex record with signs. Frequencies
+    and carrier are in Hz; |X| of each bin in V, of the signal alone, and with noise
+    where that is drawn. The SNR and the probability of detection are those of the strongest
+    bin.
+    """
+
+    name: str
+    slope: float
+    bins: np.ndarray
+    frequency: np.ndarray
+    signal_magnitude: np.ndarray
+    magnitude: np.ndarray
+    beat_frequency: float
+    carrier_frequency: float
+    bin_groups: tuple[BinGroup, ...]
+    snr: float
+    pd: float
+
+    @property
+    def peak_index(self) -> int:
+        """Place of the strongest bin."""
+        return int(np.argmax(self.magnitude))
+
+
+@dataclass(frozen=True)
+class SimulatedShot:
+    """One shot: its parameters, levels, spectra, and what it reports."""
+
+    label: str
+    parameters: Parameters
+    prepared_shot: shot_model.Shots
+    outputs: dict[str, float]
+    segments: tuple[SegmentSpectrum, ...]
+    reported_range: float
+    reported_radial_velocity: float
+
+    @property
+    def bin_deviation(self) -> float:
+        """Noise of a bin, per quadrature [V]."""
+        return float(self.prepared_shot.bin_deviation[0])
+
+    @property
+    def threshold(self) -> float:
+        """Detection threshold on |X| [V]."""
+        return float(self.prepared_shot.threshold[0])
+
+    @property
+    def noise_rms(self) -> float:
+        """Root mean square of |X| in a bin of noise [V]."""
+        return float(np.sqrt(2)) * self.bin_deviation
+
+    def to_dbv(self, magnitude: np.ndarray | float) -> np.ndarray:
+        """|X| as the amplitude of a tone that would give it, in dB above 1 V."""
+        with np.errstate(divide="ignore"):
+            return 20 * np.log10(2 * np.asarray(magnitude) / self.prepared_shot.window.sum)
+
+    @property
+    def is_detected(self) -> bool:
+        """Tell whether the segments that detect a shot have a group."""
+        if self.prepared_shot.any_two:
+            return sum(bool(segment.bin_groups) for segment in self.segments) >= 2
+        return all(
+            segment.bin_groups for segment in self.segments if segment.name != SEGMENT_NAMES[1]
+        )
+
+
+def simulate_shot(
+    parameters: Parameters,
+    effects: Collection[str] = CORE,
+    *,
+    label: str = "",
+    seed: int | None = None,
+) -> SimulatedShot:
+    """One shot on a flat plane."""
+    ((_, prepared_shot),) = prepare(parameters, effects)
+    return simulate_prepared_shot(prepared_shot, parameters, label=label, seed=seed)
+
+
+def simulate_prepared_shot(
+    prepared_shot: shot_model.Shots,
+    parameters: Parameters,
+    *,
+    label: str = "",
+    seed: int | None = None,
+) -> SimulatedShot:
+    """One shot that is prepared already, whatever it looks at."""
+    segment_results = shot_model.find(prepared_shot)
+    segments = tuple(
+        _segment_spectrum(prepared_shot, segment_results[k, :, 0], k, seed)
+        for k in range(3)
+        if prepared_shot.segments[k]
+    )
+    peak_results = segment_results.copy()
+    for segment in segments:
+        peak_results[SEGMENT_NAMES.index(segment.name), 3, 0] = segment.frequency[
+            segment.peak_index
+        ]
+    measurement = shot_model.report(prepared_shot, peak_results)
+    return SimulatedShot(
+        label=label,
+        parameters=parameters,
+        prepared_shot=prepared_shot,
+        outputs={
+            name: float(value[0]) for name, value in shot_model.statistics(prepared_shot).items()
+        },
+        segments=segments,
+        reported_range=float(measurement.range[0]),
+        reported_radial_velocity=float(measurement.radial_velocity[0]),
+    )
+
+
+def _segment_spectrum(
+    prepared_shot: shot_model.Shots,
+    segment_result: np.ndarray,
+    segment_index: int,
+    seed: int | None,
+) -> SegmentSpectrum:
+    signed_bins, signal_magnitude = (
+        prepared_shot.signed_bins,
+        whole_spectrum(prepared_shot, 0, segment_index),
+    )
+    magnitude, looks = np.abs(signal_magnitude), prepared_shot.looks
+    if seed is not None:
+        noise = np.array(
+            [
+                draw_noise_spectrum(
+                    prepared_shot, seed=seed, segment=segment_index, look=look
+                ).take(signed_bins, mode="wrap")
+                for look in range(looks.number)
+            ]
+        )
+        noise = noise if looks.added == 1 else noise.mean(axis=0, keepdims=True)
+        noisy_magnitudes = np.abs(signal_magnitude + noise)
+        magnitude = looks.shown(noisy_magnitudes) if looks.several else noisy_magnitudes[0]
+    segment = prepared_shot.waveform[segment_index]
+    carrier_frequency = np.asarray(segment.carrier).item()
+    beat_frequency = waveform.beat_frequency(
+        segment.slope,
+        carrier=carrier_frequency,
+        chirp_rate=np.asarray(prepared_shot.chirp_rate),
+        range=prepared_shot.range[0] - np.ravel(segment.nearer)[0],
+        radial_velocity=np.ravel(segment.beta)[0] * SPEED_OF_LIGHT / 2,
+    )
+    return SegmentSpectrum(
+        name=SEGMENT_NAMES[segment_index],
+        slope=segment.slope,
+        bins=signed_bins,
+        frequency=signed_bins * float(prepared_shot.sample_rate[0]) / prepared_shot.fft_size,
+        signal_magnitude=signal_magnitude,
+        magnitude=magnitude,
+        beat_frequency=np.asarray(beat_frequency).item(),
+        carrier_frequency=carrier_frequency,
+        bin_groups=find_bin_groups(magnitude, float(prepared_shot.threshold[0])),
+        snr=float(prepared_shot.snr(segment_result[2])[0]),
+        pd=float(segment_result[0]),
+    )
+
+
+def draw_noise_spectrum(
+    prepared_shot: shot_model.Shots, *, seed: int, segment: int, look: int = 0
+) -> np.ndarray:
+    """Noise of a look's windowed record, spectrum (N/2 + 1,) [V]; (N,) of a complex record.
+
+    It is added to the signal's |X|, whose phase from bin to bin is lost.
+    """
+    window_shape = prepared_shot.window
+    spawn_key = (segment, look) if look else (segment,)
+    generator = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=spawn_key))
+    deviation = float(np.sqrt(prepared_shot.noise_variance[0]))
+    in_phase = generator.normal(0.0, deviation, window_shape.length)
+    taper = window.samples(window_shape.name, window_shape.length)
+    if prepared_shot.complex_record:
+        quadrature = generator.normal(0.0, deviation, window_shape.length)
+        return np.fft.fft((in_phase + 1j * quadrature) / np.sqrt(2) * taper, prepared_shot.fft_size)
+    return np.fft.rfft(in_phase * taper, prepared_shot.fft_size)
+
+
+def find_bin_groups(magnitude: np.ndarray, threshold: float) -> tuple[BinGroup, ...]:
+    """Find runs of adjacent bins at or above the threshold."""
+    bins_above = np.flatnonzero(magnitude >= threshold)
+    runs = (
+        np.split(bins_above, np.flatnonzero(np.diff(bins_above) > 1) + 1) if bins_above.size else []
+    )
+    return tuple(
+        BinGroup(int(run[0]), int(run[-1]), int(run[np.argmax(magnitude[run])])) for run in runs
+    )
+
+
+def range_or_velocity_at(
+    shot: SimulatedShot, segment: SegmentSpectrum, frequency: np.ndarray
+) -> np.ndarray:
+    """Range [m] or velocity [m/s] that a frequency seen in a segment stands for near its beat."""
+    prepared_shot = shot.prepared_shot
+    sample_rate = float(prepared_shot.sample_rate[0])
+    fold_frequency = np.rint(segment.beat_frequency / sample_rate) * sample_rate
+    is_mirrored = segment.beat_frequency < fold_frequency and not prepared_shot.complex_record
+    signed_frequency = fold_frequency + (-1.0 if is_mirrored else 1.0) * np.asarray(frequency)
+    if segment.slope == 0:
+        return signed_frequency * SPEED_OF_LIGHT / (2 * segment.carrier_frequency)
+    beta = float(np.asarray(prepared_shot.beta).flat[0])
+    range_beat = (segment.carrier_frequency * beta - signed_frequency) / segment.slope
+    return (
+        range_beat * SPEED_OF_LIGHT / (2 * np.asarray(prepared_shot.chirp_rate).item() * (1 + beta))
+    )
+
+
+SPECTRUM_COLOUR, THRESHOLD_COLOUR, NOISE_COLOUR, DETECTION_COLOUR = (
+    canvas.LINE_COLOURS[0],
+    canvas.LINE_COLOURS[2],
+    canvas.LINE_COLOURS[1],
+    "black",
+)
+MARGIN_BELOW_DB, MARGIN_ABOVE_DB = 25.0, 12.0
+"""Decibels shown below the noise level, and above the strongest bin."""
+
+VIEW_HALF_WIDTH_MIN_BINS = 12
+"""Least half-width of the view around the peak, in bins."""
+
+VIEW_MARGIN_MIN_BINS = 8
+"""Bins shown beside the outermost detections, at least."""
+
+NEAR_DETECTION_BAND_FRACTION = 0.05
+"""Distance from the strongest peak up to which detections are in the same view, of the band."""
+
+
+def draw_spectra_sheet(
+    shots: Sequence[SimulatedShot], *, title: str, footnote: str, shows_detections: bool = False
+) -> Sheet:
+    """Spectra of shots side by side: a row a segment, the whole band and around the peak."""
+    n_rows, n_columns = len(shots[0].segments), 2 * len(shots)
+    width = 5.4 if len(shots) == 1 else 4.2
+    sheet, axes = canvas.sheet_with_axes(width * n_columns, 3.1 * n_rows + 1.2, n_rows, n_columns)
+    decibel_limits = _decibel_limits(shots)
+    for j, shot in enumerate(shots):
+        for i, segment in enumerate(shot.segments):
+            whole_axes, close_axes = axes[i * n_columns + 2 * j], axes[i * n_columns + 2 * j + 1]
+            _draw_spectrum(whole_axes, shot, segment, slice(None), 0.5)
+            view = (
+                detection_view(segment) if shows_detections else peak_view(segment.signal_magnitude)
+            )
+            _draw_spectrum(close_axes, shot, segment, view, 1.0)
+            _annotate(close_axes, shot, segment)
+            for panel in (whole_axes, close_axes):
+                panel.set_ylim(*decibel_limits)
+                panel.grid(True)
+            if not segment.bin_groups:
+                whole_axes.text(
+                    0.02,
+                    0.95,
+                    "no detection",
+                    transform=whole_axes.transAxes,
+                    color=DETECTION_COLOUR,
+                    va="top",
+                    size=9,
+                )
+            whole_axes.set_title(", ".join(filter(None, [segment.name, shot.label])), size=10)
+            if j == 0:
+                whole_axes.set_ylabel("amplitude (dB re 1 V)")
+    axes[0].legend(fontsize=7.5, loc="upper right", framealpha=0.9, ncols=3)
+    for panel in axes[(n_rows - 1) * n_columns :]:
+        panel.set_xlabel("frequency (MHz)")
+    canvas.set_title(sheet, title)
+    canvas.set_caption(sheet, footnote)
+    return sheet
+
+
+def _decibel_limits(shots: Sequence[SimulatedShot]) -> tuple[float, float]:
+    """Decibels that show all of the noise and of the peaks."""
+    low = min(float(shot.to_dbv(shot.noise_rms)) for shot in shots) - MARGIN_BELOW_DB
+    high = max(
+        float(shot.to_dbv(max(segment.magnitude.max(), shot.threshold)))
+        for shot in shots
+        for segment in shot.segments
+    )
+    return low, high + MARGIN_ABOVE_DB
+
+
+def _draw_spectrum(
+    axes: Axes, shot: SimulatedShot, segment: SegmentSpectrum, view: slice, line_width: float
+) -> None:
+    """Spectrum, threshold, noise level and detections."""
+    frequency_mhz = segment.frequency[view] / 1e6
+    level_db = np.maximum(shot.to_dbv(segment.magnitude[view]), -500.0)
+    marker = "." if frequency_mhz.size <= 200 else ""
+    axes.plot(
+        frequency_mhz,
+        level_db,
+        color=SPECTRUM_COLOUR,
+        linewidth=line_width,
+        marker=marker,
+        markersize=4,
+    )
+    for value, colour, dash, label in (
+        (shot.threshold, THRESHOLD_COLOUR, "--", "threshold"),
+        (shot.noise_rms, NOISE_COLOUR, "-.", "noise (rms)"),
+    ):
+        height_db = float(shot.to_dbv(value))
+        axes.axhline(height_db, color=colour, linestyle=dash, linewidth=1.2, label=label)
+    peak_indices = np.array([group.peak_index for group in segment.bin_groups], dtype=int)
+    axes.plot(
+        segment.frequency[peak_indices] / 1e6,
+        shot.to_dbv(segment.magnitude[peak_indices]),
+        linestyle="",
+        marker="v",
+        markersize=7,
+        color=DETECTION_COLOUR,
+        markeredgecolor="white",
+        label="detection",
+    )
+    axes.set_xlim(float(frequency_mhz[0]), float(frequency_mhz[-1]))
+
+
+def _annotate(axes: Axes, shot: SimulatedShot, segment: SegmentSpectrum) -> None:
+    """Signal-to-noise ratio and pd in a corner, range or velocity of the frequencies on top."""
+    annotation_lines = (
+        [f"signal-to-noise {10 * np.log10(segment.snr):.1f} dB"] if segment.snr > 0 else []
+    )
+    axes.text(
+        0.98,
+        0.95,
+        "\n".join([*annotation_lines, f"pd {segment.pd:.4g}"]),
+        transform=axes.transAxes,
+        size=8,
+        color=DETECTION_COLOUR,
+        ha="right",
+        va="top",
+    )
+    value_at_zero, value_at_1_mhz = (
+        float(q) for q in range_or_velocity_at(shot, segment, np.array([0.0, 1e6]))
+    )
+
+    def to_range_or_velocity(mhz: Any) -> Any:
+        return value_at_zero + (value_at_1_mhz - value_at_zero) * mhz
+
+    def to_mhz(value: Any) -> Any:
+        return (value - value_at_zero) / (value_at_1_mhz - value_at_zero)
+
+    top_axis = axes.secondary_xaxis("top", functions=(to_range_or_velocity, to_mhz))
+    top_axis.set_xlabel(
+        "range (m)" if segment.slope else "radial velocity (m/s)", size=8, labelpad=4
+    )
+    top_axis.tick_params(labelsize=8)
+    top_axis.ticklabel_format(axis="x", useOffset=False)
+    axes.ticklabel_format(axis="x", useOffset=False)
+
+
+def peak_view(magnitude: np.ndarray) -> slice:
+    """Bins that show the peak and what spreads around it, down to a tenth of its height."""
+    peak = int(np.argmax(magnitude))
+    strong_bins = np.flatnonzero(magnitude >= 0.1 * magnitude[peak])
+    nearby_bins = strong_bins[np.abs(strong_bins - peak) < magnitude.size // 8]
+    half_width = max(
+        VIEW_HALF_WIDTH_MIN_BINS, int(1.5 * max(peak - nearby_bins[0], nearby_bins[-1] - peak))
+    )
+    return slice(max(peak - half_width, 0), min(peak + half_width + 1, magnitude.size))
+
+
+def detection_view(segment: SegmentSpectrum) -> slice:
+    """Bins that show all detections near to the strongest peak, and what spreads around it."""
+    view, n_bins = peak_view(segment.signal_magnitude), segment.signal_magnitude.size
+    peak = int(np.argmax(segment.signal_magnitude))
+    near_groups = [
+        group
+        for group in segment.bin_groups
+        if abs(group.peak_index - peak) <= NEAR_DETECTION_BAND_FRACTION * n_bins
+    ]
+    if not near_groups:
+        return view
+    first_index, last_index = (
+        min(g.first_index for g in near_groups),
+        max(g.last_index for g in near_groups),
+    )
+    margin = max(VIEW_MARGIN_MIN_BINS, (last_index - first_index) // 6)
+    return slice(
+        max(min(view.start, first_index - margin), 0),
+        min(max(view.stop, last_index + margin + 1), n_bins),
+    )
+
+
+def draw_scene_shot_sheet(
+    shot: SimulatedShot,
+    eyepoints: Eyepoints,
+    surfaces: Sequence[str],
+    *,
+    title: str,
+    remarks: Sequence[str],
+) -> Sheet:
+    """Spectra of a shot of a scene, and where its beamlets' lines are."""
+    notes = [*remarks, "marks at the foot: where the beamlets' own lines are, by surface"]
+    sheet = draw_spectra_sheet(
+        [shot], title=title, footnote=labels.join_sentences(notes), shows_detections=True
+    )
+    is_hit, line_bins = eyepoints.surface[0] >= 0, beamlet_lines(shot.prepared_shot)[0]
+    bin_width = float(shot.prepared_shot.sample_rate[0]) / shot.prepared_shot.fft_size
+    for i, segment in enumerate(shot.segments):
+        line_frequencies = line_bins[SEGMENT_NAMES.index(segment.name), is_hit] * bin_width / 1e6
+        close_axes = sheet.axes[2 * i + 1]
+        line_marks = [
+            close_axes.plot(
+                surface_lines,
+                np.full(surface_lines.size, 0.02),
+                "|",
+                transform=close_axes.get_xaxis_transform(),
+                color=canvas.LINE_COLOURS[k % 8],
+                markersize=9,
+                scalex=False,
+                scaley=False,
+                label=surfaces[surface_number],
+            )[0]
+            for k, surface_number in enumerate(np.unique(eyepoints.surface[0, is_hit]))
+            for surface_lines in [line_frequencies[eyepoints.surface[0, is_hit] == surface_number]]
+        ]
+        if i == 0:
+            close_axes.legend(handles=line_marks, fontsize=7.5, loc="upper left", framealpha=0.9)
+    return sheet
+
+
+def _noise_table(shot: SimulatedShot) -> PageTable:
+    """Noise at the ADC by source, in volts and shares of the variance."""
+    variance_by_source = {
+        n: float(np.asarray(v).item()) for n, v in shot.prepared_shot.noise_sources.items()
+    }
+    total_variance = sum(variance_by_source.values())
+    rows = [
+        (
+            name.replace("_", " "),
+            f"{math.sqrt(variance):.4e}",
+            percent(variance / total_variance, ".4g"),
+        )
+        for name, variance in sorted(variance_by_source.items(), key=lambda item: -item[1])
+        if variance > 0
+    ]
+    rows.append(("total", f"{math.sqrt(total_variance):.4e}", percent(1.0, ".4g")))
+    return PageTable("Noise at the ADC", ("source", "V rms", "share"), rows)
+
+
+def _segment_table(shot: SimulatedShot) -> PageTable:
+    columns = (
+        "segment", "beat (MHz)", "seen (MHz)", "peak bin", "level (dBV)", "SNR (dB)", "pd",
+        "groups",
+    )  # fmt: skip
+    heading = (
+        f"Segments (noise of a bin {shot.to_dbv(shot.noise_rms):.1f} dBV rms, threshold "
+        f"{shot.to_dbv(shot.threshold):.1f} dBV)"
+    )
+    rows = [
+        (
+            segment.name,
+            f"{segment.beat_frequency / 1e6:+.6f}",
+            f"{segment.frequency[segment.peak_index] / 1e6:.6f}",
+            int(segment.bins[segment.peak_index]),
+            f"{shot.to_dbv(segment.magnitude[segment.peak_index]):.1f}",
+            f"{10 * math.log10(segment.snr):.2f}" if segment.snr > 0 else "-",
+            f"{segment.pd:.6g}",
+            len(segment.bin_groups),
+        )
+        for segment in shot.segments
+    ]
+    return PageTable(heading, columns, rows)
+
+
+def _measurement_table(shot: SimulatedShot) -> PageTable:
+    """Range and radial velocity: true, reported, and the error in the units of a bin."""
+    prepared_shot = shot.prepared_shot
+    rows = [
+        (
+            name,
+            f"{true_value:.{digits}f}",
+            f"{reported_value:.{digits}f}",
+            f"{reported_value - true_value:+.{digits}f}",
+        )
+        for name, digits, true_value, reported_value in (
+            ("range (m)", 4, float(prepared_shot.range[0]), shot.reported_range),
+            (
+                "radial velocity (m/s)",
+                5,
+                float(prepared_shot.radial_velocity[0]),
+                shot.reported_radial_velocity,
+            ),
+        )
+    ]
+    verdict = "detected" if shot.is_detected else "NOT detected: read off the strongest bins"
+    return PageTable(f"Report ({verdict})", ("", "true", "reported", "error"), rows)
+
+
+def _false_alarm_table(shot: SimulatedShot) -> PageTable:
+    label_by_variable = {
+        "pfa_bin": "one bin, noise", "pfa_segment": "up-chirp segment, noise",
+        "pfa_both_chirps": "both chirp segments, noise", "pfa_shot": "any segment, noise",
+        "p_leakage_up": "up-chirp segment, leakage",
+        "p_leakage_down": "down-chirp segment, leakage",
+    }  # fmt: skip
+    rows = [(label, f"{shot.outputs[name]:.4e}") for name, label in label_by_variable.items()]
+    return PageTable("False alarms", ("", "probability"), rows)
+
+
+DRAWN_VALUES_MAX = 3
+"""Values of a study's only axis up to which each is drawn."""
+
+_DESCRIBED_PATHS = (
+    "target.range", "target.grazing_angle", "target.radial_velocity", "target.reflectance",
+    "target.reflectance_law", "instrument.laser.power", "instrument.telescope.aperture",
+    DIVERGENCE, WAIST, "instrument.processing.fft_size", "instrument.processing.window", *WAYS,
+)  # fmt: skip
+
+
+def write_shot_report(
+    spec: GridSpec,
+    coordinate_values: Mapping[str, str],
+    directory: str | Path,
+    *,
+    draws_noise: bool = False,
+    seed: int = 0,
+    picture_format: str = "png",
+) -> tuple[str, list[Path]]:
+    """Spectra, threshold, noise level and detections of one shot: text, and the files written.
+
+    Parameters on an axis take the values in `at`, written with their units, or the first; a
+    study with a single axis of few values is drawn at each of them. SpecError for what can't be
+    read.
+    """
+    effect_modes = spec.effect_modes()
+    effects = [e.name for e in EFFECTS if not e.is_random and effect_modes[e.name] != "off"]
+    shots = [
+        simulate_shot(parameters, effects, label=label, seed=seed if draws_noise else None)
+        for label, parameters in select_shot_parameters(spec, coordinate_values)
+    ]
+    name_parts = [
+        re.sub(r"[^A-Za-z0-9.+-]+", "", f"{name.split('.')[-1]}{v}")
+        for name, v in coordinate_values.items()
+    ]
+    directory, stem = Path(directory), "_".join(["shot", *name_parts])[:120]
+    remark = f"noise drawn with seed {seed}" if draws_noise else "the signal alone, no noise drawn"
+    with canvas.uniform_style():
+        sheet = draw_spectra_sheet(
+            shots,
+            title=spec.title,
+            footnote=labels.join_sentences([remark, _describe_shared_parameters(shots)]),
+        )
+        paths = [
+            canvas.save_sheet(sheet, directory / f"{stem}.{picture_format}"),
+            directory / f"{stem}.txt",
+        ]
+    page = TablePage(spec.title, _shot_tables(shots), [f"Spectra: {remark}."], [])
+    paths[1].write_text(page.to_text(), encoding="utf-8")
+    return page.to_text(), paths
+
+
+def select_shot_parameters(
+    spec: GridSpec, coordinate_values: Mapping[str, str]
+) -> list[tuple[str, Parameters]]:
+    """Parameters of the shots to draw, each with its label."""
+    axis_parameters = [axis_parameter for axis in spec.axes for axis_parameter in axis.parameters]
+    path_by_name, rule_by_path = {m.coordinate: m.path for m in axis_parameters}, parameter_rules()
+    names_by_path: dict[str, str] = {}
+    for name in coordinate_values:
+        path = path_by_name.get(name, name)
+        if path in names_by_path:
+            problem = f"is given twice, as {names_by_path[path]} and as {name}"
+            raise SpecError([Mistake(path, problem, suggestion="keep one of them")])
+        names_by_path[path] = name
+    draws_all_values = (
+        not coordinate_values and len(spec.axes) == 1 and spec.axes[0].size <= DRAWN_VALUES_MAX
+    )
+    labelled_parameters: list[tuple[str, Parameters]] = []
+    for i in range(spec.axes[0].size if draws_all_values else 1):
+        raw_values: dict[str, object] = {
+            m.path: rule_by_path[m.path].format(m.values[i]) for m in axis_parameters
+        }
+        # what is no coordinate is left for the spec to read, or to refuse
+        raw_values |= {
+            path_by_name.get(name, name): value for name, value in coordinate_values.items()
+        }
+        label = ", ".join(
+            labels.format_coordinate_value(m.coordinate, m.display_values[i], m.units)
+            for m in axis_parameters
+        )
+        labelled_parameters.append(
+            (label if draws_all_values else "", spec.parameters_with(raw_values))
+        )
+    return labelled_parameters
+
+
+def _describe_parameters(shot: SimulatedShot, paths: tuple[str, ...]) -> list[tuple[str, str]]:
+    """Parameters as a user would write them, by name."""
+    rule_by_path = parameter_rules()
+    descriptions = []
+    for path in paths:
+        value = shot.parameters.get(path)
+        if value is None:  # the threshold is set otherwise
+            continue
+        if path in (DIVERGENCE, WAIST) and value == 0:  # the beam is stated by the other one
+            continue
+        if isinstance(value, str):
+            value_text = value
+        elif path == GRAZING_ANGLE_PATH:
+            value_text = labels.format_quantity(math.degrees(value), "deg")
+        else:
+            value_text = labels.format_with_prefix(value, rule_by_path[path].value_unit)
+        descriptions.append((labels.coordinate_label(path.rsplit(".", 1)[-1]), value_text))
+    return descriptions
+
+
+def _describe_shared_parameters(shots: list[SimulatedShot]) -> str:
+    """Parameters that all shots share, in a line."""
+    descriptions = [_describe_parameters(shot, _DESCRIBED_PATHS) for shot in shots]
+    return ", ".join(
+        f"{name} {value_text}"
+        for name, value_text in descriptions[0]
+        if all((name, value_text) in e for e in descriptions)
+    )
+
+
+def _shot_tables(shots: list[SimulatedShot]) -> list[PageTable]:
+    """Tables of all shots, each under its label."""
+    tables = []
+    for shot in shots:
+        prefix = f"{shot.label}: " if shot.label else ""
+        parameter_table = PageTable(
+            f"{prefix}Shot", ("parameter", "value"), _describe_parameters(shot, _DESCRIBED_PATHS)
+        )
+        further_tables = [
+            _noise_table(shot),
+            _segment_table(shot),
+            _measurement_table(shot),
+            _false_alarm_table(shot),
+        ]
+        tables += [
+            parameter_table,
+            *(PageTable(prefix + b.heading, b.columns, b.rows) for b in further_tables),
+        ]
+    return tables

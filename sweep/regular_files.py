@@ -1,0 +1,168 @@
+"""Open regular files of untrusted directories without blocking, and within a size limit.
+
+A path that a study or a store names may be a named pipe, whose opening waits for a writer, a device
+that never ends, or a link out of the store. These functions open without waiting, and refuse
+anything that is not a regular file.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+_FILE_TYPE_NAMES = {
+    stat.S_IFIFO: "a named pipe", stat.S_IFCHR: "a device", stat.S_IFBLK: "a device",
+    stat.S_IFSOCK: "a socket", stat.S_IFLNK: "a symbolic link", stat.S_IFDIR: "a directory",
+}  # fmt: skip
+
+#: Bytes that are read at a time where content is not kept in memory.
+READ_BUFFER_BYTES = 1 << 20
+
+
+class RefusedFileError(OSError):
+    """A path is not a regular file of a permitted size, or leads out of its directory."""
+
+    def __str__(self) -> str:
+        return f"{self.filename} {self.strerror}"
+
+
+def file_type(mode: int) -> str:
+    """Return the name of a file type, from the mode of its stat result.
+
+    >>> kind_of(stat.S_IFIFO)
+    'a named pipe'
+    """
+    return _FILE_TYPE_NAMES.get(stat.S_IFMT(mode), "a plain file")
+
+
+def open_regular(path: str | Path, *, follow_links: bool = True) -> int:
+    """Open a regular file for reading without blocking, and return its descriptor.
+
+    Raises
+    ------
+    UnfitFileError
+        The path is a pipe, a device, a socket, or (unless ``follow_links``) a symbolic link.
+    OSError
+        As of `os.open`.
+    """
+    return _open_refusing_irregular(
+        str(path), str(path), 0 if follow_links else os.O_NOFOLLOW, None
+    )
+
+
+def open_below(root: str | Path, name: str) -> int:
+    """Open the regular file ``name`` below the directory ``root``; return its descriptor.
+
+    ``name`` has components separated by '/'. No component below ``root`` may be a symbolic link,
+    '.' or '..'. ``root`` itself may be reached through links, because the user has named it.
+    """
+    *parent_names, base_name = name.split("/")
+    path_in_messages = f"{root}/{name}"
+    if not {"", ".", ".."}.isdisjoint((*parent_names, base_name)):
+        raise RefusedFileError(errno.EINVAL, "leads out of its folder", path_in_messages)
+    folder_descriptor = os.open(root, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        for depth, folder_name in enumerate(parent_names, start=1):
+            try:
+                inner_descriptor = _open_refusing_irregular(
+                    folder_name, path_in_messages, os.O_NOFOLLOW | os.O_DIRECTORY, folder_descriptor
+                )
+            except RefusedFileError as error:
+                problem = f"lies behind {'/'.join(parent_names[:depth])}, which is a symbolic link"
+                raise RefusedFileError(error.errno, problem, path_in_messages) from None
+            os.close(folder_descriptor)
+            folder_descriptor = inner_descriptor
+        return _open_refusing_irregular(
+            base_name, path_in_messages, os.O_NOFOLLOW, folder_descriptor
+        )
+    finally:
+        os.close(folder_descriptor)
+
+
+def _open_refusing_irregular(
+    name: str, path_in_messages: str, flags: int, folder_descriptor: int | None
+) -> int:
+    """Open a regular file, or a directory for O_DIRECTORY; errors name it ``path_in_messages``."""
+    descriptor = -1
+    try:
+        descriptor = os.open(
+            name, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | flags, dir_fd=folder_descriptor
+        )
+        mode = os.fstat(descriptor).st_mode
+    except OSError as error:
+        mode = 0
+        with suppress(OSError):
+            mode = os.stat(
+                name, dir_fd=folder_descriptor, follow_symlinks=not flags & os.O_NOFOLLOW
+            ).st_mode
+        if stat.S_ISLNK(mode) and flags & os.O_NOFOLLOW:
+            problem = "is a symbolic link, no plain file"
+            raise RefusedFileError(errno.ELOOP, problem, path_in_messages) from None
+        if not stat.S_ISSOCK(mode):
+            raise OSError(error.errno, error.strerror, path_in_messages) from None
+    if flags & os.O_DIRECTORY:
+        return descriptor
+    if not stat.S_ISREG(mode):
+        if descriptor >= 0:
+            os.close(descriptor)
+        if stat.S_ISDIR(mode):
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), path_in_messages)
+        raise RefusedFileError(
+            errno.EINVAL, f"is {file_type(mode)}, no plain file", path_in_messages
+        )
+    return descriptor
+
+
+def read_regular(path: str | Path, bytes_max: int) -> bytes:
+    """Read a regular file of at most ``bytes_max`` bytes; symbolic links are followed."""
+    return _read(open_regular(path), bytes_max, str(path))
+
+
+def read_below(
+    root: str | Path, name: str, bytes_max: int, byte_slice: slice = slice(None)
+) -> bytes:
+    """Read a regular file, or the bytes ``byte_slice`` of it, as :func:`open_below` opens it."""
+    return _read(open_below(root, name), bytes_max, f"{root}/{name}", byte_slice)
+
+
+def _read(
+    descriptor: int, bytes_max: int, path_in_messages: str, byte_slice: slice = slice(None)
+) -> bytes:
+    with open(descriptor, "rb", buffering=0) as file:
+        start, stop, _ = byte_slice.indices(checked_size(descriptor, bytes_max, path_in_messages))
+        file.seek(start)
+        pieces: list[bytes] = []
+        remaining = stop - start
+        while remaining > 0 and (piece := file.read(remaining)):
+            pieces.append(piece)
+            remaining -= len(piece)
+    return pieces[0] if len(pieces) == 1 else b"".join(pieces)
+
+
+@contextmanager
+def stream_below(
+    root: str | Path, name: str, bytes_max: int
+) -> Iterator[tuple[int, Iterator[bytes]]]:
+    """Context manager: size of a regular file below a directory, and an iterator over its bytes."""
+    descriptor = open_below(root, name)
+    with open(descriptor, "rb", buffering=0) as file:
+        size = checked_size(descriptor, bytes_max, f"{root}/{name}")
+        yield size, iter(lambda: file.read(READ_BUFFER_BYTES), b"")
+
+
+def checked_size(descriptor: int, bytes_max: int, path_in_messages: str) -> int:
+    """Return the size of an open file; raise UnfitFileError if it exceeds ``bytes_max``."""
+    size = os.fstat(descriptor).st_size
+    check_size(size, bytes_max, path_in_messages)
+    return size
+
+
+def check_size(size: int, bytes_max: int, path_in_messages: str) -> None:
+    """Raise UnfitFileError if the size of a file or object exceeds ``bytes_max``."""
+    if size > bytes_max:
+        problem = f"has {size:,} bytes, and can have no more than {bytes_max:,}"
+        raise RefusedFileError(errno.EFBIG, problem, path_in_messages)

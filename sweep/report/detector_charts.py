@@ -1,0 +1,558 @@
+"""Charts of the detector: characteristic, noise by source, false alarms, maximum range."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pandas
+import xarray as xr
+
+from sweep.analysis import charts, labels
+from sweep.analysis.answers import probability
+from sweep.analysis.charts import (
+    LINEAR,
+    LOG,
+    PROBABILITY_LIMITS,
+    Chart,
+    ChartAxis,
+    ChartLine,
+    CoordinateAxis,
+    Panel,
+)
+from sweep.analysis.selection import (
+    GRAZING_ANGLE_PATH,
+    RANGE_PATH,
+    PointSelection,
+    SortedCoordinate,
+    find_axis_parameter,
+    parameters_at,
+    split_by_coordinates,
+    thin_evenly,
+)
+from sweep.analysis.study_figures import GridResults
+from sweep.model import noise_only
+from sweep.model.effects.catalogue import EFFECTS, names_of
+from sweep.model.looks import COMBINE, NUMBER, VOTES, Looks
+from sweep.model.shot import prepare
+from sweep.model.threshold import WAYS, tnr_of
+from sweep.report.html_page import HtmlTable
+from sweep.units import percent
+
+CHART_PARTS_MAX = 6
+"""Values that a chart offers to choose from, at the most."""
+
+NOISE_BUDGET_POINTS = 24
+"""Places along a coordinate at which the noise is told by source."""
+
+ROC_PD_VALUES = (0.999, 0.9, 0.5, 0.1, 0.01)
+"""Probabilities of detection near which points are taken whose characteristic is drawn."""
+
+ROC_PFA_BIN_VALUES = np.logspace(-0.05, -16, 90)
+"""Probabilities of a false alarm in a bin, over which characteristics are drawn."""
+
+ROC_DRAWS = 400
+"""Draws of each point whose characteristic is random."""
+
+PFA_WITH_LEAKAGE_NAME = "pfa_both_chirps_with_leakage"
+
+_LABEL_BY_ALARM = {
+    "pfa_bin": "noise, one bin",
+    "pfa_segment": "noise, a segment",
+    "pfa_both_chirps": "noise, both",
+    "pfa_shot": "noise, any",
+    "p_leakage_up": "leakage, up",
+    "p_leakage_down": "leakage, down",
+    PFA_WITH_LEAKAGE_NAME: "either, both",
+}
+"""Variables in as few words as a legend has room for."""
+
+_RANDOM_EFFECTS = {effect.name for effect in EFFECTS if effect.is_random}
+
+
+@dataclass(frozen=True)
+class GridProfile:
+    """Points of one part of a study along its main coordinate, or its only point."""
+
+    label: str
+    points: PointSelection
+    coordinate_name: str
+    coordinate: SortedCoordinate | None
+
+    @property
+    def coordinate_axis(self) -> CoordinateAxis:
+        """The main coordinate along an axis."""
+        return CoordinateAxis.from_points(self.points, self.coordinate_name)
+
+    def spread_indices(self, n_max: int) -> np.ndarray:
+        """Return some of its places, spread over all."""
+        if self.coordinate is None:
+            return np.zeros(1, int)
+        size = self.coordinate.values.size
+        return np.unique(np.linspace(0, size - 1, min(n_max, size)).round().astype(int))
+
+    def axis_indices(self, index: Any) -> dict[str, Any]:
+        """Position along every axis of one of its places, or of several."""
+        if self.coordinate is None:
+            return self.points.first_indices()
+        return self.points.first_indices(self.coordinate) | {
+            self.coordinate.dim: self.coordinate.indices[index]
+        }
+
+    def variable_values(self, variable: str, indices: np.ndarray) -> np.ndarray:
+        """Return a variable at some of its places."""
+        return np.ravel(self.points.dataset[variable].isel(self.axis_indices(indices)).values)
+
+
+def grid_profiles(results: GridResults) -> tuple[list[GridProfile], int]:
+    """Tracks along the main coordinate, and how many are left out.
+
+    The main coordinate is range where it varies, else the longest one of numbers.
+    """
+    axis_parameters = [
+        axis_parameter for axis in results.spec.axes for axis_parameter in axis.parameters
+    ]
+    numeric_parameters = [
+        axis_parameter
+        for axis_parameter in axis_parameters
+        if not isinstance(axis_parameter.values, tuple)
+    ]
+    longest_parameter = max(
+        numeric_parameters, key=lambda m: np.unique(m.display_values).size, default=None
+    )
+    main_parameter = find_axis_parameter(results.spec, RANGE_PATH) or longest_parameter
+    name = main_parameter.coordinate if main_parameter else ""
+    parts, n_omitted = charts.split_into_parts(
+        results.points, [name] if name else [], CHART_PARTS_MAX
+    )
+    return [
+        GridProfile(words, p, name, p.sorted_coordinate(name) if name else None)
+        for words, p in parts
+    ], n_omitted
+
+
+def roc_chart(results: GridResults, profiles: Sequence[GridProfile], n_omitted: int) -> Chart:
+    """Probability of detection over that of a false alarm, as the threshold moves."""
+    panels = [panel for profile in profiles for panel in _roc_panels(results, profile)]
+    line_names = [line.name for line in panels[0].lines if line.name]
+    return Chart(
+        heading="Receiver operating characteristic",
+        alt=(
+            "Lines of the probability of detection of a shot over the probability of a false "
+            f"alarm, as the threshold moves, {'; '.join(line_names) or 'at the point'}."
+        ),
+        caption=[
+            "From the stored signal-to-noise ratio; where that alone does not give the stored "
+            "probability of detection, simulated for this page with the effects that the study "
+            "simulates at the point"
+            + (f", in {ROC_DRAWS} draws" if results.spec.draws.has_draws else ""),
+            "False alarms of noise alone, in all bins that are counted",
+            "Dots: the study's own threshold",
+            "Points: those whose probability of detection comes nearest to "
+            + ", ".join(f"{pd_value:g}" for pd_value in ROC_PD_VALUES),
+            charts.omission_remark(n_omitted),
+        ],
+        panels=panels,
+        facet_labels={"part": "Shown for", "alarm": "False alarm"},
+    )
+
+
+_PFA_FROM_BIN = {
+    "in a segment": noise_only.segment_probability,
+    "in a bin": lambda bin_probability, bins: bin_probability,
+    "in both chirps": lambda p, bins: noise_only.segment_probability(p, bins) ** 2,
+}
+"""Probability of a false alarm from that in a bin, and the number of bins that are counted."""
+
+
+def _roc_panels(results: GridResults, profile: GridProfile) -> list[Panel]:
+    """Return a panel for each kind of false alarm: line and dot of some points."""
+    lines_by_alarm: dict[str, list[ChartLine]] = {alarm: [] for alarm in _PFA_FROM_BIN}
+    for style_index, index in enumerate(_roc_indices(profile)):
+        point = results.dataset.isel(profile.axis_indices(index)).compute()
+        curve = point.sweep.roc(ROC_PFA_BIN_VALUES, draws=ROC_DRAWS)
+        parameters = parameters_at(results.spec, profile.axis_indices(index))
+        study_pfa, study_pd = 10.0 ** point["log10_pfa_bin"].values, point["pd_shot"].values
+        n_bins, study_n_bins = (
+            noise_only.bins_counted(parameters, p) for p in (ROC_PFA_BIN_VALUES, study_pfa)
+        )
+        tnr_texts = [f"TNR {t:.3g}" for t in curve["curve_tnr"].values]
+        for alarm, pfa_from_bin in _PFA_FROM_BIN.items():
+            x = np.asarray(pfa_from_bin(ROC_PFA_BIN_VALUES, n_bins))
+            line = ChartLine(
+                x,
+                curve["pd"].values,
+                _point_label(profile, index),
+                style_index,
+                hover_texts=tnr_texts,
+            )
+            study_point = ChartLine(
+                np.atleast_1d(pfa_from_bin(study_pfa, study_n_bins)),
+                np.atleast_1d(study_pd),
+                style_index=style_index,
+                style="dots",
+            )
+            lines_by_alarm[alarm] += [line, study_point]
+    x_axis = ChartAxis("probability of a false alarm", LOG)
+    y_axis = ChartAxis("probability of detection, shot", limits=PROBABILITY_LIMITS)
+    return [Panel({"part": profile.label, "alarm": alarm}, x_axis, y_axis, lines)
+            for alarm, lines in lines_by_alarm.items()]  # fmt: skip
+
+
+def _point_label(profile: GridProfile, index: int) -> str:
+    if profile.coordinate is None:
+        return ""
+    value = profile.coordinate_axis.to_axis_units(profile.coordinate.values[index : index + 1])[0]
+    return labels.format_coordinate_value(
+        profile.coordinate_name, value, profile.coordinate_axis.units
+    )
+
+
+def _roc_indices(profile: GridProfile) -> np.ndarray:
+    """Places along a track whose probability of detection is near to those looked for."""
+    indices = profile.spread_indices(4 * charts.LINE_INTERVALS)
+    pd = profile.variable_values("pd_shot", indices)
+    if not np.isfinite(pd).any():
+        return np.zeros(0, int)
+    nearest_indices = [
+        int(indices[np.nanargmin(np.abs(pd - pd_value))]) for pd_value in ROC_PD_VALUES
+    ]
+    return np.unique(nearest_indices)
+
+
+def noise_budget_of_grid(
+    results: GridResults, profiles: Sequence[GridProfile], n_omitted: int
+) -> Chart:
+    """Share of each source in the noise at the ADC, along the main coordinate."""
+    panels = []
+    for profile in profiles:
+        indices = profile.spread_indices(NOISE_BUDGET_POINTS)
+        budgets = []
+        for index, flags in zip(indices, profile.variable_values("effects", indices), strict=True):
+            parameters = parameters_at(results.spec, profile.axis_indices(index))
+            effects = [name for name in names_of(int(flags)) if name not in _RANDOM_EFFECTS]
+            ((_, shots),) = prepare(parameters, effects)
+            budgets.append(shots.noise_sources)
+        if profile.coordinate is None:
+            x_axis, x = ChartAxis(), indices
+        else:
+            x_axis, x = (
+                profile.coordinate_axis.axis,
+                profile.coordinate_axis.to_axis_units(profile.coordinate.values[indices]),
+            )
+        panels.append(noise_budget_panel({"part": profile.label}, x_axis, x, budgets))
+    return noise_budget_chart(
+        panels,
+        ["Shares of the variance at the ADC, simulated for this page with the effects that the "
+         "study simulates at each point; the standard deviation is shown on hovering",
+         charts.omission_remark(n_omitted)],
+    )  # fmt: skip
+
+
+def noise_budget_panel(
+    facet_choices: Mapping[str, str],
+    x_axis: ChartAxis,
+    x: np.ndarray,
+    budgets: Sequence[Mapping[str, Any]],
+) -> Panel:
+    """Shares of sources of noise from their variances [V^2] at some places, the largest first."""
+    variances_by_point = [
+        {n: float(np.ravel(v)[0]) for n, v in budget.items()} for budget in budgets
+    ]
+    sources = list(
+        dict.fromkeys(n for variances in variances_by_point for n, v in variances.items() if v > 0)
+    )
+    sources.sort(key=lambda name: -variances_by_point[0].get(name, 0.0))
+    total_variance = np.array([sum(variances.values()) for variances in variances_by_point])
+    lines = []
+    for style_index, source in enumerate(sources):
+        variance = np.array([variances.get(source, 0.0) for variances in variances_by_point])
+        lines.append(
+            ChartLine(
+                x,
+                100 * variance / np.where(total_variance > 0, total_variance, 1.0),
+                source.replace("_", " "),
+                style_index,
+                style="area",
+                hover_texts=[f"{1e3 * np.sqrt(v):.3g} mV rms" for v in variance],
+            )
+        )
+    return Panel(
+        facet_choices, x_axis, ChartAxis("share of the noise variance (%)", limits=(0, 100)), lines
+    )
+
+
+def noise_budget_chart(panels: Sequence[Panel], caption: Sequence[str]) -> Chart:
+    """Shares of sources of noise, a panel at a time."""
+    share_texts = ", ".join(
+        f"{line.name} {percent(line.y[0] / 100)} at first" for line in panels[0].lines
+    )
+    alt = f"Shares of noise sources in the noise variance at the ADC. {share_texts}."
+    return Chart("Noise by source", alt, caption, panels, {"part": "Shown for"})
+
+
+def false_alarm_chart(
+    results: GridResults, profiles: Sequence[GridProfile], n_omitted: int
+) -> Chart | None:
+    """Return false alarms of noise and leakage along the main coordinate, if there is one."""
+    if profiles[0].coordinate is None:
+        return None
+    coordinate_name = profiles[0].coordinate_name
+    pfa_with_leakage = probability.false_alarms_per_shot(results.dataset, leakage=True)
+    alarm_dataset = results.dataset[
+        [v for v in _LABEL_BY_ALARM if v != PFA_WITH_LEAKAGE_NAME]
+    ].assign({PFA_WITH_LEAKAGE_NAME: pfa_with_leakage})
+    named_points: list[charts.NamedPoints] = []
+    drawn_lines: list[ChartLine] = []
+    remarks: list[str] = []
+    for variable, alarm_label in _LABEL_BY_ALARM.items():
+        variable_points = [
+            (profile.label, alarm_label, replace(profile.points, dataset=alarm_dataset))
+            for profile in profiles
+        ]
+        # a reading each: together their chunks would wait for each other in memory
+        lines, remarks = charts.lines_along(
+            [(points, variable) for _, _, points in variable_points], coordinate_name
+        )
+        drawn_lines += lines
+        named_points += variable_points
+    x_axis = CoordinateAxis.from_points(results.points, coordinate_name)
+    panels = charts.make_panels(named_points, drawn_lines, x_axis, ChartAxis("probability", LOG))
+    # The same for all points where no axis moves it, and no number of bins.
+    off_axes = results.spec.parameters_off_axes()
+    has_one_threshold = (
+        set(WAYS[:3]) & off_axes.keys() and {NUMBER, COMBINE, VOTES} <= off_axes.keys()
+    )
+    parameters = results.spec.parameters()
+    closed_form = noise_only.bin_probability(float(tnr_of(parameters)), Looks.of(parameters))
+    return Chart(
+        "False alarms",
+        charts.lines_alt_text(
+            "probabilities of false alarms and leakage", x_axis.axis.label, panels[0]
+        ),
+        [f"A bin of noise alone crosses with probability {closed_form:.3g} in closed form"
+         if has_one_threshold else "",
+         *remarks,
+         "Leakage: extra groups raised by the signal's own sidelobes, over noise alone",
+         "Either: by noise or by leakage; both: in the up- and in the down-chirp of a shot",
+         charts.omission_remark(n_omitted)],
+        panels,
+        {"part": "Shown for"},
+    )  # fmt: skip
+
+
+PD_LEVEL = 0.9
+
+UNBROKEN_LABEL = "kept all the way"
+ANSWER_BY_LABEL = {UNBROKEN_LABEL: "unbroken", "reached at all": "farthest"}
+"""Answers of :func:`.limits.limit` by what is chosen of them."""
+
+LABEL_BY_END = {"low": "lower end", "high": "upper end"}
+
+MAXIMUM_RANGE_TITLE = f"Maximum range at a pd of {PD_LEVEL:g}"
+
+MAXIMUM_RANGE_CAPTION = [
+    f"Kept all the way: up to here the probability of detection of a shot is {PD_LEVEL:g} or more "
+    "at "
+    "every range of the study; reached at all: the farthest range at which it is.",
+    "Between ranges it is interpolated in its normal deviate.",
+    f"There is none where it is below {PD_LEVEL:g} from the first range on, not below it at the "
+    "last, or "
+    "not computed.",
+]
+
+
+def maximum_range_item(results: GridResults) -> Chart | HtmlTable | None:
+    """Maximum range along another coordinate; a table where there is none to go along.
+
+    None where range does not vary.
+    """
+    range_parameter = find_axis_parameter(results.spec, RANGE_PATH)
+    if range_parameter is None:
+        return None
+    points = results.points
+    range_axis = CoordinateAxis.from_points(points, range_parameter.coordinate)
+    other_names = points.distinguishing_along(
+        points.dim_of(range_parameter.coordinate), [range_parameter.coordinate]
+    )
+    parts, _ = split_by_coordinates(points, other_names, points.size)
+    varied_parts = [
+        (words, part_points)
+        for words, part_points in parts
+        if len(part_points.unique_values(range_parameter.coordinate)) > 1
+    ]
+    shown_parts, n_omitted = thin_evenly(varied_parts, CHART_PARTS_MAX)
+    max_ranges = [
+        (words, _maximum_range_points(shown_points, range_parameter.coordinate, range_axis.factor))
+        for words, shown_points in shown_parts
+    ]
+    if not max_ranges:
+        return None
+    words = labels.axis_label("maximum range", range_axis.units)
+    x = _choose_x(results, max_ranges[0][1])
+    return (
+        _maximum_range_chart(max_ranges, x, words, n_omitted)
+        if x
+        else _maximum_range_table(max_ranges, words)
+    )
+
+
+def is_empty(item: Chart | HtmlTable | None) -> bool:
+    """Return whether a chart has no value, as where pd is above the level at every range."""
+    if not isinstance(item, Chart):
+        return False
+    return not any(np.isfinite(line.y).any() for panel in item.panels for line in panel.lines)
+
+
+def maximum_range_sentences(item: Chart | HtmlTable | None) -> list[str]:
+    """Maximum range in a sentence, as a chart or table of :func:`maximum_range_item` has it."""
+    unbroken_label = next(iter(ANSWER_BY_LABEL))
+    if isinstance(item, Chart):
+        range_label, unbroken_panels = (
+            item.panels[0].y.label,
+            [p for p in item.panels if p.facet_choices["answer"] == unbroken_label],
+        )
+        values = np.concatenate([line.y for panel in unbroken_panels for line in panel.lines])
+    elif item is not None:
+        range_label = next(name for name in item.frame if name.startswith("maximum range"))
+        values = item.frame[range_label][
+            item.frame[f"a pd of {PD_LEVEL:g}"] == unbroken_label
+        ].to_numpy(float)
+    else:
+        return []
+    finite_values = values[np.isfinite(values)]
+    sentences = []
+    if finite_values.size:
+        range_texts = " to ".join(
+            dict.fromkeys(
+                f"{range_end:.3g}" for range_end in (finite_values.min(), finite_values.max())
+            )
+        )
+        parts_note = (
+            ", of the parts shown here" if any("not shown" in c for c in item.caption) else ""
+        )
+        quantity, _, units = range_label.rstrip(")").partition(" (")
+        sentences = [
+            f"{quantity.capitalize()} with a probability of {PD_LEVEL:g} or more all the "
+            f"way{parts_note}: "
+            f"{range_texts} {units}."
+        ]
+    if n_missing := values.size - finite_values.size:
+        sentences.append(
+            f"No maximum range at {n_missing:,} of {values.size:,} places: there the probability "
+            "is "
+            f"below {PD_LEVEL:g} from the first range on, or {PD_LEVEL:g} or more up to the last."
+        )
+    return sentences
+
+
+def _maximum_range_points(points: PointSelection, name: str, unit_factor: float) -> PointSelection:
+    """Return the maximum range in the units shown, and its coordinates; lazy."""
+    dim = points.dim_of(name)
+    indices = np.sort(points.sorted_coordinate(name).indices)
+    dataset = points.dataset
+    if indices.size < dataset.sizes[dim]:
+        dataset = dataset.isel({dim: indices})
+    max_range = dataset.sweep.maximum_range(PD_LEVEL)
+    converted = {
+        str(variable): (array * unit_factor).assign_attrs(array.attrs)
+        for variable, array in max_range.data_vars.items()
+        if not str(variable).endswith("reason")
+    }
+    return PointSelection.from_dataset(max_range.assign(converted))
+
+
+def _choose_x(results: GridResults, points: PointSelection) -> str:
+    """Return the grazing angle if it varies, or the longest coordinate of numbers."""
+    varying_names = points.varying_coordinates()
+    angle_parameter = find_axis_parameter(results.spec, GRAZING_ANGLE_PATH)
+    if angle_parameter is not None and angle_parameter.coordinate in varying_names:
+        return angle_parameter.coordinate
+    numeric_names = [
+        name for name in varying_names if not labels.is_categorical(points.coordinate_values(name))
+    ]
+    return max(
+        numeric_names or varying_names, key=lambda name: len(points.unique_values(name)), default=""
+    )
+
+
+def _maximum_range_chart(
+    max_ranges: Sequence[tuple[str, PointSelection]], x: str, range_label: str, n_omitted: int
+) -> Chart:
+    """Both answers of every part, a line for each value of what has few."""
+    first_points = max_ranges[0][1]
+    line_coordinates = [
+        n
+        for n in first_points.distinguishing_coordinates([x])
+        if len(first_points.unique_values(n)) <= charts.LINES_PER_PANEL_MAX
+    ][:1]
+    parts: list[tuple[str, PointSelection]] = []
+    for part_label, max_range in max_ranges:
+        own, n_omitted_parts = split_by_coordinates(
+            max_range, max_range.distinguishing_coordinates([x, *line_coordinates]), CHART_PARTS_MAX
+        )
+        parts += [
+            (", ".join(filter(None, (part_label, subpart_label))), part)
+            for subpart_label, part in own
+        ]
+        n_omitted += n_omitted_parts
+    n_omitted += max(0, len(parts) - CHART_PARTS_MAX)
+    named_points, _ = charts.split_into_lines(parts[:CHART_PARTS_MAX], line_coordinates)
+    pairs = [(own, answer) for answer in ANSWER_BY_LABEL.values() for _, _, own in named_points]
+    drawn_lines, remarks = charts.lines_along(pairs, x)
+    x_axis = CoordinateAxis.from_points(first_points, x)
+    y_axis = ChartAxis(range_label, LINEAR, (0.0, None))
+    panels = [
+        panel
+        for answer_label, answer_lines in zip(
+            ANSWER_BY_LABEL,
+            (drawn_lines[: len(named_points)], drawn_lines[len(named_points) :]),
+            strict=True,
+        )
+        for panel in charts.make_panels(
+            named_points, answer_lines, x_axis, y_axis, answer=answer_label
+        )
+    ]
+    span_text = x_axis.describe_span(np.unique(first_points.coordinate_values(x)))
+    return Chart(
+        MAXIMUM_RANGE_TITLE,
+        charts.lines_alt_text(
+            f"{range_label} at a probability of detection of {PD_LEVEL:g}", span_text, panels[0]
+        ),
+        [*MAXIMUM_RANGE_CAPTION, *remarks, charts.omission_remark(n_omitted)],
+        panels,
+        {"part": "Shown for", "answer": f"A pd of {PD_LEVEL:g}"},
+    )
+
+
+def _maximum_range_table(
+    max_ranges: Sequence[tuple[str, PointSelection]], range_label: str
+) -> HtmlTable:
+    """Both answers of each part, with their intervals or why there are none."""
+    rows = []
+    for part, range_points in max_ranges:
+        max_range: xr.Dataset = range_points.dataset.isel(range_points.first_indices()).compute()
+        reason_texts = str(max_range["unbroken_reason"].attrs["flag_meanings"]).split()
+        for answer_label, answer in ANSWER_BY_LABEL.items():
+            label_by_end = {
+                f"{answer}_{end_name}": end_label for end_name, end_label in LABEL_BY_END.items()
+            }
+            rows.append(
+                {
+                    "for": part,
+                    f"a pd of {PD_LEVEL:g}": answer_label,
+                    range_label: max_range[answer].item(),
+                }
+                | {
+                    end_label: max_range[name].item()
+                    for name, end_label in label_by_end.items()
+                    if name in max_range
+                }
+                | {"which is": reason_texts[int(max_range[f"{answer}_reason"])].replace("_", " ")}
+            )
+    frame = pandas.DataFrame(rows)
+    if not any(part for part, _ in max_ranges):
+        frame = frame.drop(columns="for")
+    return HtmlTable(MAXIMUM_RANGE_TITLE, MAXIMUM_RANGE_CAPTION, frame, "maximum_range")

@@ -1,0 +1,612 @@
+"""Charts of a flight: its point clouds to turn, shots over time, navigation and noise."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+import pandas
+import plotly.graph_objects as go
+import xarray as xr
+
+from sweep.analysis import canvas, labels
+from sweep.analysis.charts import (
+    PROBABILITY_LIMITS,
+    Chart,
+    ChartAxis,
+    ChartLine,
+    Panel,
+    omission_remark,
+)
+from sweep.analysis.datasets import NotAStoreError
+from sweep.analysis.scene_results.cloud_figures import HeightMap
+from sweep.analysis.scene_results.navigation_errors import navigation_chart, navigation_curves
+from sweep.analysis.scene_results.recordings import (
+    INTERPOLATED,
+    POINT_KINDS,
+    WORLD_AXES,
+    AxisPosition,
+    PointCloud,
+    Recording,
+    axis_position_at,
+    gather_cloud,
+    point_kinds,
+    quantity_label,
+    read_eyepoints,
+    to_shown_units,
+)
+from sweep.analysis.selection import parameters_at
+from sweep.analysis.study_figures import SceneResults
+from sweep.model.effects.catalogue import names_of
+from sweep.model.eyepoints import prepare_eyepoints
+from sweep.model.navigation import EXCLUDED
+from sweep.model.pairing import TRUE
+from sweep.report.detector_charts import NOISE_BUDGET_POINTS, noise_budget_chart, noise_budget_panel
+from sweep.report.html_page import (
+    COLOUR_BAR,
+    Control,
+    HtmlTable,
+    Plot,
+    plot_layout,
+    title_layout,
+    to_sentences,
+    trace_meta,
+)
+from sweep.spec import SceneSpec
+
+CLOUD_COLOURS = ("range", "radial_velocity", "snr")
+"""Quantities that points can be coloured by."""
+
+PAGE_POINTS_MAX = 36_000
+"""Points of all clouds of a page together."""
+
+PAGE_CLOUDS_MAX = 8
+"""Scanners times places along the study's axes."""
+
+TERRAIN_NODES_MAX = 90
+"""Nodes of the terrain along a side."""
+
+TERRAIN_DEPTH_FRACTION = 0.012
+"""Depth at which terrain is drawn below itself, of the picture's size: points lie on it."""
+
+FIELD_OF_VIEW = math.radians(45)
+"""Angle from the lower to the upper edge of what the library shows of a scene."""
+
+VIEW_FILL_FRACTION, VIEW_ASPECT_MIN = 0.88, 1.2
+"""Share of the field of view that the picture takes, so that its labels have room; width of the
+narrowest sheets, a phone's, over their height."""
+
+EYE_BY_VIEW = {
+    "at an angle": {"x": 1.1, "y": -1.3, "z": 0.6},
+    "from above": {"x": 0.0, "y": -0.01, "z": 1.8},
+    "from the south": {"x": 0.0, "y": -1.8, "z": 0.1},
+    "from the east": {"x": 1.8, "y": 0.0, "z": 0.1},
+}
+"""Places of the eye, in the lengths that the library counts in."""
+
+LOOK_AT_POINT = {"x": 0.0, "y": 0.0, "z": -0.1}
+"""Point that the eye looks at."""
+
+
+@dataclass(frozen=True)
+class LabelledRecording:
+    """Recording of a scanner at one place along the study's axes."""
+
+    label: str
+    recording: Recording
+    axis_position: AxisPosition
+
+
+def select_recordings(results: SceneResults) -> tuple[list[LabelledRecording], int]:
+    """Scanners at places along the axes, as many as a page shows, and how many are left out."""
+    axis_index_tuples = product(*(range(axis.size) for axis in results.spec.axes))
+    candidates = list(product(results.scanners, axis_index_tuples))
+    chosen_numbers = np.unique(
+        np.linspace(0, len(candidates) - 1, min(PAGE_CLOUDS_MAX, len(candidates))).round()
+    )
+    labelled_recordings = []
+    for scanner, index in (candidates[int(i)] for i in chosen_numbers):
+        axis_position = axis_position_at(results.spec, index)
+        scanner_label = labels.coordinate_label(scanner) if len(results.scanners) > 1 else ""
+        recording_label = ", ".join(filter(None, [scanner_label, axis_position.label]))
+        labelled_recordings.append(
+            LabelledRecording(
+                recording_label, axis_position.recording(results.tree, scanner), axis_position
+            )
+        )
+    return labelled_recordings, len(candidates) - len(labelled_recordings)
+
+
+def cloud_plot(
+    results: SceneResults, labelled_recordings: Sequence[LabelledRecording], n_omitted: int
+) -> Plot | None:
+    """All clouds, one at a time; none where there is no point at all."""
+    points_max = PAGE_POINTS_MAX // len(labelled_recordings)
+    cloud_by_label = {
+        labelled.label: gather_cloud(
+            labelled.recording,
+            [*CLOUD_COLOURS, "pd"],
+            ranges=INTERPOLATED,
+            with_path=True,
+            points_max=points_max,
+        )
+        for labelled in labelled_recordings
+    }
+    shown_clouds = {
+        cloud_label: cloud for cloud_label, cloud in cloud_by_label.items() if cloud is not None
+    }
+    if not shown_clouds:
+        return None
+    height_map = HeightMap.from_tree(results.tree)
+    traces = [
+        trace
+        for cloud_label, cloud in shown_clouds.items()
+        for trace in _cloud_traces(cloud_label, cloud, height_map)
+    ]
+    first_cloud = next(iter(shown_clouds.values()))
+    n_draws = labelled_recordings[0].recording.dataset.sizes["draw"]
+    count_texts = [
+        f"{cloud_label}: {', '.join(cloud.remarks)}" if cloud_label else ", ".join(cloud.remarks)
+        for cloud_label, cloud in shown_clouds.items()
+    ]
+    return Plot(
+        heading="Points, flight path and terrain",
+        alt=(
+            f"Point cloud in three dimensions of {first_cloud.thinned_points.n_total:,} points, "
+            "heights in metres: "
+            f"{labels.describe_extent(first_cloud.points['z'])}; ranges: "
+            f"{labels.describe_extent(first_cloud.points['range'])}; "
+            f"with the flight path{' over the terrain' if height_map else ''}."
+        ),
+        caption=to_sentences(
+            [
+                *count_texts,
+                f"Draw 0 of {n_draws}" if n_draws > 1 else "",
+                "Ranges interpolated between bins; terrain shaded, and drawn a little below itself "
+                "so that points show",
+                omission_remark(n_omitted),
+            ]
+        ),
+        figure=go.Figure(traces, _scene_layout()),
+        controls=[
+            Control("cloud", "Shown for", list(shown_clouds)),
+            Control(
+                "colour",
+                "Colour",
+                [_colour_option(name) for name in CLOUD_COLOURS],
+                {
+                    _colour_option(name): {"title": title_layout(quantity_label(name))}
+                    for name in CLOUD_COLOURS
+                },
+            ),
+            Control(
+                "view",
+                "View",
+                list(EYE_BY_VIEW),
+                {
+                    name: {"scene.camera": _camera(name)} | _hidden_axis(name)
+                    for name in EYE_BY_VIEW
+                },
+            ),
+            Control(
+                "frame",
+                "Frame",
+                ["whole flight", "ground"],
+                {
+                    "whole flight": _frame_layout(list(shown_clouds.values()), with_path=True),
+                    "ground": _frame_layout(list(shown_clouds.values())),
+                },
+            ),
+            Control("ground", "Terrain", ["shown", "hidden"] if height_map else ["none"]),
+        ],
+        is_tall=True,
+    )
+
+
+def _colour_option(quantity: str) -> str:
+    return {"snr": "signal-to-noise ratio"}.get(quantity, labels.coordinate_label(quantity))
+
+
+def _xyz_columns(
+    column_arrays: dict[str, np.ndarray], row_selection: np.ndarray | slice
+) -> dict[str, np.ndarray]:
+    return {axis: column_arrays[axis][row_selection].astype(np.float32) for axis in WORLD_AXES}
+
+
+def _cloud_traces(
+    cloud_label: str, cloud: PointCloud, height_map: HeightMap | None
+) -> Iterator[go.Scatter3d | go.Surface]:
+    """Terrain, path, and points in each colour."""
+    if height_map is not None:
+        yield from _terrain_traces(cloud_label, cloud, height_map)
+    yield go.Scatter3d(
+        **_xyz_columns(cloud.path, slice(None)),
+        mode="lines",
+        line={"width": 5},
+        name="flight path",
+        meta=trace_meta(0, cloud=cloud_label),
+        hoverinfo="name",
+    )
+    is_true = cloud.is_true
+    for quantity in CLOUD_COLOURS:
+        values = to_shown_units(quantity, cloud.points[quantity])
+        scale_values = values[is_true] if is_true.any() else values
+        scale_values = scale_values[np.isfinite(scale_values)]
+        low, high = (
+            (float(scale_values.min()), float(scale_values.max()))
+            if scale_values.size
+            else (0.0, 1.0)
+        )
+        for kind_label, is_of_kind in (("true points", is_true), ("false points", ~is_true)):
+            if is_of_kind.any():
+                kind_values = values[is_of_kind].astype(np.float32)
+                is_true_kind = kind_label == "true points"
+                yield go.Scatter3d(
+                    **_xyz_columns(cloud.points, is_of_kind),
+                    mode="markers",
+                    name=kind_label,
+                    customdata=kind_values,
+                    meta=trace_meta(cloud=cloud_label, colour=_colour_option(quantity))
+                    | {"scaled": True},
+                    hovertemplate=f"{quantity_label(quantity)}: "
+                    f"%{{customdata:.5g}}<extra>{kind_label}</extra>",
+                    marker={
+                        "size": 3 if is_true_kind else 5,
+                        "symbol": "circle" if is_true_kind else "diamond",
+                        "color": kind_values,
+                        "cmin": low,
+                        "cmax": high,
+                        "showscale": is_true_kind or not is_true.any(),
+                        "colorbar": COLOUR_BAR,
+                    },
+                )
+
+
+def _terrain_traces(
+    cloud_label: str, cloud: PointCloud, height_map: HeightMap
+) -> Iterator[go.Surface]:
+    """Draw the ground around the points seen, shaded, just below itself."""
+    map_limits = {}
+    for axis in ("x", "y"):
+        values = np.concatenate([cloud.points[axis], cloud.path[axis]])
+        margin = 0.1 * (np.ptp(values) + 1.0)
+        map_limits[axis] = float(values.min() - margin), float(values.max() + margin)
+    cropped = height_map.crop(map_limits["x"], map_limits["y"], TERRAIN_NODES_MAX)
+    if cropped is None:
+        return
+    map_size = max(high - low for low, high in map_limits.values())
+    yield go.Surface(
+        x=cropped.x.astype(np.float32), y=cropped.y.astype(np.float32),
+        z=(cropped.height - TERRAIN_DEPTH_FRACTION * map_size).astype(np.float32),
+        surfacecolor=cropped.hillshade().astype(np.float32), cmin=0, cmax=1, showscale=False,
+        lighting={"ambient": 1, "diffuse": 0, "specular": 0, "fresnel": 0}, hoverinfo="skip",
+        name="terrain", meta=trace_meta(cloud=cloud_label, ground="shown") | {"ground": True},
+    )  # fmt: skip
+
+
+def _camera(view: str) -> dict[str, dict[str, float]]:
+    return {"eye": EYE_BY_VIEW[view], "up": {"x": 0.0, "y": 0.0, "z": 1.0}, "center": LOOK_AT_POINT}
+
+
+def _hidden_axis(view: str) -> dict[str, bool]:
+    """Hide the axis that a view looks along, whose labels would overlap."""
+    low, _, high = sorted(WORLD_AXES, key=lambda axis: abs(EYE_BY_VIEW[view][axis]))
+    return {f"scene.{high}axis.visible": False} if EYE_BY_VIEW[view][low] == 0 else {}
+
+
+def _longest_side(side_ratios: np.ndarray) -> float:
+    """Longest side at which all of a box is seen from every view, in the library's lengths."""
+    corners = np.array(list(product((-0.5, 0.5), repeat=3))) * side_ratios
+    eye_positions = [np.array([view[axis] for axis in WORLD_AXES]) for view in EYE_BY_VIEW.values()]
+    side_lengths = np.linspace(2.0, 0.1, 191).tolist()
+    fitting_lengths = (
+        side_length
+        for side_length in side_lengths
+        if all(_is_in_view(side_length * corners, eye) for eye in eye_positions)
+    )
+    return next(fitting_lengths, side_lengths[0])
+
+
+def _is_in_view(corners: np.ndarray, eye: np.ndarray) -> bool:
+    """Tell whether an eye has (n, 3) corners within its field of view."""
+    view_direction = np.array([LOOK_AT_POINT[axis] for axis in WORLD_AXES]) - eye
+    view_direction /= np.linalg.norm(view_direction)
+    right_direction = np.cross(view_direction, [0.0, 0.0, 1.0])
+    right_direction /= np.linalg.norm(right_direction)
+    from_eye = corners - eye
+    depth = from_eye @ view_direction
+    offset = np.maximum(
+        np.abs(from_eye @ right_direction) / VIEW_ASPECT_MIN,
+        np.abs(from_eye @ np.cross(right_direction, view_direction)),
+    )
+    return bool((offset <= VIEW_FILL_FRACTION * math.tan(FIELD_OF_VIEW / 2) * depth).all())
+
+
+def _frame_layout(clouds: Sequence[PointCloud], *, with_path: bool = False) -> dict[str, Any]:
+    """Limits around the true points of all clouds, and their paths, to one scale."""
+    axis_ranges: dict[str, Any] = {}
+    lengths = {}
+    for axis in WORLD_AXES:
+        true_values = [
+            c.points[axis][c.is_true if c.is_true.any() else slice(None)] for c in clouds
+        ]
+        values = np.concatenate(
+            [*true_values, *(cloud.path[axis] for cloud in clouds if with_path)]
+        )
+        margin = 0.06 * np.ptp(values) + 2.0
+        axis_ranges[f"scene.{axis}axis.range"] = [values.min() - margin, values.max() + margin]
+        lengths[axis] = np.ptp(values) + 2 * margin
+    side_ratios = np.array([lengths[axis] for axis in WORLD_AXES]) / max(lengths.values())
+    aspect_ratio = _longest_side(side_ratios) * side_ratios
+    return axis_ranges | {
+        "scene.aspectratio": dict(zip(WORLD_AXES, aspect_ratio.tolist(), strict=True))
+    }
+
+
+def _scene_layout() -> dict[str, Any]:
+    axis_style = {"showbackground": False, "showspikes": False, "nticks": 5}
+    return plot_layout(
+        scene={
+            "aspectmode": "manual",
+            **{
+                f"{axis}axis": {"title": {"text": f"{axis} (m)"}} | axis_style
+                for axis in WORLD_AXES
+            },
+        },
+        legend={"orientation": "h", "x": 0, "y": 0, "yanchor": "top", "itemsizing": "constant"},
+        margin={"l": 0, "r": 0, "t": 88, "b": 40},
+    )
+
+
+SHOT_QUANTITIES = ("pd_shot", "snr_up", "beam_range", "beam_radial_velocity", "pfa_up")
+"""Quantities of shots that are shown over time."""
+
+MEASURED_QUANTITIES = ("range", "radial_velocity")
+"""Quantities of a point that have a truth."""
+
+PAGE_SHOTS_MAX = 12_000
+"""Shots of all charts over time of a page together."""
+
+ALTITUDE_BINS = 20
+"""Bins of altitude that errors are told in."""
+
+
+def shots_over_time_chart(labelled_recordings: Sequence[LabelledRecording]) -> Chart | None:
+    """Quantities of shots over time; none where none is computed."""
+    quantities = [
+        name for name in SHOT_QUANTITIES if name in labelled_recordings[0].recording.dataset
+    ]
+
+    def quantity_lines(column_arrays: dict[str, np.ndarray]) -> Iterator[QuantityLines]:
+        for name in quantities:
+            y_axis = ChartAxis(
+                quantity_label(name), limits=PROBABILITY_LIMITS if name == "pd_shot" else None
+            )
+            yield quantity_label(name), y_axis, _lines_by_beam(column_arrays, name)
+
+    panels, reduction_remark = _time_panels(
+        labelled_recordings, "shot", [*quantities, "beam"], quantity_lines
+    )
+    extent_texts = [
+        f"{panel.y.label}: "
+        f"{labels.describe_extent(np.concatenate([line.y for line in panel.lines]))}"
+        for panel in panels[: len(quantities)]
+    ]
+    alt = f"Marks of a quantity of each shot over time. {'; '.join(extent_texts)}."
+    return _time_chart("Shots over time", alt, [reduction_remark], panels)
+
+
+def error_chart(labelled_recordings: Sequence[LabelledRecording]) -> Chart | None:
+    """Errors of range and velocity of true points against truth; none where there are none."""
+
+    def quantity_lines(column_arrays: dict[str, np.ndarray]) -> Iterator[QuantityLines]:
+        is_true = (column_arrays["flags"].astype(int) & TRUE) > 0
+        for name in MEASURED_QUANTITIES if is_true.any() else ():
+            error_column = {"error": column_arrays[name] - column_arrays[f"true_{name}"]}
+            true_columns = {
+                key: values[is_true] for key, values in (column_arrays | error_column).items()
+            }
+            error_label = quantity_label(name).replace(" (", " error (")
+            rms_text = labels.format_number(
+                float(f"{np.sqrt(np.mean(true_columns['error'] ** 2)):.3g}")
+            )
+            yield (
+                f"{error_label}, rms {rms_text}",
+                ChartAxis(error_label),
+                _lines_by_beam(true_columns, "error"),
+            )
+
+    names = [
+        "time",
+        "beam",
+        "flags",
+        *MEASURED_QUANTITIES,
+        *(f"true_{name}" for name in MEASURED_QUANTITIES),
+    ]
+    panels, reduction_remark = _time_panels(labelled_recordings, "point", names, quantity_lines)
+    error_texts = "; ".join(
+        panel.facet_choices["quantity"] for panel in panels[: len(MEASURED_QUANTITIES)]
+    )
+    alt = f"Marks of the error of each true point over time. {error_texts}."
+    method_remark = "Measured less true, of true points, interpolated between bins"
+    return _time_chart("Errors against truth", alt, [method_remark, reduction_remark], panels)
+
+
+QuantityLines = tuple[str, ChartAxis, list[ChartLine]]
+"""Words for a quantity, its axis, and its lines over time."""
+
+
+def _time_panels(
+    labelled_recordings: Sequence[LabelledRecording], noun: str, names: Sequence[str],
+    quantity_lines: Callable[[dict[str, np.ndarray]], Iterator[QuantityLines]],
+) -> tuple[list[Panel], str]:  # fmt: skip
+    """Panels of what is drawn of shots or points, and a remark where some are left out."""
+    panels: list[Panel] = []
+    thinning_step = 1
+    for labelled in labelled_recordings:
+        thinned = labelled.recording.thinned_rows(
+            names, PAGE_SHOTS_MAX // len(labelled_recordings), ranges=INTERPOLATED
+        )
+        thinning_step = max(thinning_step, thinned.step)
+        column_arrays = thinned.to_columns()
+        for quantity_text, y_axis, lines in (
+            quantity_lines(column_arrays) if column_arrays and column_arrays["time"].size else ()
+        ):
+            facet_choices = {"cloud": labelled.label, "quantity": quantity_text}
+            panels.append(Panel(facet_choices, ChartAxis("time (s)"), y_axis, lines))
+    return panels, f"One {noun} in {thinning_step} shown: reduced for this page" * (
+        thinning_step > 1
+    )
+
+
+def _time_chart(heading: str, alt: str, caption: list[str], panels: list[Panel]) -> Chart | None:
+    """Return a chart of quantities over time; none without panels."""
+    facets = {"cloud": "Shown for", "quantity": "Quantity"}
+    return Chart(heading, alt, caption, panels, facets) if panels else None
+
+
+def _lines_by_beam(column_arrays: dict[str, np.ndarray], name: str) -> list[ChartLine]:
+    """Return marks of each beam; of all together where there are more than colours."""
+    values = to_shown_units(name, column_arrays[name])
+    beams = np.unique(column_arrays["beam"])
+    if beams.size > len(canvas.LINE_COLOURS):
+        return [ChartLine(column_arrays["time"], values, "all beams", style="dots")]
+    return [
+        ChartLine(
+            column_arrays["time"][is_of_beam],
+            values[is_of_beam],
+            f"beam {int(beam)}",
+            number,
+            style="dots",
+        )
+        for number, beam in enumerate(beams)
+        for is_of_beam in [column_arrays["beam"] == beam]
+    ]
+
+
+def returns_table(labelled_recordings: Sequence[LabelledRecording]) -> HtmlTable:
+    """Shots and points by kind of each scanner, over all draws."""
+    rows = []
+    for labelled in labelled_recordings:
+        kind_counts, n_shots = np.zeros(len(POINT_KINDS), int), 0
+        for shot_slice in labelled.recording.shot_slices():
+            flags = np.asarray(labelled.recording.dataset["flags"].isel(shot=shot_slice).values)
+            n_shots += flags.shape[0] * flags.shape[1]
+            kind_counts += np.bincount(
+                point_kinds(flags).ravel() + 1, minlength=len(POINT_KINDS) + 1
+            )[1:]
+        count_by_kind = dict(
+            zip(map(labels.coordinate_label, POINT_KINDS), kind_counts.tolist(), strict=True)
+        )
+        rows.append({"what": labelled.label or "all", "shots": n_shots} | count_by_kind)
+    caption = ["Shots times draws, and points by kind."]
+    return HtmlTable("Shots and points", caption, pandas.DataFrame(rows), "returns")
+
+
+def returns_sentences(
+    returns_frame: pandas.DataFrame, groups: Sequence[xr.Dataset], n_omitted: int = 0
+) -> list[str]:
+    """Points and solved velocities in sentences; `returned` as :func:`returns_table` has it.
+
+    `fewer` is the number of parts of the study that the page leaves out, and `returned` with it.
+    """
+    n_shots, n_true = (int(returns_frame[name].sum()) for name in ("shots", "true"))
+    n_false = int(returns_frame.iloc[:, 2:].sum(axis=None)) - n_true
+    n_parts = len(returns_frame)
+    parts_text = (
+        f"In the {n_parts} of {n_parts + n_omitted} parts of the study shown here, "
+        if n_omitted
+        else ""
+    )
+    messages = [
+        f"{parts_text}{n_shots:,} shots brought back {n_true:,} true points and {n_false:,} false "
+        "ones; "
+        "a shot counts once a draw."
+    ]
+    status = [group["velocity_status"] for group in groups if "velocity_status" in group]
+    if n_known := sum(int((status_array >= 0).sum()) for status_array in status):
+        n_solved = sum(
+            int(((status_array >= 0) & (status_array <= EXCLUDED)).sum()) for status_array in status
+        )
+        messages.append(f"Velocity was solved in {n_solved:,} of {n_known:,} cycles.")
+    return messages
+
+
+def navigation_error_chart(
+    spec: SceneSpec, labelled_recordings: Sequence[LabelledRecording]
+) -> Chart | None:
+    """Errors of velocity and altitude over altitude; none where no scanner navigates."""
+    named_recordings = [(labelled.label, labelled.recording) for labelled in labelled_recordings]
+    error_curves = [
+        curve
+        for quantity in ("velocity", "altitude")
+        for curve in navigation_curves(named_recordings, quantity=quantity, n_bins=ALTITUDE_BINS)
+    ]
+    if not error_curves:
+        return None
+    chart = navigation_chart(error_curves, "all")
+    return replace(chart, caption=[*chart.caption, *_error_floor_remarks(spec)])
+
+
+def _error_floor_remarks(spec: SceneSpec) -> list[str]:
+    """Errors that no echo lowers, and errors that are not stated."""
+    floor_mapping = spec.to_yaml_mapping()["error_floor"]
+    floor_texts = [
+        f"{labels.coordinate_label(name)} {floor_mapping[name]}"
+        for name, value in spec.error_floor
+        if value > 0
+    ]
+    floor_remark = [f"errors that no echo lowers: {', '.join(floor_texts)}"] if floor_texts else []
+    return floor_remark + spec.unstated_error_sentences()
+
+
+def noise_budget_of_flight(
+    results: SceneResults, labelled_recordings: Sequence[LabelledRecording]
+) -> Chart | None:
+    """Share of each source in the noise along the flight; none where eyepoints are gone."""
+    try:
+        panels = [
+            panel
+            for labelled in labelled_recordings
+            if (panel := _noise_panel(results, labelled)).lines
+        ]
+    except NotAStoreError:
+        return None
+    if not panels:
+        return None
+    return noise_budget_chart(
+        panels,
+        ["Shares of the variance at the ADC in shots spread over the flight, simulated for "
+         "this page with the effects that the study simulates; the standard deviation is shown "
+         "on hovering"],
+    )  # fmt: skip
+
+
+def _noise_panel(results: SceneResults, labelled: LabelledRecording) -> Panel:
+    """Return sources of noise of some of the shots that see something."""
+    recording = labelled.recording
+    n_shots = recording.n_shots
+    shot_indices = np.unique(
+        np.linspace(0, n_shots - 1, min(NOISE_BUDGET_POINTS, n_shots)).round().astype(int)
+    )
+    eyepoints = read_eyepoints(results.store_path, recording.dataset, shot_indices)
+    seen_indices = np.flatnonzero(eyepoints.seen)
+    flags = np.asarray(recording.dataset["effects"].isel(shot=shot_indices[seen_indices]).values)
+    parameters, surfaces = (
+        parameters_at(results.spec, labelled.axis_position.axis_indices),
+        results.spec.surfaces(),
+    )
+    budgets = [
+        prepare_eyepoints(
+            eyepoints.some(np.array([i])), parameters, surfaces, names_of(int(flag))
+        ).noise_sources
+        for i, flag in zip(seen_indices, flags, strict=True)
+    ]
+    facet_choices = {"part": labelled.label}
+    return noise_budget_panel(
+        facet_choices, ChartAxis("time (s)"), eyepoints.time[seen_indices], budgets
+    )

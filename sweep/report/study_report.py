@@ -1,0 +1,586 @@
+"""The report of a store: what is on it, in which order, and the file that it becomes."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import dask
+import numpy as np
+import pandas
+import xarray as xr
+import yaml
+
+from sweep.analysis import labels
+from sweep.analysis.charts import Chart, ChartSizeLimits
+from sweep.analysis.datasets import (
+    ACCURACY_KIND,
+    GRID_KIND,
+    SCENE_KIND,
+    NotAStoreError,
+    read_attributes_of_kind,
+)
+from sweep.analysis.scene_results.consistency import check_consistency
+from sweep.analysis.scene_results.recordings import INTERPOLATED, QUANTITY_BY_NAME, to_shown_units
+from sweep.analysis.selection import to_float_with_nan
+from sweep.analysis.study_figures import GridResults, SceneResults, describe_selection
+from sweep.analysis.tables import TablePage as TablePage
+from sweep.analysis.tables import outputs_page
+from sweep.model.effects.catalogue import EFFECTS
+from sweep.report import detector_charts, flight_charts
+from sweep.report.flight_charts import LabelledRecording
+from sweep.report.html_page import (
+    HtmlTable,
+    PageItem,
+    PageSection,
+    ReportPage,
+    TextItem,
+    make_plot,
+    render_html,
+)
+from sweep.spec import GridSpec, SceneSpec, SlicesFigure, SurfaceFigure
+from sweep.spec.noise_alarms import alarm_probabilities
+from sweep.spec.sections import parameter_rules
+from sweep.storage.locations import Location, atomic_path, parse_location
+from sweep.storage.store_format import parse_software_versions
+
+PAGE_LIMITS = ChartSizeLimits(
+    parts_max=detector_charts.CHART_PARTS_MAX,
+    columns_max=500,
+    rows_max=180,
+    cells_max=400_000,
+    maps_abreast=1,
+)
+"""Cells of all heat maps of a page together, which keep it to a few megabytes."""
+
+TABLE_POINTS_MAX = 1000
+"""Points in a table."""
+
+GRID_TABLE_VARIABLES = (
+    "pd_shot", "pd_shot_half_width", "pd_up", "pd_doppler", "pd_down", "pfa_segment", "pfa_shot",
+    "pfa_both_chirps",
+    "p_leakage_up", "false_alarms", "snr_up", "snr_doppler", "range_error",
+    "radial_velocity_error", "range_rmse", "range_bound", "radial_velocity_rmse",
+    "radial_velocity_bound", "beamlets", "n_draws", "effects_error",
+)  # fmt: skip
+
+CLOUD_TABLE_QUANTITIES = (
+    "time", "beam", "x", "y", "z", "range", "radial_velocity", "snr", "pd", "true_range",
+    "true_radial_velocity", "flags",
+)  # fmt: skip
+
+
+def write_report(store: str | Location, file: str | Path) -> Path:
+    """Write the report of a study as one page that needs nothing else.
+
+    Parameters
+    ----------
+    store
+        Store of a grid of points or of a scene, complete or not.
+    file
+        The page to write; nothing is in its place before it is whole.
+
+    Raises
+    ------
+    NotAStoreError
+        Where there is no store of a grid or of a scene.
+    OSError
+        Where the file can't be written.
+    """
+    store, file = parse_location(store), Path(file)
+    kind = read_attributes_of_kind(store)["kind"]
+    if kind == ACCURACY_KIND:
+        raise NotAStoreError(f"{store} holds what accuracy costs: sweep figures {store}  draws it")
+    if kind not in (GRID_KIND, SCENE_KIND):
+        read_attributes_of_kind(store, GRID_KIND)  # says what it holds instead
+    page = _scene_report(store) if kind == SCENE_KIND else _grid_report(store)
+    html = render_html(page)
+    with atomic_path(file, replace=True) as draft_path:
+        draft_path.write_text(html, encoding="utf-8")
+    return file
+
+
+SectionItem = Chart | PageItem | None
+
+AnySpec = GridSpec | SceneSpec
+
+
+def _grid_report(store: Location) -> ReportPage:
+    results = GridResults.from_store(store)
+    dataset, spec = results.dataset, results.spec
+    figure_items: list[SectionItem] = list(_figure_charts(results))
+    table_items = list(_study_tables(results))
+    max_range_item = detector_charts.maximum_range_item(results)
+    figure_items.append(None if detector_charts.is_empty(max_range_item) else max_range_item)
+    profiles_and_omitted = detector_charts.grid_profiles(results)
+    detector_items: list[SectionItem] = [
+        detector_charts.noise_budget_of_grid(results, *profiles_and_omitted)
+    ]
+    if not spec.draws.draws_whole_spectra:  # of what looks at those there are no closed forms
+        detector_items = [
+            detector_charts.roc_chart(results, *profiles_and_omitted),
+            detector_charts.false_alarm_chart(results, *profiles_and_omitted),
+            *detector_items,
+        ]
+    request_section = _request_section(spec, [dataset["effects"]], dataset)
+    axis_texts = [f"{axis.size:,} {labels.coordinate_label(axis.name)}" for axis in spec.axes]
+    facts = [("points", f"{dataset.attrs['points']:,}"),
+             ("grid", " x ".join(axis_texts) or "a single point")]  # fmt: skip
+    sections = [
+        _answer_section(
+            spec, [dataset], "points", detector_charts.maximum_range_sentences(max_range_item)
+        ),
+        _page_section("figures", "Figures", figure_items),
+        _page_section("detector", "Detection and noise", detector_items),
+        request_section,
+        _page_section("tables", "Tables", [*table_items, _grid_point_table(results)]),
+    ]
+    return _report_page(spec, dataset.attrs, "points", facts, sections, store)
+
+
+def _answer_section(
+    spec: AnySpec, groups: Sequence[xr.Dataset], counted_unit: str, further_sentences: Sequence[str]
+) -> PageSection:
+    """Section that opens the page: detection, false alarms, and whether the tolerance is kept."""
+    tolerance, pd_level = spec.accuracy.tolerance, detector_charts.PD_LEVEL
+    limits = {"effects_error": tolerance, "beamlets_error": tolerance, "accuracy_missed": 0.0}
+    lazy_counts = []
+    for group in groups:
+        pd = group["pd_shot"]
+        exceedances = [group[name] > most for name, most in limits.items() if name in group]
+        missed = sum(exceedances, xr.DataArray(0)) > 0
+        unchecked = pd.notnull() & group["beamlets_error"].isnull()
+        lazy_counts.append(
+            (pd.count(), (pd >= pd_level).sum(), pd.sum(), pd.min(), missed.sum(), unchecked.sum())
+        )
+    counts_by_statistic = np.array(dask.compute(lazy_counts)[0], float).T  # a column a group
+    n_computed, n_at_level, pd_sum, _, missed, unchecked = counts_by_statistic.sum(axis=1)
+    if not n_computed:
+        return PageSection("answer", "Answer", ["No result is there yet."])
+    sentences = [
+        f"The probability of detection of a shot is {pd_level:g} or more at {n_at_level:,.0f} of "
+        f"{n_computed:,.0f} {counted_unit}; its mean is {pd_sum / n_computed:.3g}, its lowest "
+        f"{np.nanmin(counts_by_statistic[3]):.3g}.",
+        *further_sentences,
+    ]
+    if alarms := alarm_probabilities(spec):
+        most = max(alarm_probability for alarm_probability, _ in alarms)
+        alarm_text = f"{most:.3g}" + " at the most" * (len(alarms) > 1)
+        sentences.append(
+            f"Noise alone raises a false alarm in either chirp with probability {alarm_text}."
+        )
+    tolerance_text = (
+        f"missed at {missed:,.0f} {counted_unit}"
+        if missed
+        else f"kept at all of these {counted_unit}"
+    )
+    sentences.append(f"The tolerance of {tolerance:g} is {tolerance_text}.")
+    if unchecked:
+        sentences.append(
+            f"Whether the number of beamlets keeps it is not checked at {unchecked:,.0f} of them: "
+            "their number is given, or their amplitudes add."
+        )
+    return PageSection("answer", "Answer", sentences)
+
+
+def _request_section(
+    spec: AnySpec, effect_flags: Sequence[xr.DataArray], dataset: xr.Dataset
+) -> PageSection:
+    """Section on the study's fields, the effects simulated and the accuracy reached."""
+    items = [
+        _axis_table(spec),
+        _effect_table(effect_flags, spec.effect_modes()),
+        _field_table(spec),
+    ]
+    return _page_section(
+        "asked", "What was asked and simulated", items, accuracy_sentences(dataset, spec)
+    )
+
+
+def _report_page(
+    spec: AnySpec, attributes: Mapping[Any, Any], counted_unit: str,
+    first_facts: Sequence[tuple[str, str]], sections: Sequence[PageSection], store: Location,
+) -> ReportPage:  # fmt: skip
+    """Return the page: a summary, its sections, and how to make it again."""
+    facts = [
+        *first_facts,
+        ("study", attributes["study_id"][:8]),
+        ("model", str(attributes["model_version"])),
+        ("sweep", parse_software_versions(attributes).get("sweep", "")),
+        ("finished (UTC)", str(attributes["finished"])[:16].replace("T", " ")),
+    ]
+    n_done, n_total = attributes[f"{counted_unit}_committed"], attributes[counted_unit]
+    remark = (
+        f"The study is not complete: {n_done:,} of {n_total:,} {counted_unit} are computed. "
+        "sweep resume goes on."
+    )
+    return ReportPage(
+        spec.title,
+        spec.question,
+        [(name, value) for name, value in facts if value],
+        [remark] if n_done < n_total else [],
+        [*sections, _reproduction_section(attributes, spec, str(store))],
+    )
+
+
+def _figure_charts(results: GridResults) -> Iterator[SectionItem]:
+    """Charts of the surfaces and slices that a study asks for, or of a usual set."""
+    figure_specs = [
+        figure_spec
+        for figure_spec in results.figure_specs
+        if isinstance(figure_spec, SurfaceFigure | SlicesFigure)
+    ]
+    n_maps = sum(isinstance(figure_spec, SurfaceFigure) for figure_spec in figure_specs)
+    for figure_spec in figure_specs:
+        chart = results.make_chart(
+            figure_spec, replace(PAGE_LIMITS, cells_max=PAGE_LIMITS.cells_max / max(1, n_maps))
+        )
+        if chart is None:
+            yield TextItem(figure_spec.title, ["No point of the study is within its limits."], "")
+        else:
+            yield replace(
+                chart,
+                heading=figure_spec.title or chart.heading,
+                caption=[describe_selection(figure_spec), *chart.caption],
+            )
+
+
+def _study_tables(results: GridResults) -> Iterator[HtmlTable]:
+    """Return the tables that a study asks for; every output of a single point."""
+    if not results.spec.axes:
+        yield from _html_tables(outputs_page(results.dataset), "outputs")
+    for figure_spec in results.figure_specs:
+        if not isinstance(figure_spec, SurfaceFigure | SlicesFigure):
+            yield from _html_tables(results.make_page(figure_spec), figure_spec.file_stem)
+
+
+def _html_tables(table_page: TablePage, stem: str) -> Iterator[HtmlTable]:
+    """Tables of a page of tables."""
+    for table_number, page_table in enumerate(table_page.page_tables):
+        frame = pandas.DataFrame(
+            [list(row) for row in page_table.rows], columns=list(page_table.columns)
+        )
+        is_last = table_number + 1 == len(table_page.page_tables)
+        heading = (
+            f"{table_page.title}: {page_table.heading}" if table_page.title else page_table.heading
+        )
+        notes = (
+            [" ".join(" ".join(table_page.notes).split())] if is_last and table_page.notes else []
+        )
+        yield HtmlTable(
+            heading, notes, frame, f"{stem}_{table_number + 1}" if table_number else stem
+        )
+
+
+def _scene_report(store: Location) -> ReportPage:
+    results = SceneResults.from_store(store)
+    spec, attributes = results.spec, results.tree.attrs
+    labelled_recordings, n_omitted = flight_charts.select_recordings(results)
+    cloud_plot = flight_charts.cloud_plot(results, labelled_recordings, n_omitted)
+    flight_items: list[SectionItem] = [
+        flight_charts.shots_over_time_chart(labelled_recordings),
+        flight_charts.error_chart(labelled_recordings),
+        flight_charts.navigation_error_chart(spec, labelled_recordings),
+        flight_charts.noise_budget_of_flight(results, labelled_recordings),
+    ]
+    scanner_datasets = [results.tree[name].to_dataset() for name in results.scanners]
+    request_section = _request_section(
+        spec, [g["effects"].chunk() for g in scanner_datasets], scanner_datasets[0]
+    )
+    facts = [("shots times draws", f"{attributes['points']:,}"),
+             ("scanners", ", ".join(map(labels.coordinate_label, results.scanners)))]  # fmt: skip
+    returns_table = flight_charts.returns_table(labelled_recordings)
+    sections = [
+        _answer_section(
+            spec,
+            scanner_datasets,
+            "shots",
+            [
+                *flight_charts.returns_sentences(returns_table.frame, scanner_datasets, n_omitted),
+                *consistency_sentences(results.tree),
+            ],
+        ),
+        _page_section(
+            "cloud",
+            "Point cloud",
+            [cloud_plot],
+            [] if cloud_plot else ["No shot has brought back a point."],
+        ),
+        _page_section("flight", "Along the flight", flight_items),
+        request_section,
+        _page_section("tables", "Tables", [returns_table, _cloud_point_table(labelled_recordings)]),
+    ]
+    return _report_page(spec, attributes, "blocks", facts, sections, store)
+
+
+def consistency_sentences(tree: xr.DataTree) -> list[str]:
+    """Return sentences on errors against the standard errors that are stated."""
+    results = check_consistency(tree)
+    if messages := [result.message for result in results if not result.is_consistent]:
+        return messages
+    if not any(result.n_errors for result in results):
+        return []
+    return ["Errors of points and of navigation agree with the standard errors that are stated."]
+
+
+def _page_section(
+    anchor: str, title: str, items: Sequence[SectionItem], paragraphs: Sequence[str] = ()
+) -> PageSection:
+    page_items = [make_plot(item) if isinstance(item, Chart) else item for item in items]
+    return PageSection(anchor, title, paragraphs, [item for item in page_items if item is not None])
+
+
+def _grid_point_table(results: GridResults) -> HtmlTable | None:
+    """Points of a grid, every k-th along its longest axes; none where there is a single one."""
+    dataset = results.dataset
+    if not results.spec.axes:
+        return None
+    variables = [name for name in GRID_TABLE_VARIABLES if name in dataset]
+    size_by_dim = dict(zip(dataset[variables[0]].dims, dataset[variables[0]].shape, strict=True))
+    reduced_size = dict(size_by_dim)
+    while np.prod(list(reduced_size.values())) > TABLE_POINTS_MAX:
+        longest_dim = max(reduced_size, key=lambda dim: reduced_size[dim])
+        reduced_size[longest_dim] -= max(1, reduced_size[longest_dim] // 10)
+    indices = {
+        dim: np.unique(np.linspace(0, size_by_dim[dim] - 1, length).round().astype(int))
+        for dim, length in reduced_size.items()
+    }
+    reduced = dataset[variables].isel(indices)  # type: ignore[arg-type]
+    for name in variables:
+        reduced[name] = to_float_with_nan(reduced[name]).assign_attrs(dataset[name].attrs)
+    frame = reduced.to_dataframe().reset_index()
+    frame = frame[[c for c in frame.columns if c in dataset.coords or c in variables]]
+    frame = frame.rename(
+        columns={
+            c: labels.column_label(c, dataset[c].attrs.get("units", "")) for c in frame.columns
+        }
+    )
+    n_total = int(np.prod(list(size_by_dim.values())))
+    return HtmlTable("Points", _reduction_caption(len(frame), n_total), frame, "points")
+
+
+def _reduction_caption(n_rows: int, n_total: int) -> list[str]:
+    if n_rows == n_total:
+        return [f"All {n_total:,} points."]
+    return [
+        f"{n_rows:,} of {n_total:,} points, spread over all: reduced for this page. The store has "
+        "every one."
+    ]
+
+
+def _cloud_point_table(labelled_recordings: list[LabelledRecording]) -> HtmlTable:
+    """Points of clouds of the first draw, with what a reader wants of each."""
+    frames, n_total = [], 0
+    for labelled in labelled_recordings:
+        thinned = labelled.recording.thinned_rows(
+            CLOUD_TABLE_QUANTITIES,
+            TABLE_POINTS_MAX // len(labelled_recordings),
+            ranges=INTERPOLATED,
+        )
+        n_total += thinned.n_total
+        if thinned.n_total:
+            column_arrays = thinned.to_columns()
+            columns = {
+                labels.column_label(
+                    name, "dB" if name == "snr" else QUANTITY_BY_NAME[name].units
+                ): (to_shown_units(name, values) if name != "flags" else values)
+                for name, values in column_arrays.items()
+            }
+            frames.append(
+                pandas.DataFrame({"recorded by": labelled.label or "the scanner"} | columns)
+            )
+    frame = pandas.concat(frames, ignore_index=True) if frames else pandas.DataFrame()
+    return HtmlTable("Points", _reduction_caption(len(frame), n_total), frame, "points")
+
+
+def _field_table(spec: AnySpec) -> HtmlTable:
+    """Every field of the spec with what it means."""
+    rule_by_path = parameter_rules()
+    spec_mapping = spec.to_yaml_mapping()
+    rows = [
+        (path, _format_field(value), rule_by_path[path].description if path in rule_by_path else "")
+        for path, value in _iter_fields(spec_mapping)
+        if path.split(".")[0] not in ("title", "question", "figures", "axes", "effects")
+    ]
+    frame = pandas.DataFrame(rows, columns=["field", "value", "meaning"])
+    return HtmlTable("Every field", ["Defaults included."], frame, "fields")
+
+
+def _iter_fields(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in mapping.items():
+        path = f"{prefix}{name}"
+        if isinstance(value, Mapping) and value:
+            yield from _iter_fields(value, f"{path}.")
+        else:
+            yield path, value
+
+
+def _format_field(value: object) -> str:
+    value_text = (
+        value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, default=str)
+    )
+    return value_text if len(value_text) <= 120 else f"{value_text[:117]}..."
+
+
+def _axis_table(spec: AnySpec) -> HtmlTable | None:
+    """Axes with their values."""
+    rows = [
+        (
+            axis.name,
+            axis_parameter.path,
+            axis.size,
+            _format_values(axis_parameter.display_values, axis_parameter.units),
+        )
+        for axis in spec.axes
+        for axis_parameter in axis.parameters
+    ]
+    if not rows:
+        return None
+    frame = pandas.DataFrame(rows, columns=["axis", "parameter", "values", "which"])
+    return HtmlTable("What varies", [], frame, "axes")
+
+
+def _format_values(values: np.ndarray, units: str) -> str:
+    value_texts = [labels.format_quantity(v, units) for v in values[:4]]
+    if len(values) > 5:
+        return ", ".join([*value_texts[:2], "...", labels.format_quantity(values[-1], units)])
+    return ", ".join(labels.format_quantity(v, units) for v in values)
+
+
+def _effect_table(flag_arrays: Sequence[xr.DataArray], modes: Mapping[str, str]) -> HtmlTable:
+    """Effects that were simulated: at how many points, and in which part of the study."""
+    lazy_counts = []
+    for k in range(len(EFFECTS)):
+        presence = [array // 2**k % 2 > 0 for array in flag_arrays]
+        lazy_counts.append(
+            [(own.sum(), [own.any(set(own.dims) - {dim}) for dim in own.dims]) for own in presence]
+        )
+    (effect_counts,) = dask.compute(lazy_counts)
+    n_points = sum(array.size for array in flag_arrays)
+    rows = []
+    for effect, group_counts in zip(EFFECTS, effect_counts, strict=True):
+        n_with_effect = sum(int(own) for own, _ in group_counts)
+        extent_texts = [_describe_presence(along) for _, own in group_counts for along in own]
+        where_text = (
+            ", ".join(dict.fromkeys(filter(None, extent_texts)))
+            if n_with_effect < n_points
+            else "everywhere"
+        )
+        rows.append(
+            (
+                effect.name.replace("_", " "),
+                modes[effect.name],
+                round(100 * n_with_effect / n_points, 2),
+                where_text,
+                effect.about,
+            )
+        )
+    rows.sort(key=lambda row: -row[2])
+    columns = ["effect", "asked", "% of points", "within", "what it is"]
+    caption = [
+        "Asked: auto simulates an effect where leaving it out could change a probability, or the "
+        "magnitude of a bin, by more than the tolerance allows.",
+        "Within: the smallest part of the study that holds all points with the effect.",
+    ]
+    return HtmlTable("Effects", caption, pandas.DataFrame(rows, columns=columns), "effects")
+
+
+def _describe_presence(presence: xr.DataArray) -> str:
+    """Return ends of the coordinates along a dimension between which an effect is present."""
+    is_present, extent_texts = presence.values, []
+    for name, coordinate in presence.coords.items():
+        if coordinate.ndim != 1 or is_present.all() or not is_present.any():
+            continue
+        if labels.is_categorical(coordinate.values):
+            continue
+        present_values = coordinate.values[is_present]
+        units = coordinate.attrs.get("units", "")
+        end_texts = [
+            labels.format_quantity(v, units) for v in (present_values.min(), present_values.max())
+        ]
+        extent_texts.append(
+            f"{labels.coordinate_label(str(name))} {end_texts[0]} to {end_texts[1]}"
+        )
+    return ", ".join(extent_texts)
+
+
+def accuracy_sentences(dataset: xr.Dataset, spec: AnySpec) -> list[str]:
+    """Accuracy of the results, in sentences."""
+    tolerance = spec.accuracy.tolerance
+    sentences = [
+        f"Asked for: no probability of detection off by more than {tolerance:g}"
+        + (f", with a confidence of {spec.accuracy.confidence:g}" if "n_draws" in dataset else "")
+        + "."
+    ]
+    if "effects_error" in dataset:
+        sentences.append(
+            "What was left out changes a probability by "
+            f"{float(dataset['effects_error'].max()):.2g} at the most, at any point."
+        )
+    beamlets_error = float(dataset["beamlets_error"].max()) if "beamlets_error" in dataset else 0.0
+    if beamlets_error > 0:
+        sentences.append(f"More beamlets would change one by {beamlets_error:.2g} at the most.")
+    elif math.isnan(beamlets_error):
+        sentences.append("What more beamlets would change is not checked.")
+    if "n_draws" in dataset:
+        accuracy_missed = dataset["accuracy_missed"]
+        n_known = int(accuracy_missed.notnull().sum())
+        n_met = int((accuracy_missed <= 0).sum())
+        sentences.append(
+            f"Drawn to that accuracy at {n_met:,} of {n_known:,} points; the largest half-width of "
+            f"pd_shot is {float(dataset['pd_shot_half_width'].max()):.2g}, and "
+            f"{int(dataset['n_draws'].where(dataset['n_draws'] > 0).sum()):,} draws were made."
+        )
+    return sentences
+
+
+def _reproduction_section(
+    attributes: Mapping[Any, Any], spec: AnySpec, store_path: str
+) -> PageSection:
+    """Citation of the study, and commands that make it again."""
+    version_by_package = parse_software_versions(attributes)
+    version = version_by_package.get("sweep", "")
+    year = str(attributes.get("finished") or attributes.get("started") or "")[:4]
+    id_text = f"study {attributes['study_id']}, model {attributes['model_version']}"
+    citation = (
+        f"{attributes['title']}. Simulated with sweep {version}, {id_text}"
+        f"{f', {year}' if year else ''}."
+    )
+    bibtex = (
+        f"@misc{{sweep-{attributes['study_id'][:8]},\n"
+        f"  title = {{{{{attributes['title']}}}}},\n"
+        f"  howpublished = {{Simulated with sweep {version}}},\n"
+        f"  note = {{{id_text}}},\n" + (f"  year = {{{year}}},\n" if year else "") + "}"
+    )
+    spec_yaml = yaml.safe_dump(
+        spec.to_yaml_mapping(), sort_keys=False, allow_unicode=True, width=100
+    )
+    commands = (
+        f"sweep run study.yaml --store {store_path}\nsweep figures {store_path}\nsweep report "
+        f"{store_path}"
+    )
+    versions_text = ", ".join(
+        f"{name} {package_version}" for name, package_version in version_by_package.items()
+    )
+    paragraphs = [
+        f"Made with {versions_text}, on a processor {attributes['processor']}. The same spec, seed "
+        "and "
+        "versions give the same numbers, bit for bit, on any number of workers."
+    ]
+    return PageSection(
+        "reproduce",
+        "Cite and reproduce",
+        paragraphs,
+        [
+            TextItem("Citation", [], citation),
+            TextItem("BibTeX", [], bibtex, "study.bib"),
+            TextItem("Commands", ["With the spec below saved as study.yaml."], commands),
+            TextItem(
+                "Spec", ["As it was computed, every default written out."], spec_yaml, "study.yaml"
+            ),
+        ],
+    )

@@ -1,0 +1,476 @@
+"""Craters, boulders and trees: how many lie on an area, and what they look like."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import exp1
+
+from sweep.scenes.meshes import Facets, join_facets
+from sweep.scenes.terrain import AreaBounds, Terrain
+
+
+@dataclass(frozen=True)
+class LeastPowerLaw:
+    """The least of several power laws ``N(>D) = coefficient * D**-exponent`` [1/m^2, D in m]."""
+
+    laws: tuple[tuple[float, float], ...]
+
+    def cumulative_density(self, diameter: np.ndarray) -> np.ndarray:
+        """Return the number per area of this diameter or larger [1/m^2]."""
+        d = np.asarray(diameter, float)
+        return np.min([c * d**-b for c, b in self.laws], axis=0)
+
+    def diameter_at_density(self, density: np.ndarray) -> np.ndarray:
+        """Diameter [m] which `number` per area [1/m^2] reach or exceed."""
+        n = np.asarray(density, float)
+        return np.min([(c / n) ** (1 / b) for c, b in self.laws], axis=0)
+
+
+TRASK_POWER_LAW = (10**-1.1, 2.0)
+"""Lunar craters in equilibrium: ``N = 10**10.9 D**-2`` per 10^6 km^2, D in metres.
+
+Trask, in Ranger VIII and IX, part II, JPL Technical Report 32-800 (1966), restated per m^2.
+"""
+
+PRODUCTION_EXPONENT = 2.8
+"""Exponent of young craters of 1 to 100 m, which have not yet worn each other down.
+
+Moore, Boyce and Hahn, The Moon and the Planets 23, 231 (1980): "near 2.8".
+"""
+
+
+def lunar_crater_law(*, equilibrium_diameter: float = math.inf) -> LeastPowerLaw:
+    """Craters in equilibrium up to a diameter [m], and as they were produced beyond it.
+
+    The diameter at which the two laws cross grows with the age of the ground.
+    """
+    if math.isinf(equilibrium_diameter):
+        return LeastPowerLaw((TRASK_POWER_LAW,))
+    coefficient = TRASK_POWER_LAW[0] * equilibrium_diameter ** (
+        PRODUCTION_EXPONENT - TRASK_POWER_LAW[1]
+    )
+    return LeastPowerLaw((TRASK_POWER_LAW, (coefficient, PRODUCTION_EXPONENT)))
+
+
+@dataclass(frozen=True)
+class MartianRockLaw:
+    """Rocks of the Martian plains, by their cumulative fractional area.
+
+    ``F(D) = k exp(-q D)``, ``q = 1.79 + 0.152/k`` with D in metres (Golombek and Rapp, J.
+    Geophys. Res. 102, 4117, 1997); each rock covers ``pi D^2 / 4``, so that the number per area
+    is ``N(>D) = (4 k q / pi) (exp(-q D)/D - q E1(q D))``. The cover k is that of rocks of any
+    size, 0.02 to 0.2 at the landing sites.
+    """
+
+    area_fraction: float
+
+    @property
+    def decay_rate(self) -> float:
+        """Decay of the area with the diameter, q [1/m]."""
+        return 1.79 + 0.152 / self.area_fraction
+
+    def cumulative_density(self, diameter: np.ndarray) -> np.ndarray:
+        """Return the number per area of this diameter or larger [1/m^2]."""
+        d = np.asarray(diameter, float)
+        q = self.decay_rate
+        return np.asarray(
+            4 * self.area_fraction * q / math.pi * (np.exp(-q * d) / d - q * exp1(q * d))
+        )
+
+    def diameter_at_density(self, density: np.ndarray) -> np.ndarray:
+        """Diameter [m] which `number` per area [1/m^2] reach or exceed."""
+        n = np.asarray(density, float)
+        scale = 4 * self.area_fraction * self.decay_rate / math.pi
+        log_density = np.log(n)
+        # N(>D) > scale exp(-q D) / (D (q D + 2)), which puts this start below the root; and log N
+        # is convex in D, so that Newton's steps approach the root from there without passing it.
+        d = np.minimum(scale / (3 * math.e * n), 1 / self.decay_rate)
+        for _ in range(100):
+            value = self.cumulative_density(d)
+            step = (
+                (np.log(value) - log_density)
+                * value
+                * d**2
+                / (scale * np.exp(-self.decay_rate * d))
+            )
+            d = d + step
+            if (np.abs(step) <= 1e-13 * d).all():
+                break
+        return np.asarray(d)
+
+
+SizeFrequencyLaw = LeastPowerLaw | MartianRockLaw
+"""Numbers per area by diameter, and diameters by number per area."""
+
+
+def draw_scatter(
+    generator: np.random.Generator,
+    law: SizeFrequencyLaw,
+    *,
+    bounds: AreaBounds,
+    smallest: float,
+    largest: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Independent places (x, y) and diameters [m] on a rectangle, in falling order of diameter.
+
+    The number is Poisson with the law's mean between the two diameters; places are uniform.
+    ValueError for an empty rectangle or range of diameters, or more than 5 million of them.
+    """
+    west, south, east, north = bounds
+    if not (0 < smallest < largest and west < east and south < north):
+        raise ValueError("a size-frequency law needs 0 < smallest < largest and an area")
+    density_of_smallest, density_of_largest = law.cumulative_density(np.array([smallest, largest]))
+    expected_number = (density_of_smallest - density_of_largest) * (east - west) * (north - south)
+    if expected_number > 5e6:
+        raise ValueError(f"{expected_number:.2g} objects are too many: raise the smallest diameter")
+    number = generator.poisson(expected_number)
+    x = generator.uniform(west, east, number)
+    y = generator.uniform(south, north, number)
+    diameter = law.diameter_at_density(
+        generator.uniform(density_of_largest, density_of_smallest, number)
+    )
+    order = np.argsort(-diameter, kind="stable")
+    return x[order], y[order], diameter[order]
+
+
+EJECTA_REACH_RADII = 4.0
+"""Radius, in crater radii, at which the ejecta are cut off: 1/64 of their height at the rim."""
+
+
+class CraterArrays(NamedTuple):
+    """Craters of a piece of ground, (n,) each.
+
+    World position of the centres, diameter from rim crest to rim crest [m], and freshness: depth
+    and rim height as a share of a fresh crater's, 0..1.
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    diameter: np.ndarray
+    freshness: np.ndarray
+
+
+def fresh_depth(diameter: np.ndarray) -> np.ndarray:
+    """Depth of a fresh simple crater below its rim crest [m].
+
+    ``0.196 D^1.010`` in km (Pike, in Impact and Explosion Cratering, 489, 1977): lunar craters
+    up to 15 km; about a fifth of the diameter.
+    """
+    return np.asarray(1e3 * 0.196 * (np.asarray(diameter, float) / 1e3) ** 1.010)
+
+
+def fresh_rim_height(diameter: np.ndarray) -> np.ndarray:
+    """Height of a fresh simple crater's rim crest above the ground before it [m].
+
+    ``0.036 D^1.014`` in km (Pike, 1977, as for `fresh_depth`).
+    """
+    return np.asarray(1e3 * 0.036 * (np.asarray(diameter, float) / 1e3) ** 1.014)
+
+
+def crater_profile(
+    radius: np.ndarray, *, diameter: np.ndarray, freshness: np.ndarray
+) -> np.ndarray:
+    """Height above the ground before the crater, at a distance from its centre [m].
+
+    A paraboloid from floor to rim crest; outside, ejecta that thin with the third power of the
+    distance (McGetchin, Settle and Head, Earth Planet. Sci. Lett. 20, 226, 1973), lowered so that
+    they end, without a step, at `REACH` radii. Diameter and freshness are as in `Craters`.
+    """
+    depth, rim_height = fresh_depth(diameter), fresh_rim_height(diameter)
+    relative_radius = 2 * np.asarray(radius, float) / diameter
+    bowl = rim_height - depth * (1 - relative_radius**2)
+    ejecta = (
+        rim_height
+        * (np.maximum(relative_radius, 1.0) ** -3 - EJECTA_REACH_RADII**-3)
+        / (1 - EJECTA_REACH_RADII**-3)
+    )
+    return np.asarray(freshness * np.where(relative_radius < 1, bowl, np.maximum(ejecta, 0.0)))
+
+
+def draw_craters(
+    generator: np.random.Generator,
+    law: SizeFrequencyLaw,
+    *,
+    bounds: AreaBounds,
+    smallest: float,
+    largest: float,
+    least_fresh: float = 0.1,
+) -> CraterArrays:
+    """Craters that reach into a rectangle, largest first; `scatter` has the parameters.
+
+    Ground in equilibrium holds craters of every state from fresh to all but gone. Their
+    freshness is drawn evenly: a simplification, as wear by diffusion leaves more of the shallow
+    ones.
+    """
+    margin = EJECTA_REACH_RADII * largest / 2
+    wider_bounds = bounds[0] - margin, bounds[1] - margin, bounds[2] + margin, bounds[3] + margin
+    x, y, diameter = draw_scatter(
+        generator, law, bounds=wider_bounds, smallest=smallest, largest=largest
+    )
+    freshness = generator.uniform(least_fresh, 1.0, len(x))
+    reach = EJECTA_REACH_RADII * diameter / 2
+    west, south, east, north = bounds
+    is_near = (x > west - reach) & (x < east + reach) & (y > south - reach) & (y < north + reach)
+    return CraterArrays(x[is_near], y[is_near], diameter[is_near], freshness[is_near])
+
+
+def carve_craters(terrain: Terrain, craters: CraterArrays) -> Terrain:
+    """Terrain with craters added to it; ValueError where one is under three grid steps across."""
+    step = max(abs(d) for d in terrain.spacing)
+    if len(craters.x) and craters.diameter.min() < 3 * step:
+        raise ValueError(
+            f"a crater of {craters.diameter.min():g} m is under three grid steps of {step:g} m; "
+            "make the grid finer or the smallest crater larger"
+        )
+    heights = terrain.heights.copy()
+    for x, y, diameter, freshness in zip(*craters, strict=True):
+        reach = EJECTA_REACH_RADII * diameter / 2
+        rows, row_y = _nodes_within_reach(
+            y - terrain.origin[1], reach, terrain.spacing[1], heights.shape[0]
+        )
+        cols, col_x = _nodes_within_reach(
+            x - terrain.origin[0], reach, terrain.spacing[0], heights.shape[1]
+        )
+        radius = np.hypot(row_y[:, None], col_x)
+        heights[rows, cols] += crater_profile(radius, diameter=diameter, freshness=freshness)
+    return replace(terrain, heights=heights)
+
+
+def _nodes_within_reach(
+    centre: float, reach: float, step: float, number: int
+) -> tuple[slice, np.ndarray]:
+    """Nodes of one axis within reach of a centre, and their distances from it [m]."""
+    first, last = sorted(((centre - reach) / step, (centre + reach) / step))
+    start = min(max(int(np.ceil(first)), 0), number)
+    stop = max(min(int(np.floor(last)) + 1, number), start)
+    return slice(start, stop), np.arange(start, stop) * step - centre
+
+
+def draw_boulders(
+    generator: np.random.Generator,
+    law: SizeFrequencyLaw,
+    terrain: Terrain,
+    *,
+    smallest: float,
+    largest: float,
+    bounds: AreaBounds | None = None,
+    height_ratio: float = 0.5,
+    elongation: float = 1.5,
+    subdivisions: int = 2,
+) -> Facets:
+    """Boulders on a terrain, from a size-frequency law; `scatter` has the other parameters.
+
+    The outline of each covers the area of a circle of its diameter exactly. Its long axis over
+    the short one is drawn evenly from 1 to the elongation. Those that would stand in a hole of
+    the terrain are left out.
+    """
+    x, y, diameter = draw_scatter(
+        generator, law, bounds=bounds or terrain.bounds, smallest=smallest, largest=largest
+    )
+    axis_ratio = generator.uniform(1.0, elongation, len(x))
+    heading = generator.uniform(0.0, math.pi, len(x))
+    z = terrain.height_at(x, y)
+    is_on_ground = np.isfinite(z)
+    centre = np.column_stack([x, y, z])[is_on_ground] - terrain.origin
+    diameter, axis_ratio = diameter[is_on_ground, None], np.sqrt(axis_ratio[is_on_ground, None])
+    dome, faces = unit_dome(subdivisions)
+    along_long_axis, along_short_axis = (
+        dome[:, 0] * (diameter / 2 * axis_ratio),
+        dome[:, 1] * (diameter / 2 / axis_ratio),
+    )
+    c, s = np.cos(heading[is_on_ground, None]), np.sin(heading[is_on_ground, None])
+    # The skirt goes as deep as half a diameter: no gap under a boulder on a slope up to 45 deg.
+    height_above_ground = np.where(dome[:, 2] > 0, height_ratio, 0.5) * dome[:, 2] * diameter
+    vertices = np.stack(
+        [
+            c * along_long_axis - s * along_short_axis,
+            s * along_long_axis + c * along_short_axis,
+            height_above_ground,
+        ],
+        axis=-1,
+    )
+    vertices += centre[:, None, :]
+    index_shift = np.arange(len(centre)) * len(dome)
+    faces = faces + index_shift[:, None, None]
+    return Facets.on_one_surface(vertices, faces, origin=terrain.origin)
+
+
+def unit_dome(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return a unit dome above z = 0 with a skirt down to z = -1: vertices, faces.
+
+    The outline's area is pi exactly. Each subdivision cuts every facet of the half-octahedron
+    into four.
+    """
+    n_rows = 2**subdivisions
+    points: list[np.ndarray] = []
+    faces: list[np.ndarray] = []
+    first_of_row = {}
+    # Rows of the octahedron's four upper faces: row k has 4 k nodes, evenly round at k / side.
+    for k in range(n_rows + 1):
+        first_of_row[k] = len(points)
+        angle = 2 * math.pi * np.arange(max(4 * k, 1)) / max(4 * k, 1)
+        tilt = math.pi / 2 * k / n_rows
+        ring = math.sin(tilt) * np.cos(angle), math.sin(tilt) * np.sin(angle)
+        points += list(np.column_stack([*ring, np.full(len(angle), math.cos(tilt))]))
+    for k in range(n_rows):  # between row k and the next
+        quarter, i = np.divmod(np.arange(4 * k + 4), k + 1)
+        inner_number, outer_number = k * quarter + i, np.arange(4 * k + 4)
+        a, b = (first_of_row[k] + n % max(4 * k, 1) for n in (inner_number, inner_number + 1))
+        c, d = (first_of_row[k + 1] + n % (4 * k + 4) for n in (outer_number, outer_number + 1))
+        cell_faces = np.stack([np.stack([a, c, d], axis=1), np.stack([a, d, b], axis=1)], axis=1)
+        faces.append(cell_faces[np.stack([i <= k, i < k], axis=1)])
+    first_rim_node, n_rim_nodes = first_of_row[n_rows], 4 * n_rows
+    vertices = np.array(points)
+    vertices[first_rim_node:, 2] = 0.0
+    skirt = vertices[first_rim_node:] - [0.0, 0.0, 1.0]
+    nodes = np.arange(n_rim_nodes)
+    a, b = first_rim_node + nodes, first_rim_node + (nodes + 1) % n_rim_nodes
+    lower_a, lower_b = a + n_rim_nodes, b + n_rim_nodes
+    skirt_faces = [np.column_stack([lower_a, lower_b, b]), np.column_stack([lower_a, b, a])]
+    vertices = np.concatenate([vertices, skirt])
+    polygon_area = n_rim_nodes / 2 * math.sin(2 * math.pi / n_rim_nodes)
+    vertices[:, :2] *= math.sqrt(math.pi / polygon_area)
+    return vertices, np.concatenate([*faces, *skirt_faces])
+
+
+@dataclass(frozen=True)
+class MeanTree:
+    """Mean measures of the trees of a clump.
+
+    Leaves lie at random, with the spherical distribution of leaf angles: every direction of a
+    leaf's normal is as likely as any other. So the probability of a gap along a ray is Beer's law,
+    ``exp(-G * density * path)`` with ``G = 1/2``. Sources: de Wit, Photosynthesis of Leaf Canopies
+    (1965); Ross, The Radiation Regime and Architecture of Plant Stands (1981).
+    """
+
+    height: float = 12.0  # from the ground to the top of the crown [m]
+    crown_diameter: float = 7.0  # [m]
+    crown_base: float = 3.0  # height of the crown's lower end [m]
+    trunk_diameter: float = 0.4  # at the ground [m]; a third of it at the top
+    leaf_length: float = 0.30  # diagonals of a leaf, which is a rhombus [m]
+    leaf_width: float = 0.20
+    leaf_area_index: float = 2.0  # one-sided leaf area over that of the crown's outline
+    variation: float = 0.25  # sizes of trees are drawn evenly within this share of the mean
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.crown_base < self.height:
+            raise ValueError("a tree's crown must begin above the ground and below its height")
+
+    @property
+    def leaf_area(self) -> float:
+        """One-sided area of a leaf [m^2]."""
+        return self.leaf_length * self.leaf_width / 2
+
+    @property
+    def number_of_leaves(self) -> int:
+        """Number of leaves of a tree of mean size."""
+        crown_area = math.pi * self.crown_diameter**2 / 4
+        return round(self.leaf_area_index * crown_area / self.leaf_area)
+
+
+LEAF_SURFACE, TRUNK_SURFACE = 0, 1
+"""Surface indices."""
+
+
+def plant_clump(
+    generator: np.random.Generator,
+    terrain: Terrain,
+    *,
+    centre: tuple[float, float],
+    radius: float,
+    number: int,
+    tree: MeanTree,
+) -> Facets:
+    """Plant a clump of trees on a terrain, their trunks at least half a crown apart.
+
+    ValueError where they find no room within the radius [m], or no ground.
+    """
+    parts = []
+    for x, y in _draw_trunk_positions(generator, centre, radius, number, tree.crown_diameter / 2):
+        z = float(terrain.height_at(np.array(x), np.array(y)))
+        if not math.isfinite(z):
+            raise ValueError(f"a tree at ({x:.1f}, {y:.1f}) m would stand beside the ground")
+        foot_position = np.array([x, y, z]) - terrain.origin
+        size_factor = 1 + tree.variation * generator.uniform(-1.0, 1.0)
+        for facets in (trunk_facets(tree, size_factor), crown_facets(generator, tree, size_factor)):
+            parts.append(
+                Facets(
+                    facets.vertices + foot_position, facets.faces, facets.surface, terrain.origin
+                )
+            )
+    return join_facets(parts)
+
+
+def _draw_trunk_positions(
+    generator: np.random.Generator,
+    centre: tuple[float, float],
+    radius: float,
+    number: int,
+    distance_min: float,
+) -> list[tuple[float, float]]:
+    """Places in a disc, no two nearer than `apart` [m], by throwing darts."""
+    positions: list[tuple[float, float]] = []
+    for _ in range(1000 * number):
+        if len(positions) == number:
+            break
+        distance, azimuth = radius * math.sqrt(generator.random()), 2 * math.pi * generator.random()
+        x, y = centre[0] + distance * math.cos(azimuth), centre[1] + distance * math.sin(azimuth)
+        if all(math.hypot(x - px, y - py) >= distance_min for px, py in positions):
+            positions.append((x, y))
+    if number < 1 or len(positions) < number:
+        raise ValueError(
+            f"{number} trees {distance_min:g} m apart do not fit in a clump of radius {radius:g} m"
+        )
+    return positions
+
+
+def trunk_facets(tree: MeanTree, size_factor: float = 1.0) -> Facets:
+    """Tapered prism from half a metre below the foot to the middle of the crown."""
+    sides = 8
+    top_height = (tree.crown_base + tree.height) / 2
+    angle = 2 * math.pi * np.arange(sides) / sides
+    ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(sides)])
+    lower = ring * tree.trunk_diameter / 2 - [0.0, 0.0, 0.5]
+    upper = ring * tree.trunk_diameter / 6 + [0.0, 0.0, top_height]
+    a, b = np.arange(sides), np.roll(np.arange(sides), -1)
+    faces = np.concatenate(
+        [np.column_stack([a, b, b + sides]), np.column_stack([a, b + sides, a + sides])]
+    )
+    return Facets.on_one_surface(
+        size_factor * np.concatenate([lower, upper]), faces, surface=TRUNK_SURFACE
+    )
+
+
+def crown_facets(
+    generator: np.random.Generator, tree: MeanTree, size_factor: float = 1.0
+) -> Facets:
+    """Leaves with their centres spread evenly over an ellipsoid, the tree's foot at the origin.
+
+    A larger tree has more leaves, not larger ones: the leaf area index stays.
+    """
+    n_leaves = round(tree.number_of_leaves * size_factor**2)
+    directions = _draw_directions(generator, n_leaves)
+    unit_ball_points = directions * np.cbrt(generator.random(n_leaves))[:, None]
+    semi_axes = (
+        np.array([tree.crown_diameter, tree.crown_diameter, tree.height - tree.crown_base]) / 2
+    )
+    middle = np.array([0.0, 0.0, (tree.height + tree.crown_base) / 2])
+    centres = size_factor * (unit_ball_points * semi_axes + middle)
+    along = _draw_directions(generator, n_leaves)
+    across = np.cross(along, _draw_directions(generator, n_leaves))
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    along, across = along * tree.leaf_length / 2, across * tree.leaf_width / 2
+    corners = [centres + along, centres + across, centres - along, centres - across]
+    leaf_triangles = np.array([[0, 1, 2], [0, 2, 3]])
+    faces = 4 * np.arange(n_leaves)[:, None, None] + leaf_triangles
+    return Facets.on_one_surface(np.stack(corners, axis=1), faces, surface=LEAF_SURFACE)
+
+
+def _draw_directions(generator: np.random.Generator, number: int) -> np.ndarray:
+    """Return unit vectors, evenly over the sphere, (number, 3)."""
+    vectors = generator.standard_normal((number, 3))
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))

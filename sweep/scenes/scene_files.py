@@ -1,0 +1,402 @@
+"""Files of a scene: what is wrong with one, what tells it from others, CSV tables."""
+
+from __future__ import annotations
+
+import csv
+import errno
+import hashlib
+import json
+import re
+from collections.abc import Collection, Mapping, Sequence
+from decimal import Decimal, localcontext
+from pathlib import Path
+from typing import Any, NamedTuple
+from urllib.parse import unquote
+
+import numpy as np
+
+from sweep.messages import PrintableError
+from sweep.model.geometry.quaternion import from_heading
+from sweep.units import QuantityError, read_unit
+
+
+class SceneError(PrintableError):
+    """A file that a scene can not be made of: the rule broken, and what to do about it."""
+
+    def __init__(self, file: str | Path, problem: str, remedy: str) -> None:
+        super().__init__(f"{file}: {problem}; {remedy}")
+        self.file, self.problem, self.remedy = str(file), problem, remedy
+
+
+def require_file(path: str | Path) -> Path:
+    """Path of a file that is there; SceneError where it is not, or is no plain file."""
+    path = Path(path)
+    if str(path).startswith("/vsi"):
+        raise SceneError(path, "is no file of this machine", "fetch it, and name the file")
+    if path.is_dir():
+        raise SceneError(path, "is a folder", "name the file in it")
+    if _is_link_loop(path):
+        raise SceneError(path, "is reached by a link that leads back to itself", "mend the link")
+    if not path.exists():
+        remedy = "check the path, which is relative to the file that names it"
+        if path.parent.is_dir():
+            sibling_names = sorted(sibling.name for sibling in path.parent.glob(f"*{path.suffix}"))[
+                :5
+            ]
+            remedy += f" (there is: {', '.join(sibling_names)})" if sibling_names else ""
+        raise SceneError(path, "does not exist", remedy)
+    if not path.is_file():
+        raise SceneError(path, "is a pipe or a device", "name a plain file")
+    return path
+
+
+def _is_link_loop(path: Path) -> bool:
+    """Return true if symbolic links on the way to a file lead in a circle."""
+    try:
+        path.stat()
+    except OSError as error:
+        return error.errno == errno.ELOOP
+    return False
+
+
+def file_digest(path: str | Path) -> str:
+    """Digest of a file's bytes, and of those of files that a glTF reads; SceneError if lost."""
+    path = require_file(path)
+    digest = hashlib.blake2b(digest_size=16)
+    for file_part in (path, *_companion_paths(path)):
+        try:
+            with require_file(file_part).open("rb") as file:
+                hashlib.file_digest(file, lambda: digest)
+        except OSError as error:
+            raise SceneError(file_part, f"cannot be read ({error.strerror})", "check it") from None
+    return digest.hexdigest()
+
+
+def require_memory(subject: str | Path, bytes_needed: float, remedy: str) -> None:
+    """Refuse a file or an object that would take more memory [bytes] than the machine has free."""
+    import psutil
+
+    bytes_free = psutil.virtual_memory().available
+    if bytes_needed > bytes_free:
+        problem = (
+            f"would take about {bytes_needed / 1e9:.1f} GB of memory, of which "
+            f"{bytes_free / 1e9:.1f} GB"
+        )
+        raise SceneError(subject, f"{problem} are free", remedy)
+
+
+def read_companion(path: Path, name: str) -> bytes:
+    """Content of a plain file that another one names; SceneError for what is none."""
+    companion = require_file(_companion_path(path, name))
+    size = companion.stat().st_size
+    require_memory(companion, 4 * size, "reduce it")
+    with companion.open("rb") as file:
+        return file.read(size)
+
+
+def _companion_path(path: Path, name: str) -> Path:
+    """Path of a file that another one names; SceneError for an address of the network."""
+    if "://" in name:
+        problem = f"needs {name}, and nothing is fetched over the network"
+        raise SceneError(path, problem, "fetch that, or export it in one file (GLB)")
+    return path.parent / unquote(name)
+
+
+def _companion_paths(path: Path) -> list[Path]:
+    """Files whose content belongs to this one's."""
+    if path.suffix.lower() != ".gltf":
+        return []
+    try:
+        document = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return []  # what is wrong with it is told where it is read
+    buffers: Any = document.get("buffers") if isinstance(document, dict) else None
+    buffers = buffers if isinstance(buffers, list) else []
+    uris = [buffer.get("uri", "") for buffer in buffers if isinstance(buffer, dict)]
+    return [
+        _companion_path(path, uri)
+        for uri in uris
+        if isinstance(uri, str) and uri and not uri.startswith("data:")
+    ]
+
+
+WAYPOINT_COLUMN_UNITS = {
+    "time": "s", "x": "m", "y": "m", "z": "m",
+    "qw": "", "qx": "", "qy": "", "qz": "",
+    "heading": "rad", "pitch": "rad", "roll": "rad",
+}  # fmt: skip
+"""Columns and the SI unit of each; quaternions have none."""
+
+_POSITION_COLUMNS = ("time", "x", "y", "z")
+_QUATERNION_COLUMNS = ("qw", "qx", "qy", "qz")
+_ANGLE_COLUMNS = ("heading", "pitch", "roll")
+_HEADER_CELL_PATTERN = re.compile(r"\s*([A-Za-z_]+)\s*(?:[\[(]([^\])]*)[\])])?\s*")
+_EXAMPLE_HEADER = "time [s], x [m], y [m], z [m], heading [deg], pitch [deg], roll [deg]"
+
+
+NumberedRow = tuple[int, list[str]]
+"""Number of a line, and its cells."""
+
+
+class WaypointTable(NamedTuple):
+    """Waypoints of a table."""
+
+    time: np.ndarray  # (n,): rising times [s]
+    position: np.ndarray  # (n, 3) [m]
+    attitude: np.ndarray | None
+    """(n, 4): quaternions (w, x, y, z), body to world; None where the table has no attitude."""
+
+
+def read_waypoints(path: str | Path, time_origin: Decimal = Decimal(0)) -> WaypointTable:
+    """Waypoints of a CSV table.
+
+    The first row names the columns and their units: ``time [s]``, ``x [km]``, ``y [km]``, ``z
+    [m]``. The attitude is either ``qw, qx, qy, qz`` (body to world) or angles. The angles are
+    ``heading [deg]`` (counter-clockwise from the x axis), ``pitch [deg]`` (nose up) and
+    ``roll [deg]`` (left side up); a missing one is 0. Lines that begin with # are skipped. A file
+    that is missing or no such table raises SceneError. Times [s] count from `time_origin`.
+    """
+    table = read_csv_columns(
+        path, WAYPOINT_COLUMN_UNITS, _POSITION_COLUMNS, _EXAMPLE_HEADER, time_origin
+    )
+    position = np.column_stack([table[name] for name in "xyz"])
+    return WaypointTable(table["time"], position, _table_attitude(Path(path), table))
+
+
+def read_first_time(path: str | Path) -> Decimal:
+    """First time [s] of a CSV table of waypoints, with all its digits; SceneError for no table."""
+    path = require_file(path)
+    rows = _read_rows(path)
+    if len(rows) < 2:
+        raise _too_short_error(path, _EXAMPLE_HEADER)
+    factors = _column_factors(path, rows[0][1], WAYPOINT_COLUMN_UNITS, ("time",), _EXAMPLE_HEADER)
+    _parse_row(path, rows[1], list(factors))
+    return _read_exact_times(rows[1:2], factors)[0]
+
+
+def read_csv_columns(
+    path: str | Path,
+    column_units: Mapping[str, str],
+    required_columns: Collection[str],
+    example: str,
+    time_origin: Decimal = Decimal(0),
+) -> dict[str, np.ndarray]:
+    """Columns of a CSV table in SI, by name, (n,) each; the times rise.
+
+    The first row names the columns and their units: ``time [us]``. Lines that begin with # are
+    passed over.
+
+    Parameters
+    ----------
+    column_units : mapping
+        SI unit of each column that there may be, ``time`` among them; empty for a pure number.
+    required_columns : collection of str
+        Columns that must be there.
+    example : str
+        A good header.
+    time_origin : Decimal
+        Subtracted from the times [s] in decimal arithmetic, before they become float64: seconds of
+        GPS (1.35e9) would lose 1e-7 s there, and the accelerations of a path with them.
+
+    Raises
+    ------
+    SceneError
+        For a file that is missing or no such table; names every line at fault, and what to write.
+    """
+    path = require_file(path)
+    numbered_rows = _read_rows(path)
+    if len(numbered_rows) < 3:
+        raise _too_short_error(path, example)
+    factors = _column_factors(path, numbered_rows[0][1], column_units, required_columns, example)
+    rows, mistakes = [], []
+    for line in numbered_rows[1:]:
+        try:
+            rows.append(_parse_row(path, line, list(factors)))
+        except SceneError as error:
+            mistakes.append(error)
+    if not mistakes:
+        times = _read_exact_times(numbered_rows[1:], factors)
+        mistakes = [
+            _falling_time_error(
+                path, (numbered_rows[i][0], times[i - 1]), (numbered_rows[i + 1][0], times[i])
+            )
+            for i in range(1, len(times))
+            if times[i] <= times[i - 1]
+        ]
+    if mistakes:
+        raise _join_errors(path, mistakes)
+    values = np.array(rows)
+    table = {name: values[:, i] * factor for i, (name, factor) in enumerate(factors.items())}
+    if time_origin:
+        with localcontext(prec=_TIME_DIGITS):
+            table["time"] = np.array([float(time - time_origin) for time in times])
+    equal_times = np.flatnonzero(np.diff(table["time"]) <= 0)
+    if equal_times.size:  # apart by less than float64 can tell
+        line = numbered_rows[equal_times[0] + 2][0]
+        problem = f"has a time on line {line} too close to the one before for numbers of 64 bits"
+        raise SceneError(path, problem, "leave one of the two lines out")
+    return table
+
+
+_MISTAKES_SHOWN_MAX = 10
+"""Mistakes of one file that are told; of more, their number."""
+
+
+def _join_errors(path: Path, mistakes: Sequence[SceneError]) -> SceneError:
+    """All mistakes of a file as one; their rules are predicates of the file."""
+    shown_mistakes = mistakes[:_MISTAKES_SHOWN_MAX]
+    rule = ", and ".join(mistake.problem for mistake in shown_mistakes)
+    if len(mistakes) > len(shown_mistakes):
+        rule += f", and {len(mistakes) - len(shown_mistakes)} more mistakes of the kind"
+    return SceneError(
+        path, rule, "; ".join(dict.fromkeys(mistake.remedy for mistake in shown_mistakes))
+    )
+
+
+def _too_short_error(path: Path, example: str) -> SceneError:
+    """Refusal of a table without two lines of numbers."""
+    remedy = f"write a header ({example}) and a line for each"
+    return SceneError(path, "holds fewer than two lines of numbers", remedy)
+
+
+def _read_exact_times(rows: Sequence[NumberedRow], factors: Mapping[str, float]) -> list[Decimal]:
+    """Return the times [s] of lines of finite numbers, with all digits that are written."""
+    column, factor = list(factors).index("time"), Decimal(repr(factors["time"]))
+    with localcontext(prec=_TIME_DIGITS):
+        return [Decimal(cells[column].strip()) * factor for _, cells in rows]
+
+
+_TIME_DIGITS = 60
+"""Significant digits of times while they are decimals."""
+
+
+def _falling_time_error(
+    path: Path, earlier: tuple[int, Decimal], later: tuple[int, Decimal]
+) -> SceneError:
+    """Refusal of a time, given with its line, that does not exceed the time before."""
+    (line, time), (next_line, next_time) = earlier, later
+    if next_time == time:
+        problem = (
+            f"has the time {next_time.normalize():f} s on line {line} and again on {next_line}"
+        )
+        return SceneError(path, problem, "leave one line of each time")
+    problem = (
+        f"has a time on line {next_line}, {next_time.normalize():f} s, that is earlier than the "
+        f"{time.normalize():f} s on line {line}"
+    )
+    return SceneError(path, problem, "sort the lines by time")
+
+
+def _column_factors(
+    path: Path,
+    header: Sequence[str],
+    column_units: Mapping[str, str],
+    required_columns: Collection[str],
+    example: str,
+) -> dict[str, float]:
+    """Factor that makes each column SI, by name in the order of the header; all its mistakes."""
+    for separator, separator_name in ((";", "semicolons"), ("\t", "tabs")):
+        if len(header) == 1 and separator in header[0]:
+            problem = f"separates its columns by {separator_name}"
+            raise SceneError(path, problem, "separate them by commas, with points in numbers")
+    factors: dict[str, float] = {}
+    mistakes: list[SceneError] = []
+    for cell in header:
+        match = _HEADER_CELL_PATTERN.fullmatch(cell)
+        name = match[1].lower() if match else ""
+        if match is None or name not in column_units:
+            problem = f"has an unknown column '{cell.strip()}'"
+            mistakes.append(SceneError(path, problem, f"use {example}"))
+        elif name in factors:
+            mistakes.append(SceneError(path, f"has two columns '{name}'", "leave one out"))
+        else:
+            factors[name] = 1.0
+            try:
+                factors[name] = _column_factor(
+                    path, name, column_units[name], (match[2] or "").strip()
+                )
+            except SceneError as error:
+                mistakes.append(error)
+    mistakes += [
+        SceneError(path, f"has no column '{name}'", f"use {example}")
+        for name in required_columns
+        if name not in factors
+    ]
+    if mistakes:
+        raise _join_errors(path, mistakes)
+    return factors
+
+
+def _read_rows(path: Path) -> list[NumberedRow]:
+    """Line numbers and cells of all lines that say something."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        raise SceneError(path, "is no text in UTF-8", "save the table as CSV") from None
+    reader = csv.reader(text.splitlines(), skipinitialspace=True)
+    return [
+        (reader.line_num, row)
+        for row in reader
+        if any(cell.strip() for cell in row) and not row[0].lstrip().startswith("#")
+    ]
+
+
+def _column_factor(path: Path, name: str, si_unit: str, unit: str) -> float:
+    """Factor that makes a column SI."""
+    if not si_unit:
+        if unit not in ("", "1"):
+            raise SceneError(path, f"gives '{name}' a unit", "quaternions have none")
+        return 1.0
+    example = f"{name} [{si_unit}]"
+    if not unit:
+        raise SceneError(path, f"has no unit for column '{name}'", f"write e.g. {example}")
+    try:
+        return read_unit(unit, si_unit=si_unit, example=example).to_si(1)  # type: ignore[arg-type]
+    except QuantityError as error:
+        problem = f"has a wrong unit for column '{name}': it {error.rule}"
+        raise SceneError(path, problem, f"write e.g. {example}") from None
+
+
+def _parse_row(path: Path, numbered_row: NumberedRow, column_names: Sequence[str]) -> list[float]:
+    """Numbers of a line, in the order of the columns' names."""
+    line_number, cells = numbered_row
+    if len(cells) != len(column_names):
+        problem = f"has {len(cells)} cells under {len(column_names)} columns on line {line_number}"
+        raise SceneError(path, problem, "fill or cut the line")
+    values = [_parse_finite_number(cell) for cell in cells]
+    if None in values:
+        wrong_column = values.index(None)
+        problem = (
+            f"has no finite number in column '{column_names[wrong_column]}' on line {line_number}: "
+        )
+        raise SceneError(path, f"{problem}'{cells[wrong_column].strip()}'", "write plain numbers")
+    return [value for value in values if value is not None]
+
+
+def _parse_finite_number(cell: str) -> float | None:
+    """Value of a cell; None if it is no finite number."""
+    try:
+        value = float(cell)
+    except ValueError:
+        return None
+    return value if np.isfinite(value) else None
+
+
+def _table_attitude(path: Path, table: Mapping[str, np.ndarray]) -> np.ndarray | None:
+    """Quaternions of the table, (n, 4)."""
+    quaternion_columns = [name for name in _QUATERNION_COLUMNS if name in table]
+    angle_columns = {name: table[name] for name in _ANGLE_COLUMNS if name in table}
+    if quaternion_columns and angle_columns:
+        raise SceneError(path, "has both a quaternion and angles", "leave one of them out")
+    if angle_columns:
+        zeros = np.zeros(len(table["time"]))
+        return from_heading(**{name: angle_columns.get(name, zeros) for name in _ANGLE_COLUMNS})
+    if not quaternion_columns:
+        return None
+    if len(quaternion_columns) < len(_QUATERNION_COLUMNS):
+        raise SceneError(path, "has part of a quaternion", "give qw, qx, qy and qz")
+    quaternions = np.column_stack([table[name] for name in _QUATERNION_COLUMNS])
+    norms = np.linalg.norm(quaternions, axis=1)
+    if not (np.abs(norms - 1) < 1e-3).all():
+        raise SceneError(path, "has quaternions of a length other than 1", "divide them by it")
+    return np.asarray(quaternions / norms[:, None])

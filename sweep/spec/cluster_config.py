@@ -1,0 +1,351 @@
+"""A cluster in one YAML file: where workers run, how many, and who may talk to them.
+
+No study names a cluster and no cluster a study: the same spec runs on any of them, to the same
+bytes.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple
+
+from pydantic import Field, PrivateAttr, TypeAdapter, ValidationError
+
+import sweep.spec.fields as declare
+from sweep.spec.fields import SpecSection
+from sweep.spec.rules import CustomRule, Finding, NumericRule, SpecError, TextRule
+from sweep.spec.yaml_document import (
+    Document,
+    drop_extensions,
+    read_document,
+    to_plain_data,
+    validation_findings,
+)
+from sweep.units import QuantityError
+
+LOOPBACK_ADDRESS = "127.0.0.1"
+NO_DASHBOARD, DASHBOARD_PORT = "none", 8787
+_WORKERS_RULE = NumericRule(
+    description="Workers", example="8", at_least="1", at_most="100000", is_integer=True
+)
+_BOUNDS_REMEDY = "write e.g. {least: 2, most: 40}"
+
+
+class WorkerBounds(NamedTuple):
+    """Workers at least and at most; the same where their number is fixed."""
+
+    least: int
+    most: int
+
+
+def _read_worker_bounds(raw_value: object) -> WorkerBounds:
+    """Read a number of workers, or bounds that it is kept within."""
+    if not isinstance(raw_value, Mapping):
+        try:
+            return WorkerBounds(_WORKERS_RULE.read(raw_value), _WORKERS_RULE.read(raw_value))
+        except QuantityError as error:
+            raise QuantityError(error.rule, "write e.g. 8 or {least: 2, most: 40}") from None
+    if raw_value.keys() != {"least", "most"}:
+        raise QuantityError("must have a least and a most", _BOUNDS_REMEDY)
+    bounds = {}
+    for name in ("least", "most"):
+        try:
+            bounds[name] = _WORKERS_RULE.read(raw_value[name])
+        except QuantityError as error:
+            raise QuantityError(f"has a {name} that {error.rule}", _BOUNDS_REMEDY) from None
+    if bounds["least"] > bounds["most"]:
+        raise QuantityError("has a least above its most", "write the smaller number as least")
+    return WorkerBounds(**bounds)
+
+
+def _read_environment(raw_value: object) -> dict[str, str]:
+    """Environment variables by name."""
+    remedy = "write e.g. {TMPDIR: /scratch}"
+    if not isinstance(raw_value, Mapping):
+        raise QuantityError("must be a mapping of names to values", remedy)
+    for name, value in raw_value.items():
+        if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", str(name)):
+            raise QuantityError(f"holds '{name}', which is no name of a variable", remedy)
+        if isinstance(value, bool) or not isinstance(value, str | int | float):
+            raise QuantityError(f"holds no text for {name}", remedy)
+        if re.search(r"[\n\r\0']", str(value)):
+            raise QuantityError(f"holds a quote or more than a line for {name}", remedy)
+    return {str(name): str(value) for name, value in raw_value.items()}
+
+
+_LINE_TEXT_ARGUMENTS = {
+    "description": "One line",
+    "pattern": r"[^\n\r\0]{1,2000}",
+    "remedy": "write one line",
+}
+_TEXTS_MAX = 100_000
+_MEMORY_ARGUMENTS = ("byte", "4 GB", "64 MB", "100 TB")
+
+
+class Security(SpecSection):
+    """Certificates with which all parts know each other, in PEM: traffic is TLS throughout."""
+
+    ca: str = declare.file_path("Certificate of the authority that signed the others")
+    certificate: str = declare.file_path("Certificate of scheduler, workers and client")
+    key: str = declare.file_path("Its private key")
+
+
+class LocalWorkerConfig(SpecSection):
+    """One worker process of this machine."""
+
+    threads: int = declare.count(
+        "Threads, each with a block of its own", "1", at_most="1000", default=1
+    )
+    memory: float | None = declare.quantity(
+        "Memory that it may take; without one, its share of 90 % of it",
+        *_MEMORY_ARGUMENTS,
+        default=None,
+    )
+
+
+class WorkerConfig(LocalWorkerConfig):
+    """One worker process."""
+
+    memory: float = declare.quantity("Memory that it may take", *_MEMORY_ARGUMENTS)
+
+
+class SchedulerConfig(SpecSection):
+    """Address of the scheduler, which listens to this machine alone unless told otherwise."""
+
+    host: str = declare.word("Address that workers reach it by", "10.0.0.5", "")
+    interface: str = declare.word("Or the network interface that it has", "ib0", "")
+    port: int = declare.count("Port; 0 for any", "8786", "0", "65535", default=0)
+    dashboard: str = declare.text(
+        "Port of Dask's dashboard, 0 for any; none: no dashboard. It has no password, and listens "
+        "to this machine alone: all users of this machine can see it",
+        NO_DASHBOARD,
+        pattern=rf"{NO_DASHBOARD}|((localhost|127\.0\.0\.1):)?[0-9]{{1,5}}",
+        remedy=f"write a port, such as {DASHBOARD_PORT}. It listens to this machine alone; "
+        f"`ssh -L {DASHBOARD_PORT}:{LOOPBACK_ADDRESS}:{DASHBOARD_PORT} HOST` shows it on another",
+    )
+
+
+class BatchJobConfig(SpecSection):
+    """One job of a batch system, with one worker or several."""
+
+    workers: int = declare.count("Workers of one job", "8", at_most="1000", default=1)
+    walltime: float = declare.duration(
+        "Time that a job may take; workers leave before it", "2 h", "1 min", "365 d"
+    )
+    queue: str = declare.word("Queue or partition", "normal", "")
+    account: str = declare.word("Account that is charged", "lidar", "")
+    directives: tuple[str, ...] = declare.list_of(
+        TextRule(**_LINE_TEXT_ARGUMENTS, example="--exclusive"), 0, _TEXTS_MAX, (),
+        description="Further options of the job", noun="texts",
+    )  # fmt: skip
+    prologue: tuple[str, ...] = declare.list_of(
+        TextRule(**_LINE_TEXT_ARGUMENTS, example="module load python/3.12"), 0, _TEXTS_MAX, (),
+        description="Shell lines before the worker starts", noun="texts",
+    )  # fmt: skip
+    logs: str = declare.word("Directory for what jobs print", "logs", "logs")
+
+
+class ClusterConfig(SpecSection):
+    """Base of all clusters."""
+
+    security: Security | None = None
+
+    _base: Path = PrivateAttr(default=Path())
+
+    def resolve_path(self, raw_path: str) -> str:
+        """Path of a file that the cluster's file names."""
+        return str(self._base / os.path.expanduser(raw_path))  # an unknown ~user stays as it is
+
+    def certificate_paths(self) -> tuple[str, str, str] | None:
+        """Paths of authority, certificate and key; None without security."""
+        security = self.security
+        if security is None:
+            return None
+        ca, certificate, key = map(
+            self.resolve_path, (security.ca, security.certificate, security.key)
+        )
+        return ca, certificate, key
+
+
+class StartedClusterConfig(ClusterConfig):
+    """Base of clusters whose workers are started here."""
+
+    environment: dict[str, str] = declare.field_of_rule(
+        CustomRule(description="Environment variables of workers", reader=_read_environment), {}
+    )
+
+
+class LocalClusterConfig(StartedClusterConfig):
+    """Processes of this machine."""
+
+    kind: Literal["local"]
+    workers: WorkerBounds | None = declare.field_of_rule(
+        CustomRule(description="Workers; without a number, one a core", reader=_read_worker_bounds),
+        None,
+    )
+    worker: LocalWorkerConfig = LocalWorkerConfig()
+    scheduler: SchedulerConfig = SchedulerConfig()
+
+
+class ExistingSchedulerConfig(ClusterConfig):
+    """A Dask scheduler that runs already."""
+
+    kind: Literal["scheduler"]
+    address: str = declare.text(
+        "Address of the scheduler",
+        pattern=r"(tcp|tls|ucx)://\S+:\d+",
+        remedy="write e.g. 'tcp://10.0.0.5:8786', or tls:// with a security section",
+    )
+
+
+class SSHClusterConfig(StartedClusterConfig):
+    """Machines that are reached by SSH."""
+
+    kind: Literal["ssh"]
+    hosts: tuple[str, ...] = declare.list_of(
+        declare.word_rule("A host", "node1"), 1, _TEXTS_MAX, description="Machines", noun="texts"
+    )
+    workers: WorkerBounds = declare.field_of_rule(
+        CustomRule(description="Workers, dealt out over the machines", reader=_read_worker_bounds)
+    )
+    worker: WorkerConfig
+    scheduler: SchedulerConfig
+    user: str = declare.word("User there; without one, as here", "lidar", "")
+    port: int = declare.count("Port of SSH", "22", at_most="65535", default=22)
+    identity: str = declare.file_path("Private key to log in with; without one, as ssh does", "")
+    known_hosts: str = declare.file_path("Keys of known machines; without one, as ssh does", "")
+    python: str = declare.word("Python there; without one, the path of this one", "python", "")
+
+
+class BatchClusterConfig(StartedClusterConfig):
+    """Jobs of a batch system."""
+
+    workers: WorkerBounds = declare.field_of_rule(
+        CustomRule(description="Workers, in whole jobs", reader=_read_worker_bounds)
+    )
+    worker: WorkerConfig
+    job: BatchJobConfig
+    scheduler: SchedulerConfig
+    python: str = declare.word(
+        "Python of the jobs; without one, the path of this one", "python", ""
+    )
+
+
+class SlurmClusterConfig(BatchClusterConfig):
+    """Jobs of SLURM."""
+
+    kind: Literal["slurm"]
+
+
+class PBSClusterConfig(BatchClusterConfig):
+    """Jobs of PBS."""
+
+    kind: Literal["pbs"]
+
+
+class Volume(SpecSection):
+    """A persistent volume that all pods and this machine see, for stores and scenes."""
+
+    claim: str = declare.word("Its claim", "studies")
+    path: str = declare.word("Where it is mounted, the same as here", "/data")
+
+
+class KubernetesClusterConfig(StartedClusterConfig):
+    """Pods that the Dask operator of a Kubernetes cluster starts."""
+
+    kind: Literal["kubernetes"]
+    workers: WorkerBounds = declare.field_of_rule(
+        CustomRule(description="Workers, a pod each", reader=_read_worker_bounds)
+    )
+    worker: WorkerConfig
+    image: str = declare.word("Image with sweep in it", "registry.example.org/sweep:0.1.0")
+    name: str = declare.text(
+        "Name of the cluster",
+        "sweep",
+        pattern=r"[a-z]([a-z0-9-]{0,50}[a-z0-9])?",
+        remedy="take small letters, digits and '-', such as 'sweep'",
+    )
+    namespace: str = declare.word("Namespace", "lidar", "default")
+    volume: Volume | None = None
+    secret: str = declare.word(
+        "Secret with ca.pem, certificate.pem and key.pem, where there is TLS", "sweep-tls", ""
+    )
+
+
+AnyClusterConfig = Annotated[
+    LocalClusterConfig
+    | ExistingSchedulerConfig
+    | SSHClusterConfig
+    | SlurmClusterConfig
+    | PBSClusterConfig
+    | KubernetesClusterConfig,
+    Field(discriminator="kind"),
+]
+_CLUSTER_ADAPTER: TypeAdapter[AnyClusterConfig] = TypeAdapter(AnyClusterConfig)
+
+
+def load_cluster_config(path: str | Path) -> AnyClusterConfig:
+    """Cluster that a YAML file describes, or a `SpecError` with every mistake in it."""
+    return _read_cluster_config(read_document(Path(path)), Path(path).absolute().parent)
+
+
+def cluster_config_from_mapping(
+    mapping: Mapping[str, Any], *, base: Path | str = "."
+) -> AnyClusterConfig:
+    """Cluster from plain data, written as in a file whose folder is `base`."""
+    return _read_cluster_config(
+        Document(drop_extensions(to_plain_data(mapping))), Path(base).absolute()
+    )
+
+
+def _read_cluster_config(document: Document, base: Path) -> AnyClusterConfig:
+    findings = document.findings
+    try:
+        cluster = _CLUSTER_ADAPTER.validate_python(document.content)
+    except ValidationError as error:
+        findings += validation_findings(error, AnyClusterConfig)
+    else:
+        cluster._base = base
+        findings += _cluster_findings(cluster)
+    if findings:
+        raise SpecError(document.to_mistakes(findings))
+    return cluster
+
+
+def _cluster_findings(cluster: AnyClusterConfig) -> Iterator[Finding]:
+    """Mistakes in a cluster beyond its single fields."""
+    for name, path in zip(Security.model_fields, cluster.certificate_paths() or (), strict=False):
+        if not Path(path).is_file():
+            remedy = "make certificates with 'sweep certificates DIRECTORY'"
+            yield Finding(("security", name), "names a file that is not there", remedy, path)
+    if isinstance(cluster, LocalClusterConfig | SSHClusterConfig | BatchClusterConfig):
+        yield from _scheduler_findings(
+            cluster.scheduler, is_remote=not isinstance(cluster, LocalClusterConfig)
+        )
+    if isinstance(cluster, ExistingSchedulerConfig):
+        address, is_encrypted = cluster.address, cluster.address.startswith("tls://")
+        if is_encrypted and not cluster.security:
+            problem = "is encrypted, and no certificates are given"
+            yield Finding(("address",), problem, "add a security section", address)
+        if cluster.security and not is_encrypted:
+            problem = "is not encrypted, for all that there are certificates"
+            yield Finding(("address",), problem, "write 'tls://...'", address)
+    if isinstance(cluster, SSHClusterConfig) and cluster.workers.least < cluster.workers.most:
+        problem = "must be a number: machines reached by SSH are there or not"
+        yield Finding(("workers",), problem, f"write {cluster.workers.most}")
+    if isinstance(cluster, KubernetesClusterConfig) and bool(cluster.secret) != bool(
+        cluster.security
+    ):
+        problem = "goes with the security section: pods have their certificates from it"
+        yield Finding(("secret",), problem, "give both, or none")
+
+
+def _scheduler_findings(scheduler: SchedulerConfig, *, is_remote: bool) -> Iterator[Finding]:
+    if scheduler.host and scheduler.interface:
+        yield Finding(("scheduler",), "has both a host and an interface", "keep one of them")
+    elif is_remote and not (scheduler.host or scheduler.interface):
+        problem = "must say where workers on other machines reach it"
+        yield Finding(("scheduler",), problem, "write e.g. 'interface: ib0' or 'host: 10.0.0.5'")

@@ -1,0 +1,129 @@
+"""Differences of two studies, told in words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from fractions import Fraction
+from functools import cache
+from types import MappingProxyType
+from typing import Any
+
+import sweep.spec.fields as spec_fields
+from sweep.spec.flight_sections import AnyScanner, Platform, beam_rule
+from sweep.spec.rules import Rule
+from sweep.spec.scene_sections import ErrorFloor, Navigation, Scene, SceneDraws, SceneStorage
+from sweep.spec.sections import MODEL_BY_SECTION
+from sweep.units import read_unit
+
+LISTED_VALUES_MAX = 8
+"""Values of an axis that are told one by one."""
+SHOWN_CHARACTERS_MAX = 200
+"""Characters of a word that are told."""
+SCENE_SECTIONS: spec_fields.ModelClasses = (
+    Scene,
+    Platform,
+    ErrorFloor,
+    Navigation,
+    SceneDraws,
+    SceneStorage,
+    *spec_fields.models_of_annotation(AnyScanner),
+)
+"""Sections that studies of scenes alone have."""
+
+
+@cache
+def rules_by_field_name() -> MappingProxyType[str, Rule]:
+    """Rule of every field by its name: one name has one unit wherever it stands."""
+    return MappingProxyType({
+        name: rule
+        for model in spec_fields.reachable_models(*MODEL_BY_SECTION.values(), *SCENE_SECTIONS)
+        for name, field in spec_fields.fields_by_name(model).items()
+        if (rule := spec_fields.rule_of_field(field))
+    })  # fmt: skip
+
+
+def describe_differences(a: Any, b: Any) -> list[str]:
+    """Lines ``path: value -> value`` for each difference between two specs or their identities."""
+    identities = (
+        identity if isinstance(identity, Mapping) else identity.identity() for identity in (a, b)
+    )
+    left, right = (_flatten_identity(spec_fields.to_canonical(identity)) for identity in identities)
+    lines = []
+    for path in [*left, *(path for path in right if path not in left)]:
+        if left.get(path) != right.get(path):
+            old_text, new_text = (
+                _format_leaf(path, identity.get(path)) for identity in (left, right)
+            )
+            lines.append(f"{path}: {old_text} -> {new_text}")
+    return lines
+
+
+def _flatten_identity(identity: Mapping[str, Any]) -> dict[str, Any]:
+    """Leaves of an identity by dotted path; the values of an axis count as one leaf."""
+    leaves: dict[str, Any] = dict(identity.get("parameters", {}))
+    for key, value in identity.items():
+        if key == "axes":
+            leaves["axes"] = [axis["name"] for axis in value]
+            for axis in value:
+                leaves |= {
+                    f"axes.{axis['name']}.{path}": parameter_content
+                    for path, parameter_content in axis["members"].items()
+                }
+        elif isinstance(value, Mapping) and key != "parameters":
+            leaves |= {f"{key}.{inner_name}": leaf for inner_name, leaf in value.items()}
+        elif key != "parameters":
+            leaves[key] = value
+    return leaves
+
+
+def _format_leaf(path: str, value: Any) -> str:
+    """Format a leaf of an identity in words."""
+    rule = rules_by_field_name().get(path.rsplit(".", 1)[-1])
+    if value is None:
+        return "(none)"
+    if isinstance(value, str):
+        return (
+            value if len(value) <= SHOWN_CHARACTERS_MAX else f"{value[:SHOWN_CHARACTERS_MAX]} ..."
+        )
+    if path in ("axes", "objects"):
+        return ", ".join(value) or "(none)"
+    if isinstance(value, list) and path.endswith(".beams"):
+        return "[" + ", ".join(_format_list(beam_rule(beam), beam) for beam in value) + "]"
+    if isinstance(value, Mapping) and "values" in value:
+        return _format_list(rule, value["values"])
+    if isinstance(value, Mapping):
+        first, last = (_format_number(rule, value[end]) for end in ("first", "last"))
+        ends_text = f"{first} to {last}{_unit_suffix(rule)}"
+        return f"{value['number']} values from {ends_text} (digest {value['digest'][:8]})"
+    return (
+        _format_list(rule, value)
+        if isinstance(value, list)
+        else _format_number(rule, value) + _unit_suffix(rule)
+    )
+
+
+def _format_list(rule: Rule | None, values: Sequence[Any]) -> str:
+    """Values of a field in a row, the first and last where they are many."""
+    texts = [_format_number(rule, value) for value in values]
+    if len(texts) > LISTED_VALUES_MAX:
+        texts = [*texts[:2], "...", texts[-1], f"{len(texts)} in all"]
+    return f"[{', '.join(texts)}]{_unit_suffix(rule)}"
+
+
+def _unit_suffix(rule: Rule | None) -> str:
+    """Units that a field is told in, behind a space: of angles those of its example, else SI."""
+    unit_name = "" if rule is None else rule.value_unit
+    if rule is not None and unit_name.startswith("rad"):
+        unit_name = rule.example.split(",")[0].split()[-1].strip("]")
+    return f" {unit_name}" if unit_name else ""
+
+
+def _format_number(rule: Rule | None, value: Any) -> str:
+    """Value in SI as it is told: of an angle what reads back as it."""
+    unit_name = _unit_suffix(rule).strip()
+    if rule is None or unit_name == rule.value_unit or isinstance(value, str):
+        return repr(value) if isinstance(value, float) else str(value)
+    unit = read_unit(unit_name, si_unit=rule.value_unit, example=rule.example)
+    number = value / float(unit.factor)
+    text = f"{number:.15g}"
+    return text if unit.to_si(Fraction(text)) == value else repr(number)

@@ -1,0 +1,547 @@
+"""The figures and tables that a study makes of its results, over a grid or of a scene.
+
+They are held against the study that they draw: its coordinates, stored quantities, scanners, draws.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import Field
+
+import sweep.spec.fields as declare
+from sweep.model import outputs
+from sweep.spec.axes import Axis
+from sweep.spec.fields import SpecSection, read_or_none
+from sweep.spec.flight_sections import AnyScanner, shots_per_cycle
+from sweep.spec.rules import ChoiceRule, CustomRule, Finding, Location, suggest_similar_name
+from sweep.spec.scene_sections import SceneDraws
+from sweep.spec.sections import SPECTRA_METHOD, parameter_rules
+from sweep.units import QuantityError, read_number
+
+CoordinateSelection = str | int | float | tuple[str | int | float, ...]
+PublishedNumbers = tuple[Any, ...]
+CropLimits = tuple[float, ...]
+
+
+def _read_selection(raw_value: object) -> dict[str, CoordinateSelection]:
+    """Coordinates with one value or several each, as written."""
+    if not isinstance(raw_value, dict):
+        problem = "must be a mapping of coordinates to values"
+        raise QuantityError(problem, "write e.g. {grazing_angle: 15 deg}")
+    return {
+        str(name): tuple(map(_read_selected_value, value))
+        if value and isinstance(value, list | tuple)
+        else _read_selected_value(value)
+        for name, value in raw_value.items()
+    }
+
+
+def _read_selected_value(raw_value: object) -> str | int | float:
+    """One value, as written."""
+    if isinstance(raw_value, bool) or not isinstance(raw_value, str | int | float):
+        raise QuantityError("must hold a value, or a list of values, of each coordinate")
+    return raw_value
+
+
+def _read_published_numbers(raw_value: object) -> PublishedNumbers:
+    """Numbers, nested as written."""
+    if not isinstance(raw_value, list | tuple):
+        raise QuantityError("must be a list of numbers or of rows of numbers")
+    return tuple(
+        _read_published_numbers(raw_element)
+        if isinstance(raw_element, list | tuple)
+        else _read_number(raw_element)
+        for raw_element in raw_value
+    )
+
+
+def _read_number(raw_value: object) -> float:
+    value, unit = read_number(raw_value)
+    return unit.to_si(value)
+
+
+_VALUE_SCHEMA = {"type": ["string", "number"]}
+_VALUES_SCHEMA = {"type": "array", "items": _VALUE_SCHEMA, "minItems": 1}
+_SELECTION_RULE = CustomRule(
+    description="Values of coordinates that the figure is confined to",
+    reader=_read_selection,
+    value_schema={
+        "type": "object",
+        "additionalProperties": {"anyOf": [_VALUE_SCHEMA, _VALUES_SCHEMA]},
+        "examples": [{"grazing_angle": "15 deg"}],
+    },
+)
+_NUMBER_SCHEMA = {"type": ["number", "string"]}
+_PUBLISHED_NUMBERS_RULE = CustomRule(
+    description="The numbers as published, row by row, to stand beside ours",
+    reader=_read_published_numbers,
+    value_schema={
+        "type": "array",
+        "items": {"anyOf": [_NUMBER_SCHEMA, {"type": "array", "items": _NUMBER_SCHEMA}]},
+    },
+)
+
+
+def _name_field(description: str, example: str, default: Any = ...) -> Any:
+    """Name of something in a store."""
+    pattern = r"[A-Za-z_][A-Za-z0-9_]{0,99}"
+    return declare.text(
+        f"Name of {description}", default, pattern=pattern, remedy=f"take {example}"
+    )
+
+
+def _coordinate_field(default: Any = ...) -> Any:
+    example = "the last part of an axis's path, such as 'range'"
+    return _name_field("a coordinate: the last part of an axis's path", example, default)
+
+
+_VARIABLE_FIELD = _name_field(
+    "a stored quantity, such as pd_shot", "a stored quantity, such as 'pd_shot'"
+)
+
+
+class FigureBase(SpecSection):
+    """Base of all figures."""
+
+    FILE_NAME_PARTS: ClassVar[tuple[str, ...]] = ("kind",)
+    """Fields whose values make the file's name, and words between them."""
+
+    name: str = declare.text(
+        "Stem of the picture's file name",
+        "",
+        pattern=r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}",
+        remedy="take letters, digits, '_', '-' and '.'",
+    )
+    title: str = declare.text("Title of the figure", "")
+
+    @property
+    def file_stem(self) -> str:
+        """Stem of the picture's file name."""
+        words = [
+            getattr(self, name_part, name_part) for name_part in (*self.FILE_NAME_PARTS, "kind")
+        ]
+        return self.name or "_".join(str(name_part) for name_part in words if name_part is not None)
+
+
+# Figures of grids
+
+
+class GridFigureBase(FigureBase):
+    """Base of figures of grids."""
+
+
+_LEVEL_RULE = declare.quantity_rule("Level, in the quantity's unit", "", "0.9", "-1e30", "1e30")
+
+
+class SurfaceFigure(GridFigureBase):
+    """A quantity over two coordinates, seen from above."""
+
+    FILE_NAME_PARTS = ("variable",)
+    kind: Literal["surface"]
+    variable: str = _VARIABLE_FIELD
+    x: str = _coordinate_field()
+    y: str = _coordinate_field()
+    where: dict[str, CoordinateSelection] = declare.field_of_rule(_SELECTION_RULE, {})
+    levels: tuple[float, ...] = declare.list_of(
+        _LEVEL_RULE, 1, 10, (), description="Levels at which contours are drawn", increasing=True
+    )
+
+
+class SlicesFigure(GridFigureBase):
+    """A quantity along one coordinate, a line for each value of another."""
+
+    FILE_NAME_PARTS = ("variable",)
+    kind: Literal["slices"]
+    variable: str = _VARIABLE_FIELD
+    x: str = _coordinate_field()
+    by: str = _coordinate_field("")
+    where: dict[str, CoordinateSelection] = declare.field_of_rule(_SELECTION_RULE, {})
+    levels: tuple[float, ...] = declare.list_of(
+        _LEVEL_RULE,
+        1,
+        10,
+        (),
+        description="Levels at which lines are drawn across",
+        increasing=True,
+    )
+
+
+class TableFigure(GridFigureBase):
+    """A quantity averaged over all but rows and columns."""
+
+    FILE_NAME_PARTS = ("variable",)
+    kind: Literal["table"]
+    variable: str = _VARIABLE_FIELD
+    rows: str = _coordinate_field()
+    columns: str = _coordinate_field("")
+    where: dict[str, CoordinateSelection] = declare.field_of_rule(_SELECTION_RULE, {})
+    minimum_range: float = declare.length(
+        "Nearer ranges are left out", "5 m", "0 m", "1e15 m", default=0.0
+    )
+    printed: PublishedNumbers = declare.field_of_rule(_PUBLISHED_NUMBERS_RULE, ())
+
+
+class FalseAlarmTable(GridFigureBase):
+    """False alarms of a shot over the three cuts of Tables 4.3 to 4.5, a row for each value.
+
+    Columns are 15 deg, 85 deg and 3500 m; ranges up to 5 m are left out.
+    """
+
+    kind: Literal["false_alarm_table"]
+    by: str = _coordinate_field()
+    printed: PublishedNumbers = declare.field_of_rule(_PUBLISHED_NUMBERS_RULE, ())
+
+
+class ThresholdTable(GridFigureBase):
+    """False alarms of a bin for each threshold, as in Table 4.2."""
+
+    kind: Literal["threshold_table"]
+    by: str = _coordinate_field("tnr")
+    printed: PublishedNumbers = declare.field_of_rule(_PUBLISHED_NUMBERS_RULE, ())
+
+
+GridFigure = Annotated[
+    SurfaceFigure | SlicesFigure | TableFigure | FalseAlarmTable | ThresholdTable,
+    Field(discriminator="kind"),
+]
+
+# Figures of scenes
+
+_FIGURE_OUTPUTS = outputs.SHOTS | outputs.STATISTICS | outputs.POINTS
+FIGURE_QUANTITIES = (
+    *(name for name, output in _FIGURE_OUTPUTS.items() if outputs.XYZ not in output.dims),
+    "altitude", "x", "y", "z", "shot",
+)  # fmt: skip
+"""Quantities of shots and of points that a figure can show."""
+
+SEVERAL_SURFACES_KEYWORD = "several_surfaces"
+_VIEW_WORD_RULE = ChoiceRule(
+    description="Where from", options=("oblique", "above", "side", "front")
+)
+_EYE_ANGLE_RULES = {
+    "azimuth": declare.quantity_rule("Of the eye, from x towards y", "rad", "-60 deg"),
+    "elevation": declare.quantity_rule("Above the horizon", "rad", "30 deg", "-90 deg", "90 deg"),
+}
+
+
+def _read_view(raw_value: object) -> str | dict[str, float]:
+    """Read a word, or azimuth and elevation of the eye [rad]."""
+    if not isinstance(raw_value, dict):
+        return _VIEW_WORD_RULE.read(raw_value)
+    if set(raw_value) != set(_EYE_ANGLE_RULES):
+        problem = "must be a word or have an azimuth and an elevation"
+        raise QuantityError(problem, "write e.g. {azimuth: -60 deg, elevation: 30 deg}")
+    return {name: problem.read(raw_value[name]) for name, problem in _EYE_ANGLE_RULES.items()}
+
+
+_VIEW_RULE = CustomRule(
+    description=_VIEW_WORD_RULE.description,
+    reader=_read_view,
+    value_schema={
+        "anyOf": [
+            {"type": "string", "enum": list(_VIEW_WORD_RULE.options)},
+            {
+                "type": "object",
+                "properties": {name: rule.schema() for name, rule in _EYE_ANGLE_RULES.items()},
+                "required": list(_EYE_ANGLE_RULES),
+                "additionalProperties": False,
+            },
+        ]
+    },
+)
+
+
+def _quantity_field(description: str, default: Any = ...) -> Any:
+    """Declare a quantity of shots or points."""
+    remedy = "take range, radial_velocity, snr, pd, surface, beam, time or altitude"
+    problem = "is no quantity of shots or points"
+    return declare.field_of_rule(
+        ChoiceRule(
+            description=description, options=FIGURE_QUANTITIES, problem=problem, remedy=remedy
+        ),
+        default,
+    )
+
+
+def _crop_field(axis: str) -> Any:
+    """Part of the scene along an axis."""
+    rule = declare.quantity_rule("Coordinate", "m", "100 m")
+    return declare.list_of(rule, 2, 2, None, description=f"Part along {axis}", increasing=True)
+
+
+_SCANNER_FIELD = declare.name("Scanner; the first by default", None)
+_RANGES_FIELD = declare.choice(
+    "By whole bins, or interpolated between them", ("quantised", "interpolated")
+)
+_DRAW_FIELD = declare.count("Number of the draw, from 0", "0", "0", "1e9", default=0)
+_TIME_FIELD = declare.list_of(
+    declare.quantity_rule("Time", "s", "10 s", "0 s", "1e8 s"), 2, 2, None,
+    description="Part of the flight's time", increasing=True,
+)  # fmt: skip
+
+
+class SceneFigureBase(FigureBase):
+    """Base of figures of scenes."""
+
+    where: dict[str, CoordinateSelection] = declare.field_of_rule(_SELECTION_RULE, {})
+
+
+class CloudFigure(SceneFigureBase):
+    """A point cloud."""
+
+    FILE_NAME_PARTS = ("scanner", "colour")
+    kind: Literal["cloud"]
+    scanner: str | None = _SCANNER_FIELD
+    colour: str = _quantity_field("What colours the points", "range")
+    ranges: str = _RANGES_FIELD
+    view: str | dict[str, float] = declare.field_of_rule(_VIEW_RULE, "oblique")
+    x: CropLimits | None = _crop_field("x")
+    y: CropLimits | None = _crop_field("y")
+    z: CropLimits | None = _crop_field("z")
+    time: CropLimits | None = _TIME_FIELD
+    terrain: bool = declare.flag("Whether to draw the ground", default=True)
+    path: bool = declare.flag("Whether to draw the flight path", default=False)
+    dropouts: bool = declare.flag("Whether to mark shots without a point", default=False)
+    draw: int = _DRAW_FIELD
+
+
+class ScatterFigure(SceneFigureBase):
+    """A quantity of shots or points over another."""
+
+    FILE_NAME_PARTS = ("scanner", "y", "over", "x")
+    kind: Literal["scatter"]
+    scanner: str | None = _SCANNER_FIELD
+    x: str = _quantity_field("Quantity along x", "time")
+    y: str = _quantity_field("Quantity along y")
+    colour: str = _quantity_field("What colours the points", "beam")
+    ranges: str = _RANGES_FIELD
+    time: CropLimits | None = _TIME_FIELD
+    draw: int = _DRAW_FIELD
+
+
+class ShotSpectraFigure(SceneFigureBase):
+    """The three spectra of one shot, with threshold, noise and detections."""
+
+    FILE_NAME_PARTS = ("scanner", "shot")
+    kind: Literal["shot_spectra"]
+    scanner: str | None = _SCANNER_FIELD
+    shot: int | str = declare.count(
+        "Number of the shot, from 0, or the first whose footprint has several surfaces",
+        "0", "0", "1e15", keyword=SEVERAL_SURFACES_KEYWORD, default=SEVERAL_SURFACES_KEYWORD,
+    )  # fmt: skip
+    draw: int = _DRAW_FIELD
+
+
+class _NavigationFigureBase(SceneFigureBase):
+    """Base of figures and tables of navigation."""
+
+    FILE_NAME_PARTS = ("quantity", "show")
+    scanners: tuple[str, ...] | None = declare.list_of(
+        declare.name_rule("Scanner", "three"), 1, 10_000, None,
+        description="Scanners; all by default", noun="names", distinct=True,
+    )  # fmt: skip
+    quantity: str = declare.choice("Velocity vector or altitude", ("velocity", "altitude"))
+    show: str = declare.choice("Which statistics", ("all", "availability", "bias", "rmse"))
+    bins: int = declare.count("Bins of altitude", "12", "1", "1000", default=12)
+
+
+class NavigationFigure(_NavigationFigureBase):
+    """Statistics of navigation over altitude, a line a scanner."""
+
+    kind: Literal["navigation"]
+
+
+class NavigationTable(_NavigationFigureBase):
+    """Statistics of navigation over altitude, as a table."""
+
+    kind: Literal["navigation_table"]
+
+
+SceneFigure = Annotated[
+    CloudFigure | ScatterFigure | ShotSpectraFigure | NavigationFigure | NavigationTable,
+    Field(discriminator="kind"),
+]
+
+# What is wrong with figures
+
+_COORDINATE_FIELDS = ("x", "y", "by", "rows", "columns")
+"""Fields of a grid's figure that name a coordinate."""
+
+NAVIGATION_SHOTS_MIN = 3
+"""Shots of a cycle from which on there is navigation."""
+
+
+def grid_figure_findings(
+    raw_spec: Mapping[str, Any], axes: tuple[Axis, ...], extra_variables: Collection[str] = ()
+) -> Iterator[Finding]:
+    """Mistakes in the figures of a grid's study; ``extra_variables`` names what it stores too."""
+    draws = raw_spec.get("draws")
+    for location, figure in _iter_readable_figures(raw_spec, GridFigure):
+        yield from _coordinate_findings(figure, axes, location)
+        if isinstance(draws, Mapping) and draws.get("method") == SPECTRA_METHOD:
+            yield from _spectra_findings(figure, location)
+        else:
+            yield from _variable_findings(figure, draws, extra_variables, location)
+    yield from _name_findings(raw_spec, GridFigure, "makes the same picture file as another")
+
+
+def scene_figure_findings(
+    raw_spec: Mapping[str, Any], axes: tuple[Axis, ...] | None
+) -> Iterator[Finding]:
+    """Mistakes in the figures of a scene's study, as written; axes None where unreadable."""
+    scanners = raw_spec.get("scanners")
+    scanners = scanners if isinstance(scanners, Mapping) else {}
+    for location, figure in _iter_readable_figures(raw_spec, SceneFigure):
+        yield from _scanner_findings(figure, scanners, location)
+        yield from () if axes is None else _coordinate_findings(figure, axes, location)
+        yield from _draw_findings(figure, raw_spec.get("draws"), location)
+    yield from _name_findings(raw_spec, SceneFigure, "makes the same file as another")
+
+
+def _iter_readable_figures(
+    raw_spec: Mapping[str, Any], annotation: Any
+) -> Iterator[tuple[Location, Any]]:
+    """Figures that can be read, each with its location."""
+    figures = raw_spec.get("figures")
+    for i, raw_figure in enumerate(figures if isinstance(figures, list | tuple) else ()):
+        if (figure := read_or_none(annotation, raw_figure)) is not None:
+            yield ("figures", i), figure
+
+
+def _name_findings(raw_spec: Mapping[str, Any], annotation: Any, problem: str) -> Iterator[Finding]:
+    """Figures that share a file."""
+    stems: set[str] = set()
+    for location, figure in _iter_readable_figures(raw_spec, annotation):
+        if figure.file_stem in stems:
+            yield Finding(location, f"{problem}, {figure.file_stem}", "give it a name")
+        stems.add(figure.file_stem)
+
+
+def _coordinate_findings(
+    figure: Any, axes: tuple[Axis, ...], figure_location: Location
+) -> Iterator[Finding]:
+    """Coordinates that no axis has, and values that are none, or in a scene not one, of them."""
+    is_grid_figure = isinstance(figure, GridFigureBase)
+    coordinate_names = (
+        {field: getattr(figure, field, "") for field in _COORDINATE_FIELDS}
+        if is_grid_figure
+        else {}
+    )
+    selection = getattr(figure, "where", {})
+    paths = {parameter.coordinate: parameter.path for axis in axes for parameter in axis.parameters}
+    known_names = list(dict.fromkeys([*paths, *(axis.name for axis in axes if is_grid_figure)]))
+    for field, name in (coordinate_names | {f"where.{name}": name for name in selection}).items():
+        location: Location = (*figure_location, *field.split("."))
+        values = selection[name] if field.startswith("where.") else ()
+        if name and name not in known_names:
+            remedy = (
+                f"the coordinates are {', '.join(known_names)}" if known_names else "it has no axes"
+            )
+            suggestion = suggest_similar_name(name, known_names, fallback=remedy)
+            if field in coordinate_names and field not in figure.model_fields_set:
+                problem = f"is '{name}' by default, which is no coordinate of this study"
+                yield Finding(location, problem, suggestion)
+            else:
+                yield Finding(location, "is no coordinate of this study", suggestion, name)
+        elif isinstance(values, tuple) and values and not is_grid_figure:
+            yield Finding(location, "must be one value", "make a figure for each")
+        elif name in paths:
+            for value in values if isinstance(values, tuple) else (values,):
+                try:
+                    parameter_rules()[paths[name]].read(value)
+                except QuantityError as error:
+                    yield Finding(location, error.rule, error.suggestion, value)
+
+
+def _variable_findings(
+    figure: Any, draws: object, extra_variables: Collection[str], location: Location
+) -> Iterator[Finding]:
+    """Report a variable that the study does not store."""
+    variable = getattr(figure, "variable", None)
+    amount_fields = ("number", "limit") if isinstance(draws, Mapping) else ()
+    has_draws = any(draws.get(name, 0) not in (0, "0") for name in amount_fields)  # type: ignore[attr-defined]
+    draw_variables = outputs.DRAW_OUTPUTS | outputs.ERROR_OUTPUTS | outputs.ACCURACY_OUTPUTS
+    known_variables = {*outputs.OUTPUTS, *extra_variables}
+    if (
+        variable is None
+        or variable in known_variables
+        or (has_draws and variable in draw_variables)
+    ):
+        return
+    remedy = suggest_similar_name(
+        variable, [*known_variables, *draw_variables], fallback="write e.g. 'pd_shot' or 'snr_up'"
+    )
+    problem = "is no stored quantity"
+    if variable in draw_variables:
+        problem = "is found over draws, and this study has none"
+        remedy = "set draws: {number: ...} or {limit: ...}"
+    elif variable in outputs.STRONGEST_OUTPUTS:
+        problem = "is found where segments report their strongest peak alone"
+        remedy = "set instrument.processing.peaks: strongest"
+    yield Finding((*location, "variable"), problem, remedy, variable)
+
+
+def _spectra_findings(figure: Any, location: Location) -> Iterator[Finding]:
+    """Report closed forms that a study of whole spectra does not store."""
+    stored_variables = outputs.SPECTRA_OUTPUTS | outputs.ACCURACY_OUTPUTS | outputs.DRAW_OUTPUTS
+    variable = getattr(figure, "variable", None)
+    if variable is None:
+        problem = "shows closed forms, which a study of whole spectra does not store"
+        yield Finding((*location, "kind"), problem, "take surface, slices or table", figure.kind)
+    elif variable not in stored_variables:
+        problem = "is nothing that a study of whole spectra stores"
+        yield Finding(
+            (*location, "variable"),
+            problem,
+            suggest_similar_name(variable, list(stored_variables)),
+            variable,
+        )
+
+
+def _scanner_findings(
+    figure: Any, scanners: Mapping[str, Any], location: Location
+) -> Iterator[Finding]:
+    """Scanners that the study lacks, or of too few beams for navigation."""
+    single_scanner, listed_scanners = (
+        getattr(figure, "scanner", None),
+        getattr(figure, "scanners", None) or (),
+    )
+    names_by_location: dict[Location, str] = (
+        {("scanner",): single_scanner} if single_scanner else {}
+    )
+    for relative_location, name in (
+        names_by_location | {("scanners", i): name for i, name in enumerate(listed_scanners)}
+    ).items():
+        if name not in scanners:
+            remedy = suggest_similar_name(name, scanners, fallback=f"it has {', '.join(scanners)}")
+            yield Finding(
+                (*location, *relative_location), "is no scanner of this study", remedy, name
+            )
+    if isinstance(figure, NavigationFigure | NavigationTable):
+        has_navigation = {name: _has_navigation(scanner) for name, scanner in scanners.items()}
+        for i, name in enumerate(figure.scanners or ()):
+            if has_navigation.get(name, True) is False:
+                problem = f"has fewer than {NAVIGATION_SHOTS_MIN} shots a cycle, and no navigation"
+                yield Finding((*location, "scanners", i), problem, "leave it out", name)
+        if not figure.scanners and has_navigation and not any(has_navigation.values()):
+            problem = f"needs a scanner of {NAVIGATION_SHOTS_MIN} shots a cycle or more"
+            yield Finding(location, problem, "leave it out")
+
+
+def _has_navigation(raw_scanner: object) -> bool:
+    """Return true if a scanner has enough shots a cycle for navigation, or can't be read."""
+    scanner = read_or_none(AnyScanner, raw_scanner)
+    try:
+        return scanner is None or shots_per_cycle(scanner.build_pattern()) >= NAVIGATION_SHOTS_MIN
+    except ValueError:
+        return True
+
+
+def _draw_findings(figure: Any, raw_draws: object, location: Location) -> Iterator[Finding]:
+    """Report a draw that the study does not make; none where its draws can't be read."""
+    draw, draws = getattr(figure, "draw", 0), read_or_none(SceneDraws, raw_draws or {})
+    if draws is not None and draw >= draws.number:
+        problem = f"is beyond the study's draws, 0 to {draws.number - 1}"
+        yield Finding((*location, "draw"), problem, "take one of them", draw)

@@ -1,0 +1,425 @@
+"""Movement of things and directions of beams: paths, attitudes, the platform, scan patterns."""
+
+from __future__ import annotations
+
+from decimal import Decimal
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+import sweep.spec.fields as declare
+from sweep.model.geometry import platform as motion_laws
+from sweep.model.geometry import quaternion
+from sweep.model.geometry import scanner as scan_patterns
+from sweep.model.geometry.scanner import Scanner
+from sweep.spec.fields import SpecFiles, SpecSection
+from sweep.spec.rules import Json, ListRule, Rule, read_element
+from sweep.units import QuantityError
+
+Vector = tuple[float, ...]
+TimeSpan = tuple[float, float]
+"""Start and stop of a stretch of time [s]."""
+
+
+class StraightPath(SpecSection):
+    """A straight line, the speed changing at a constant rate."""
+
+    kind: Literal["straight"]
+    begin: Vector = declare.position("Where it begins", alias="from")
+    to: Vector = declare.position("Where it ends")
+    initial_speed: float = declare.speed("Speed at the beginning")
+    final_speed: float | None = declare.speed("Speed at the end; the initial one", default=None)
+
+    def build_path(self, files: SpecFiles, span: TimeSpan | None = None) -> motion_laws.Path:
+        """Return the straight path."""
+        return motion_laws.straight(
+            begin=self.begin,
+            end=self.to,
+            initial_speed=self.initial_speed,
+            final_speed=self.final_speed,
+        )
+
+
+class AccelerationPath(SpecSection):
+    """A constant acceleration, 0 by default."""
+
+    kind: Literal["acceleration"]
+    position: Vector = declare.position("Position at the beginning")
+    velocity: Vector = declare.vector("Velocity at the beginning", "m/s", "30 m/s")
+    acceleration: Vector = declare.vector("Acceleration", "m/s^2", "1 m/s^2", default=(0, 0, 0))
+    duration: float = declare.duration("How long it lasts", at_least="1 ns")
+
+    def build_path(self, files: SpecFiles, span: TimeSpan | None = None) -> motion_laws.Path:
+        """Return the path of constant acceleration."""
+        path_class = motion_laws.ConstantAcceleration
+        return path_class(self.position, self.velocity, self.acceleration, self.duration)
+
+
+class WaypointPath(SpecSection):
+    """A path through the waypoints of a table."""
+
+    kind: Literal["waypoints"]
+    file: str = declare.file_path("CSV table with time, x, y, z and, if it likes, attitude")
+    smooth: bool = declare.flag("Join them by a cubic spline, not by straight lines", default=True)
+
+    def build_path(self, files: SpecFiles, span: TimeSpan | None = None) -> motion_laws.Path:
+        """Return the path through the file's waypoints."""
+        from sweep.scenes.scene_files import read_waypoints
+
+        table = read_waypoints(files.resolve(self.file), files.time_origin)
+        return motion_laws.Waypoints(table.time, table.position, smooth=self.smooth)
+
+
+class StationaryPath(SpecSection):
+    """No movement."""
+
+    kind: Literal["still"]
+    position: Vector = declare.position("Where it stays")
+    duration: float | None = declare.duration(
+        "How long; a target stays throughout the flight by default", at_least="1 ns", default=None
+    )
+
+    def build_path(self, files: SpecFiles, span: TimeSpan | None = None) -> motion_laws.Path:
+        """Return the path of a platform that stays in place."""
+        if self.duration is not None:
+            span = (0.0, self.duration)
+        if span is None:
+            raise ValueError("a platform that stays needs a duration")
+        return motion_laws.Waypoints(span, [self.position, self.position], smooth=False)
+
+
+AnyPath = Annotated[
+    StraightPath | AccelerationPath | WaypointPath | StationaryPath, Field(discriminator="kind")
+]
+
+
+class Orientation(SpecSection):
+    """A turn of a body against the world, or of an instrument against its body."""
+
+    heading: float = declare.angle("Of forward, from x, counter-clockwise from above", default=0.0)
+    pitch: float = declare.angle("Nose up", "10 deg", "-90 deg", "90 deg", default=0.0)
+    roll: float = declare.angle("Left side up", default=0.0)
+    quaternion: Vector | None = declare.vector(
+        "The turn as w, x, y, z, instead of angles", "", "0.5", dimensions=4, default=None
+    )
+
+    def to_quaternion(self) -> np.ndarray:
+        """Return the unit quaternion (4,); length 0, or angles given too, is a ValueError."""
+        if self.quaternion is None:
+            return quaternion.from_heading(heading=self.heading, pitch=self.pitch, roll=self.roll)
+        if any((self.heading, self.pitch, self.roll)):
+            raise ValueError("has both angles and a quaternion: leave one of them out")
+        return quaternion.normalise(np.asarray(self.quaternion))
+
+
+class NadirAttitude(SpecSection):
+    """Level, so that a beam along -z points straight down."""
+
+    kind: Literal["nadir"]
+    heading: float | str = declare.angle(
+        "Of forward, from x, counter-clockwise from above; 'track' follows the path",
+        keyword="track", keyword_value="track", default=0.0,
+    )  # fmt: skip
+
+    def build_attitude(self, files: SpecFiles, path: Any) -> motion_laws.Attitude:
+        """Return the law of attitude."""
+        return motion_laws.Nadir(None if self.heading == "track" else float(self.heading))
+
+
+class AlongTrackAttitude(SpecSection):
+    """Forward along the velocity."""
+
+    kind: Literal["along_track"]
+    roll: float = declare.angle("Left side up", default=0.0)
+
+    def build_attitude(self, files: SpecFiles, path: Any) -> motion_laws.Attitude:
+        """Return the law of attitude."""
+        return motion_laws.AlongTrack(self.roll)
+
+
+class FixedAttitude(Orientation):
+    """One attitude throughout."""
+
+    kind: Literal["fixed"]
+
+    def build_attitude(self, files: SpecFiles, path: Any) -> motion_laws.Attitude:
+        """Return the law of attitude."""
+        return motion_laws.Fixed(self.to_quaternion())
+
+
+class SpinningAttitude(Orientation):
+    """Turning at a constant rate; the angles are those at the path's beginning."""
+
+    kind: Literal["spin"]
+    angular_velocity: Vector = declare.vector(
+        "Angular velocity about the world's axes", "rad/s", "10 deg/s"
+    )
+
+    def build_attitude(self, files: SpecFiles, path: Any) -> motion_laws.Attitude:
+        """Return the law of attitude."""
+        return motion_laws.Spin(self.angular_velocity, self.to_quaternion(), path.start)
+
+
+class TabulatedAttitude(SpecSection):
+    """The attitude of the waypoints' table."""
+
+    kind: Literal["track"]
+    file: str | None = declare.file_path(
+        "CSV table with time, position and attitude; the path's by default", None
+    )
+
+    def build_attitude(self, files: SpecFiles, path: Any) -> motion_laws.Attitude:
+        """Return the law of attitude."""
+        from sweep.scenes.scene_files import SceneError, read_waypoints
+
+        if self.file is None:
+            raise ValueError("needs a table: name its file, or take waypoints for the path")
+        table = read_waypoints(files.resolve(self.file), files.time_origin)
+        if table.attitude is None:
+            remedy = "add heading, pitch and roll, or qw, qx, qy and qz"
+            raise SceneError(self.file, "has no attitude to follow", remedy)
+        return motion_laws.Track(table.time, table.attitude)
+
+
+AnyAttitude = Annotated[
+    NadirAttitude | AlongTrackAttitude | FixedAttitude | SpinningAttitude | TabulatedAttitude,
+    Field(discriminator="kind"),
+]
+
+
+class RigidMotion(SpecSection):
+    """Rigid movement of a target."""
+
+    path: AnyPath
+    attitude: AnyAttitude = FixedAttitude(kind="fixed")
+
+    def build_flight(self, files: SpecFiles, span: TimeSpan | None = None) -> motion_laws.Flight:
+        """Movement of the body; one that stays does so throughout `span`."""
+        path = self.path.build_path(files, span)
+        return motion_laws.Flight(path, self.build_attitude(files, path))
+
+    def build_attitude(self, files: SpecFiles, path: motion_laws.Path) -> motion_laws.Attitude:
+        """Return the law of attitude along a path."""
+        attitude = self.attitude
+        if (
+            isinstance(attitude, TabulatedAttitude)
+            and attitude.file is None
+            and isinstance(self.path, WaypointPath)
+        ):
+            attitude = attitude.model_copy(update={"file": self.path.file})
+        return attitude.build_attitude(files, path)
+
+
+class Platform(RigidMotion):
+    """Carrier of the instrument, and its steadiness."""
+
+    attitude: AnyAttitude = NadirAttitude(kind="nadir")
+    lever_arm: Vector = declare.position(
+        "The instrument's position in the body frame", default=(0.0, 0.0, 0.0)
+    )
+    mounting: Orientation = Orientation()
+    jitter: float = declare.angle(
+        "Standard deviation of random turns about each body axis", "20 urad", "0 rad", "10 deg",
+        default=0.0,
+    )  # fmt: skip
+
+    def read_time_origin(self, files: SpecFiles) -> Decimal:
+        """Time [s] in tables at which the flight begins: the first of the path's table, or 0."""
+        from sweep.scenes.scene_files import read_first_time
+
+        if not isinstance(self.path, WaypointPath):
+            return Decimal(0)
+        return read_first_time(files.resolve(self.path.file))
+
+    def build_flight(self, files: SpecFiles, span: TimeSpan | None = None) -> motion_laws.Flight:
+        """Movement of the instrument."""
+        mounting = self.mounting.to_quaternion()
+        path = self.path.build_path(files, span)
+        mounted_attitude = motion_laws.Mounted(self.build_attitude(files, path), mounting)
+        # A flight's arm is told in the frame of its attitude, which is the instrument's.
+        instrument_arm = quaternion.rotate(
+            quaternion.conjugate(mounting), np.asarray(self.lever_arm, float)
+        )
+        return motion_laws.Flight(path, mounted_attitude, instrument_arm)
+
+
+# Scan patterns
+
+BEAMS_MAX = 10_000
+STEERING_ANGLES_RULE = ListRule(
+    description="Angles of a beam towards forward and towards the left",
+    element_rule=declare.quantity_rule("Angle from nadir", "rad", "22.5 deg", "-89 deg", "89 deg"),
+    length_min=2,
+    length_max=2,
+)
+_DIRECTION_VECTOR_RULE = ListRule(
+    description="Direction of a beam in the body frame",
+    element_rule=declare.quantity_rule("Component", "", "-1", "-1e9", "1e9"),
+)
+
+
+class BeamDirectionsRule(Rule):
+    """Directions of beams: angles towards forward and left, or vectors in the body frame."""
+
+    def read(self, raw_value: object) -> tuple[tuple[float, ...], ...]:
+        """Angles [rad] (two of them) or components (three) of each beam."""
+        remedy = "write e.g. [[22.5 deg, 0 deg], [0 deg, 0 deg]]"
+        if not isinstance(raw_value, list | tuple) or not 0 < len(raw_value) <= BEAMS_MAX:
+            raise QuantityError(f"must be a list of 1 to {BEAMS_MAX} beams", remedy)
+        return tuple(
+            read_element(beam_rule(raw_beam), i, raw_beam) for i, raw_beam in enumerate(raw_value)
+        )
+
+    def format(self, value: Any) -> Any:
+        """Return lists that read back as exactly `value`."""
+        return [beam_rule(beam).format(beam) for beam in value]
+
+    def _value_schema(self) -> Json:
+        beam_schema = {"anyOf": [STEERING_ANGLES_RULE.schema(), _DIRECTION_VECTOR_RULE.schema()]}
+        length_keywords = {"minItems": 1, "maxItems": BEAMS_MAX}
+        return {"type": "array", "items": beam_schema} | length_keywords
+
+
+def beam_rule(beam: object) -> ListRule:
+    """Rule of a beam, by how many numbers it has."""
+    return (
+        _DIRECTION_VECTOR_RULE
+        if isinstance(beam, list | tuple) and len(beam) == 3
+        else STEERING_ANGLES_RULE
+    )
+
+
+_NADIR_ANGLE_BOUNDS = ("0 deg", "89 deg")
+_CYCLE_RATE_FIELD = declare.frequency("Measurement cycles a second")
+_SIMULTANEOUS_INTERVAL_FIELD = declare.duration(
+    "Time from one beam of a cycle to the next; 0, all at once, by default", "10 ms", default=0.0
+)
+_EVEN_INTERVAL_FIELD = declare.duration(
+    "Time from one beam of a cycle to the next; spread evenly over the cycle by default",
+    "10 ms", default=None,
+)  # fmt: skip
+
+
+class ConeScanner(SpecSection):
+    """Beams evenly round nadir, all of them in every cycle."""
+
+    kind: Literal["cone"]
+    beams: int = declare.count("Beams", "3", at_most=str(BEAMS_MAX))
+    half_angle: float = declare.angle("From nadir", "22.5 deg", *_NADIR_ANGLE_BOUNDS)
+    azimuth: float = declare.angle("Of the first beam, from forward to the left", default=0.0)
+    rate: float = _CYCLE_RATE_FIELD
+    interval: float = _SIMULTANEOUS_INTERVAL_FIELD
+
+    def build_pattern(self) -> Scanner:
+        """Return the scan pattern."""
+        directions = scan_patterns.cone(
+            self.beams, half_angle=self.half_angle, azimuth=self.azimuth
+        )
+        return scan_patterns.fixed(directions, rate=self.rate, interval=self.interval)
+
+
+class FixedBeamsScanner(SpecSection):
+    """Beams at stated directions, all of them in every cycle."""
+
+    kind: Literal["fixed"]
+    beams: tuple[Vector, ...] = declare.field_of_rule(
+        BeamDirectionsRule(
+            description="Angles towards forward and left, or vectors in the body frame, of each "
+            "beam"
+        )
+    )
+    rate: float = _CYCLE_RATE_FIELD
+    interval: float = _SIMULTANEOUS_INTERVAL_FIELD
+
+    def build_pattern(self) -> Scanner:
+        """Return the scan pattern."""
+        directions = [
+            scan_patterns.steered(*beam) if len(beam) == 2 else np.array(beam)  # type: ignore[arg-type]
+            for beam in self.beams
+        ]
+        return scan_patterns.fixed(np.array(directions), rate=self.rate, interval=self.interval)
+
+
+class CornersScanner(SpecSection):
+    """One steered beam that visits the corners of a square."""
+
+    kind: Literal["corners"]
+    angle: float = declare.angle("Of both axes from nadir", "22.5 deg", *_NADIR_ANGLE_BOUNDS)
+    rate: float = _CYCLE_RATE_FIELD
+    interval: float | None = _EVEN_INTERVAL_FIELD
+
+    def build_pattern(self) -> Scanner:
+        """Return the scan pattern."""
+        return scan_patterns.fixed(
+            scan_patterns.corners(self.angle), rate=self.rate, interval=self.interval
+        )
+
+
+class SquaresScanner(SpecSection):
+    """One beam steered by stacked elements, square after square; a cycle is a square."""
+
+    kind: Literal["squares"]
+    elements: Vector = declare.list_of(
+        declare.quantity_rule("Angle", "rad", "15 deg", "1e-6 deg", "45 deg"), 1, 5,
+        description="Angle by which each element of an axis throws the beam to either side",
+    )  # fmt: skip
+    rate: float = _CYCLE_RATE_FIELD
+    interval: float | None = _EVEN_INTERVAL_FIELD
+
+    def build_pattern(self) -> Scanner:
+        """Return the scan pattern."""
+        directions, visited_directions = scan_patterns.squares(self.elements)
+        return scan_patterns.BeamCycle(directions, visited_directions, self.rate, self.interval)
+
+
+class RasterScanner(SpecSection):
+    """One steered beam that visits a grid of directions; a cycle is a frame."""
+
+    kind: Literal["raster"]
+    columns: int = declare.count("Directions across", "32", at_most=str(BEAMS_MAX))
+    rows: int = declare.count("Directions along", "32", at_most=str(BEAMS_MAX))
+    half_angles: Vector = declare.list_of(
+        declare.quantity_rule("Angle", "rad", "10 deg", *_NADIR_ANGLE_BOUNDS), 2, 2,
+        description="Reach to each side of nadir, across and along",
+    )  # fmt: skip
+    rate: float = _CYCLE_RATE_FIELD
+    both_ways: bool = declare.flag("Every other row runs backwards", default=True)
+
+    def build_pattern(self) -> Scanner:
+        """Return the scan pattern."""
+        return scan_patterns.raster(**self.model_dump(exclude={"kind"}))
+
+
+class LineScanner(SpecSection):
+    """Beams swept together from side to side; a cycle is one measurement of each."""
+
+    kind: Literal["line"]
+    half_angle: float = declare.angle(
+        "Reach of the sweep to each side", "5 deg", *_NADIR_ANGLE_BOUNDS
+    )
+    line_rate: float = declare.frequency("Lines a second; a sweep one way is a line")
+    rate: float = _CYCLE_RATE_FIELD
+    along: Vector = declare.list_of(
+        declare.quantity_rule("Angle", "rad", "250 urad", "-89 deg", "89 deg"), 1, 1000, (0.0,),
+        description="Angle of each beam from nadir towards forward",
+    )  # fmt: skip
+    wave: str = declare.choice("Constant rate or resonant mirror", ("triangle", "sine"))
+    interval: float = _SIMULTANEOUS_INTERVAL_FIELD
+
+    def build_pattern(self) -> Scanner:
+        """Return the scan pattern."""
+        return scan_patterns.LineScan(**self.model_dump(exclude={"kind"}))
+
+
+AnyScanner = Annotated[
+    ConeScanner | FixedBeamsScanner | CornersScanner | SquaresScanner | RasterScanner | LineScanner,
+    Field(discriminator="kind"),
+]
+
+
+def shots_per_cycle(pattern: Scanner) -> int:
+    """Shots of one measurement cycle."""
+    if isinstance(pattern, scan_patterns.BeamCycle):
+        return pattern.beams_per_cycle
+    return pattern.beams

@@ -1,0 +1,874 @@
+"""Rules that join several fields, held against the whole grid of a study by its extremes.
+
+A chirp longer than its echo's delay, samples to transform, no more electrons than photons; beams
+that an aperture can make; effects with what they need; detectors that fit their spectra.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import partial
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from sweep.model import beam, looks, waveform
+from sweep.model.constants import ELEMENTARY_CHARGE, PLANCK, SPEED_OF_LIGHT
+from sweep.model.detectors import FIXED
+from sweep.model.effects import circulator_leak, iq_imbalance
+from sweep.model.effects.catalogue import EFFECTS
+from sweep.model.effects.effect import Effect, Parameter
+from sweep.model.effects.noise_sources import SUN_RADIUS
+from sweep.model.effects.phase_errors import ERROR_TABLE, NO_TABLE
+from sweep.model.effects.sweep_table import sweep_table
+from sweep.model.estimators import DEFAULTS, DETECTOR, ESTIMATOR
+from sweep.model.preparation import RECORD
+from sweep.model.waveform import ENDS, RANGES, VELOCITIES
+from sweep.spec.axes import Axis, parameter_location
+from sweep.spec.fields import AUTO, OFF, ON, rules_by_path
+from sweep.spec.rules import MISSING, Finding
+from sweep.spec.sections import SPECTRA_METHOD, Draws, Effects, default_value, parameter_rules
+from sweep.units import QuantityError
+
+if TYPE_CHECKING:
+    from sweep.spec.scene_sections import SceneDraws
+
+RANGE_PATH = "target.range"
+CHIRP_DURATION_PATH = "instrument.chirp.duration"
+ACQUISITION_DELAY_PATH = "instrument.processing.acquisition_delay"
+SAMPLE_RATE_PATH = "instrument.processing.sample_rate"
+FFT_SIZE_PATH = "instrument.processing.fft_size"
+WINDOW_PATH = "instrument.processing.window"
+RESPONSIVITY_PATH = "instrument.receiver.responsivity"
+ANTIALIAS_BANDWIDTH_PATH = "instrument.receiver.antialias_bandwidth"
+EXTINCTION_PATH = "atmosphere.extinction"
+FULL_SCALE_PATH = "instrument.processing.full_scale"
+DETECTION_PATH = "instrument.processing.detection"
+BINS_COUNTED_PATH = "instrument.processing.bins_counted"
+LINE_WIDTH_PATH, LINE_SHAPE_PATH = "instrument.laser.line_width", "instrument.laser.line_shape"
+ROUGHNESS_PATH = "target.roughness"
+TRAINING_PATH, GUARD_PATH, RANK_PATH = (DETECTOR + name for name in ("training", "guard", "rank"))
+
+_WINDOW_TRIAL_SAMPLES_MAX = 16
+"""Samples with which windows are tried as they are read: with more they can be had."""
+_SPECTRUM_BINS_MIN = 8
+"""Bins of a spectrum that is looked at whole."""
+
+Condition = Callable[[Any], Any]
+"""Condition on each of several values."""
+
+
+@dataclass(frozen=True)
+class GridValues:
+    """Values of a study's parameters, as far as they can be read.
+
+    Axes vary apart, and the members of one together.
+    """
+
+    values: Mapping[str, Any]
+    """SI values of the parameters by dotted path; of those on axes, the value off the axis."""
+    axes: tuple[Axis, ...] = ()
+    effect_modes: Mapping[str, str] = field(default_factory=dict)
+    """Mode of each effect by its name."""
+
+    @classmethod
+    def from_raw_spec(cls, raw_spec: Mapping[str, Any], axes: tuple[Axis, ...]) -> GridValues:
+        """Grid of a spec as written."""
+        values: dict[str, Any] = {}
+        for path, rule in parameter_rules().items():
+            raw_value = raw_value_at(raw_spec, path)
+            with suppress(QuantityError):
+                value = default_value(path) if raw_value is MISSING else rule.read(raw_value)
+                if value is not None:
+                    values[path] = value
+        effect_modes: dict[str, str] = {}
+        for name, rule in rules_by_path(Effects, "").items():
+            with suppress(QuantityError):
+                effect_modes[name] = rule.read(raw_value_at(raw_spec, f"effects.{name}", AUTO))
+        return cls(values, axes, effect_modes)
+
+    def has_values(self, *paths: str) -> bool:
+        """Return true if all parameters could be read."""
+        return all(self.values_of(path).size for path in paths)
+
+    def values_of(self, path: str) -> np.ndarray:
+        """Values (n,) that a parameter takes; none where it could not be read."""
+        for axis in self.axes:
+            for parameter in axis.parameters:
+                if parameter.path == path:
+                    return np.asarray(parameter.values)
+        return np.asarray([self.values[path]] if path in self.values else [])
+
+    def make_finding(self, path: str, problem: str, remedy: str) -> Finding:
+        """Mistake in a parameter, told where its values stand."""
+        return Finding(parameter_location(path, self.axes), problem, remedy)
+
+    def has_point(self, conditions: Mapping[str, Condition]) -> bool:
+        """Return true if some point meets all conditions on parameters by path."""
+        paths_on_axes = {parameter.path for axis in self.axes for parameter in axis.parameters}
+        for path in set(conditions) - paths_on_axes:
+            if path not in self.values or not conditions[path](np.asarray(self.values[path])):
+                return False
+        return all(_meets_conditions(axis, conditions).any() for axis in self.axes)
+
+    def argmin_of_sum(
+        self,
+        terms: Mapping[str, Callable[[Any], Any]],
+        conditions: Mapping[str, Condition] = MappingProxyType({}),
+    ) -> dict[str, float]:
+        """Parameters where the sum of a term of each is least, of points that meet conditions.
+
+        Each axis adds its own least part. Empty where no point meets the conditions, or not all
+        of the terms' parameters could be read.
+        """
+        if not self.has_values(*terms) or not self.has_point(conditions):
+            return {}
+        minimum = {path: self.values[path] for path in terms if path in self.values}
+        for axis in self.axes:
+            axis_values = {
+                parameter.path: np.asarray(parameter.values) for parameter in axis.parameters
+            }
+            axis_sum = sum(
+                (term(axis_values[path]) for path, term in terms.items() if path in axis_values),
+                np.zeros(axis.size),
+            )
+            index = np.where(_meets_conditions(axis, conditions), axis_sum, np.inf).argmin()
+            minimum |= {path: axis_values[path][index] for path in terms if path in axis_values}
+        return {path: float(value) for path, value in minimum.items()}
+
+
+def raw_value_at(raw_spec: Mapping[str, Any], path: str, default: object = MISSING) -> Any:
+    """Value written at a dotted path."""
+    raw_value: Any = raw_spec
+    for name in path.split("."):
+        raw_value = raw_value.get(name, MISSING) if isinstance(raw_value, Mapping) else MISSING
+    return default if raw_value is MISSING else raw_value
+
+
+def _meets_conditions(axis: Axis, conditions: Mapping[str, Condition]) -> np.ndarray:
+    """Return true for places along an axis (n,) that meet the conditions on its own parameters."""
+    is_met = np.ones(axis.size, bool)
+    for parameter in axis.parameters:
+        if parameter.path in conditions:
+            is_met &= conditions[parameter.path](np.asarray(parameter.values))
+    return is_met
+
+
+def _equals(expected: str | float) -> Condition:
+    return lambda values: values == expected
+
+
+def _differs_from(unwanted: str | float) -> Condition:
+    return lambda values: values != unwanted
+
+
+def _is_positive(values: np.ndarray) -> np.ndarray:
+    return values > 0
+
+
+def _is_zero(values: np.ndarray) -> np.ndarray:
+    return values == 0
+
+
+def grid_findings(grid: GridValues) -> list[Finding]:
+    """Mistakes in the combinations of values in a study's grid."""
+    return [
+        *(list(_time_findings(grid)) or _window_findings(grid)),
+        *_photon_findings(grid),
+        *_table_findings(grid),
+        *_beam_findings(grid),
+        *_nesting_findings(grid),
+        *_requirement_findings(grid),
+        *_record_findings(grid),
+        *_looks_findings(grid),
+        *_search_findings(grid),
+    ]
+
+
+# Times and samples
+
+
+def _least_weighted_sum(grid: GridValues, weights: Mapping[str, float]) -> float | None:
+    """Least weighted sum of parameters over a grid; None where not all could be read."""
+    terms = {path: partial(operator.mul, weight) for path, weight in weights.items()}
+    minimum = grid.argmin_of_sum(terms)
+    return sum(weights[path] * minimum[path] for path in weights) if minimum else None
+
+
+ECHO_TIME_PATHS = (
+    CHIRP_DURATION_PATH,
+    ACQUISITION_DELAY_PATH,
+    RANGE_PATH,
+    SAMPLE_RATE_PATH,
+    FFT_SIZE_PATH,
+)
+_ECHO_TIME_POINTS_MAX = 10**7
+"""Points of the grid of these parameters up to which all are looked at."""
+
+
+def _time_findings(grid: GridValues) -> Iterator[Finding]:
+    """Grids in which no echo arrives before its record ends, or records of less than two samples.
+
+    A grid some points of which have no echo is simulated: nothing is detected there.
+    """
+    lateness = _least_echo_lateness(grid)
+    if lateness is not None and lateness.chirp >= 0:
+        problem = "must exceed the echo's delay 2R/c, and falls short by "
+        problem += f"{lateness.chirp:.6g} s at its best"
+        yield grid.make_finding(
+            CHIRP_DURATION_PATH, problem, "shorten the range or lengthen the chirp"
+        )
+        return
+    if lateness is not None and lateness.record >= 0:
+        problem = (
+            "must let records of fft_size samples last until an echo arrives, and the whole grid's "
+            f"end {lateness.record:.6g} s or more before the echo's delay 2R/c"
+        )
+        yield grid.make_finding(
+            ACQUISITION_DELAY_PATH,
+            problem,
+            "raise it to the delay of the farthest echo, or fft_size",
+        )
+        return
+    samples = _fewest_samples(grid)
+    if samples is not None and np.floor(samples + 1e-6) < 2:
+        problem = f"must leave 2 samples after the acquisition delay, and leaves {samples:.3g}"
+        yield grid.make_finding(
+            CHIRP_DURATION_PATH, problem, "raise the sample rate or lengthen the chirp"
+        )
+
+
+class _EchoLateness(NamedTuple):
+    """Least time [s] over a grid from an end to the echo's arrival; negative if that is before."""
+
+    chirp: float
+    """From the chirp's end."""
+    record: float
+    """From the record's end, where that matters; else from the chirp's."""
+
+
+def _least_echo_lateness(grid: GridValues) -> _EchoLateness | None:
+    """Find how late the earliest echo arrives; None where it can't be told."""
+    if not grid.has_values(*ECHO_TIME_PATHS):
+        return None
+    values: dict[str, np.ndarray] = {
+        path: np.asarray(grid.values[path], float)
+        for path in ECHO_TIME_PATHS
+        if path in grid.values
+    }
+    n_points = 1
+    for axis_number, axis in enumerate(grid.axes):
+        shape = [-1 if k == axis_number else 1 for k in range(len(grid.axes))]
+        echo_parameters = {
+            parameter.path: parameter
+            for parameter in axis.parameters
+            if parameter.path in ECHO_TIME_PATHS
+        }
+        n_points *= axis.size if echo_parameters else 1
+        values |= {
+            path: np.asarray(parameter.values, float).reshape(shape)
+            for path, parameter in echo_parameters.items()
+        }
+    if n_points > _ECHO_TIME_POINTS_MAX:
+        return None
+    end, delay = values[CHIRP_DURATION_PATH], 2 / SPEED_OF_LIGHT * values[RANGE_PATH]
+    after_chirp = float(np.min(delay - end))
+    if grid.effect_modes.get("overlap") != OFF:
+        end = np.minimum(
+            values[ACQUISITION_DELAY_PATH] + values[FFT_SIZE_PATH] / values[SAMPLE_RATE_PATH], end
+        )
+    return _EchoLateness(after_chirp, float(np.min(delay - end)))
+
+
+def _fewest_samples(grid: GridValues) -> float | None:
+    """Fewest samples of one segment over the grid; None where it can't be told."""
+    if not grid.has_values(CHIRP_DURATION_PATH, ACQUISITION_DELAY_PATH, SAMPLE_RATE_PATH):
+        return None
+    weights = {CHIRP_DURATION_PATH: 1.0, ACQUISITION_DELAY_PATH: -1.0}
+    values_on_rate_axis: Mapping[str, Any] = {}
+    for axis in grid.axes:
+        axis_values = {
+            parameter.path: np.asarray(parameter.values) for parameter in axis.parameters
+        }
+        values_on_rate_axis = (
+            axis_values if SAMPLE_RATE_PATH in axis_values else values_on_rate_axis
+        )
+    span_on_rate_axis = sum(
+        (
+            weights[path] * values_on_rate_axis[path]
+            for path in weights
+            if path in values_on_rate_axis
+        ),
+        0.0,
+    )
+    span_elsewhere = _least_weighted_sum(
+        grid, {path: weight for path, weight in weights.items() if path not in values_on_rate_axis}
+    )
+    return float(
+        np.min(
+            ((span_elsewhere or 0.0) + span_on_rate_axis)
+            * values_on_rate_axis.get(SAMPLE_RATE_PATH, grid.values_of(SAMPLE_RATE_PATH))
+        )
+    )
+
+
+def _window_findings(grid: GridValues) -> Iterator[Finding]:
+    """Report a window that does not exist at the length of the shortest record."""
+    samples = _fewest_samples(grid)
+    if samples is None or not grid.has_values(WINDOW_PATH, FFT_SIZE_PATH):
+        return
+    from sweep.model import window
+
+    length = int(min(grid.values_of(FFT_SIZE_PATH).min(), samples + 1e-6))
+    for name in dict.fromkeys(grid.values_of(WINDOW_PATH).tolist()):
+        try:
+            window.samples(name, min(length, _WINDOW_TRIAL_SAMPLES_MAX))
+        except ValueError:
+            problem = f"must be one that has {length} samples, as many as the shortest record, and "
+            problem += f"{name} has none of so few"
+            remedy = "write another one, or raise instrument.processing.fft_size"
+            yield grid.make_finding(WINDOW_PATH, problem, remedy)
+            return
+
+
+def _photon_findings(grid: GridValues) -> Iterator[Finding]:
+    """More electrons than photons."""
+    responsivity_per_metre = ELEMENTARY_CHARGE / (PLANCK * SPEED_OF_LIGHT)
+    least_margin = _least_weighted_sum(
+        grid, {beam.WAVELENGTH: responsivity_per_metre, RESPONSIVITY_PATH: -1.0}
+    )
+    if least_margin is not None and least_margin < 0:
+        problem = (
+            "must not exceed that of one electron a photon, q lambda / (h c), over the whole "
+            f"grid, and does so by {-least_margin:.3g} A/W at its worst"
+        )
+        yield grid.make_finding(
+            RESPONSIVITY_PATH, problem, "lower it; the gain of an avalanche is 'apd_gain'"
+        )
+
+
+def _table_findings(grid: GridValues) -> Iterator[Finding]:
+    """Report a table of the sweep's error that does not cover the chirp."""
+    table_text = grid.values.get(ERROR_TABLE, NO_TABLE)
+    if table_text == NO_TABLE or not grid.has_values(CHIRP_DURATION_PATH):
+        return
+    table, duration_max = sweep_table(table_text), float(grid.values_of(CHIRP_DURATION_PATH).max())
+    if table.first > 1e-9 * duration_max or table.last < (1 - 1e-9) * duration_max:
+        problem = (
+            f"must cover the chirp, 0 to {duration_max:g} s: it has {table.first:g} to "
+            f"{table.last:g}"
+        )
+        yield grid.make_finding(ERROR_TABLE, f"{problem} s", "add the rows that it lacks")
+
+
+# Beams
+
+_SINGLE_MODE_CONDITIONS = {
+    beam.COUPLING: _equals(beam.SINGLE_MODE),
+    beam.ARCHITECTURE: _differs_from("direct"),
+}
+
+
+def _beam_findings(grid: GridValues) -> Iterator[Finding]:
+    """Beams that are given twice or not at all, too wide for their aperture, or too narrow."""
+    if not grid.has_values(beam.WAVELENGTH, beam.DIAMETER, beam.DIVERGENCE, beam.WAIST):
+        return
+    if grid.has_point({beam.DIVERGENCE: _is_zero, beam.WAIST: _is_zero}):
+        problem = "must be given, or beam_waist in its place"
+        yield grid.make_finding(beam.DIVERGENCE, problem, "write e.g. '50 urad'")
+    elif grid.has_point({beam.DIVERGENCE: _is_positive, beam.WAIST: _is_positive}):
+        problem = "stands beside beam_divergence, and each follows from the other"
+        yield grid.make_finding(beam.WAIST, problem, "leave one of them out")
+    else:
+        yield from _width_findings(grid)
+
+
+def _width_findings(grid: GridValues) -> Iterator[Finding]:
+    """Beams that are too wide for their aperture, or too narrow for the paraxial approximation."""
+    remedy = "or set instrument.telescope.coupling: aperture, where all light mixes"
+    if narrowest := _narrowest_impossible_beam(grid, _SINGLE_MODE_CONDITIONS):
+        narrow_beam, limit = narrowest
+        problem = (
+            f"must be at least {1e6 * limit:.3g} urad, 4 M^2 lambda / (pi D): no narrower beam "
+        )
+        problem += f"leaves an aperture of {1e3 * narrow_beam[beam.DIAMETER]:.3g} mm"
+        yield grid.make_finding(
+            beam.DIVERGENCE, problem, f"widen the beam or the aperture, {remedy}"
+        )
+    for path in (beam.WAIST, beam.RECEIVED_WAIST):
+        widest = _argmax_of_product(
+            grid, {path: 1.0, beam.DIAMETER: -1.0}, _SINGLE_MODE_CONDITIONS | {path: _is_positive}
+        )
+        if widest and widest[path] > widest[beam.DIAMETER] / 2:
+            problem = (
+                f"must be at most {500 * widest[beam.DIAMETER]:.3g} mm, the radius of the aperture"
+            )
+            yield grid.make_finding(
+                path, problem, f"take a smaller one, or a larger aperture, {remedy}"
+            )
+        powers = {beam.QUALITY: 1.0, beam.WAVELENGTH: 1.0, path: -1.0}
+        narrowest_waist = _argmax_of_product(grid, powers, {path: _is_positive})
+        if narrowest_waist and narrowest_waist[path] < (
+            waist_min := _divergence_or_waist(narrowest_waist, beam.WIDEST)
+        ):
+            problem = (
+                f"must be at least {1e6 * waist_min:.3g} um, for the beam to spread by 90 deg at "
+                "most"
+            )
+            yield grid.make_finding(path, problem, "take a larger one")
+
+
+def describe_narrow_beam(values: Mapping[str, Any], axes: tuple[Axis, ...]) -> str:
+    """Beam of a study that its aperture cannot make, in words; empty where there is none.
+
+    Only where all light in the aperture mixes: elsewhere such a beam is refused.
+    """
+    for conditions in (
+        {beam.COUPLING: _equals(beam.APERTURE)},
+        {beam.ARCHITECTURE: _equals("direct")},
+    ):
+        if narrowest := _narrowest_impossible_beam(GridValues(values, axes), conditions):
+            narrow_beam, limit = narrowest
+            aperture_text = f"an aperture of {1e3 * narrow_beam[beam.DIAMETER]:.3g} mm makes"
+            beam_text = f"a beam of {1e6 * narrow_beam[beam.DIVERGENCE]:.3g} urad is narrower than"
+            return f"{beam_text} {aperture_text}, 4 M^2 lambda / (pi D) = {1e6 * limit:.3g} urad"
+    return ""
+
+
+def _narrowest_impossible_beam(
+    grid: GridValues, conditions: Mapping[str, Condition]
+) -> tuple[dict[str, float], float] | None:
+    """Parameters of the narrowest beam that no aperture under a law makes, and its limit [rad]."""
+    # The product of these powers is the waist over the aperture's radius, but for 4 / pi.
+    rising, falling = (beam.QUALITY, beam.WAVELENGTH), (beam.DIVERGENCE, beam.DIAMETER)
+    powers = dict.fromkeys(rising, 1.0) | dict.fromkeys(falling, -1.0)
+    narrowest = _argmax_of_product(grid, powers, {**conditions, beam.DIVERGENCE: _is_positive})
+    if narrowest and narrowest[beam.DIVERGENCE] < (
+        limit := _divergence_or_waist(narrowest, narrowest[beam.DIAMETER] / 2)
+    ):
+        return narrowest, limit
+    return None
+
+
+def _divergence_or_waist(parameters: Mapping[str, float], waist_or_divergence: float) -> float:
+    """Divergence [rad] of a beam with a waist [m], or waist of one with a divergence."""
+    return float(
+        beam.divergence_of(
+            waist_or_divergence, parameters[beam.WAVELENGTH], parameters[beam.QUALITY]
+        )
+    )
+
+
+def _argmax_of_product(
+    grid: GridValues, powers: Mapping[str, float], conditions: Mapping[str, Condition]
+) -> dict[str, float]:
+    """Parameters where a product of powers of them is largest; empty where there are none."""
+    terms = {path: partial(_log_of_power, -power) for path, power in powers.items()}
+    return grid.argmin_of_sum(terms, conditions)
+
+
+def _log_of_power(power: float, values: np.ndarray) -> np.ndarray:
+    with np.errstate(divide="ignore"):
+        return np.asarray(power * np.log(values))
+
+
+# Looks
+
+VOTING_LOOKS_MAX = 64
+
+
+def _exceeds_one(number: np.ndarray) -> np.ndarray:
+    return number > 1
+
+
+def _looks_findings(grid: GridValues) -> Iterator[Finding]:
+    """Report looks whose probabilities are not known, or that contradict each other."""
+    several_looks: dict[str, Condition] = {looks.NUMBER: _exceeds_one}
+    combined_by_bin: dict[str, Condition] = {
+        looks.COMBINE: _differs_from(looks.COHERENT),
+        **several_looks,
+    }
+    added_in_amplitude: dict[str, Condition] = {
+        looks.COMBINE: _equals(looks.COHERENT),
+        **several_looks,
+    }
+    voted_on: dict[str, Condition] = {looks.COMBINE: _equals(looks.BINARY), **several_looks}
+    if grid.has_point(combined_by_bin | {DETECTION_PATH: _equals("any_bin")}):
+        problem = "detects by the largest bin of an echo where several records are not added in "
+        problem += "amplitude: the chance that any of its bins does is known for one record alone"
+        yield grid.make_finding(
+            DETECTION_PATH, problem, "write 'detection: peak_bin', or combine: coherent"
+        )
+    if grid.has_point(voted_on | {looks.NUMBER: lambda number: number > VOTING_LOOKS_MAX}):
+        problem = f"counts the votes of at most {VOTING_LOOKS_MAX} records"
+        yield grid.make_finding(looks.NUMBER, problem, "take fewer, or combine: power")
+    fewest_looks = grid.argmin_of_sum(
+        {looks.NUMBER: lambda n: n, looks.VOTES: lambda parameter: -parameter}, voted_on
+    )
+    if fewest_looks and fewest_looks[looks.VOTES] > fewest_looks[looks.NUMBER]:
+        problem = (
+            f"asks for more than the {fewest_looks[looks.NUMBER]:g} records of "
+            "instrument.looks.number"
+        )
+        yield grid.make_finding(looks.VOTES, problem, "lower it, or take more looks")
+    if grid.has_point(added_in_amplitude | {looks.SPECKLE: _equals(looks.INDEPENDENT)}):
+        problem = "gives each record a phase of its own, in which amplitudes do not add up"
+        yield grid.make_finding(looks.SPECKLE, problem, "take common, or combine: power")
+    if grid.has_point(
+        added_in_amplitude | {LINE_WIDTH_PATH: _is_positive, LINE_SHAPE_PATH: _equals("gaussian")}
+    ):
+        problem = "tells nothing of the phase from one record to the next, of which the sum is made"
+        yield grid.make_finding(LINE_SHAPE_PATH, problem, "take lorentzian, or combine: power")
+    if grid.has_point(
+        combined_by_bin | {looks.SPECKLE: _equals(looks.INDEPENDENT), ROUGHNESS_PATH: _is_positive}
+    ):
+        problem = "is drawn once a shot for a surface of stated roughness, for all its records"
+        remedy = "take common, or footprint.speckle: developed without target.roughness"
+        yield grid.make_finding(looks.SPECKLE, problem, remedy)
+    if grid.has_point(
+        {
+            looks.COMBINE: _equals(looks.POWER),
+            **several_looks,
+            DETECTOR + "kind": _differs_from(FIXED),
+        }
+    ):
+        problem = "sets its threshold by the noise of one record, and here powers are averaged"
+        remedy = "take fixed, or combine: binary or coherent"
+        yield grid.make_finding(DETECTOR + "kind", problem, remedy)
+
+
+def _drawn_noise_findings(grid: GridValues, method: str) -> Iterator[Finding]:
+    """Noise drawn where a line of leaked light stands, or in the bins of several records."""
+    if method != "probabilities" and grid.has_point({circulator_leak.PATH: _is_positive}):
+        problem = "draws noise, and instrument.telescope.leak_path has a line that is not drawn"
+        yield Finding(("draws", "method"), problem, "take draws.method: probabilities", method)
+    if method == "noise" and grid.has_point(
+        {looks.NUMBER: _exceeds_one, looks.COMBINE: _differs_from(looks.COHERENT)}
+    ):
+        problem = (
+            "adds noise to the bins of one record, and instrument.looks.number asks for several"
+        )
+        remedy = "take probabilities or spectra, or combine: coherent"
+        yield Finding(("draws", "method"), problem, remedy, method)
+
+
+def _search_findings(grid: GridValues) -> Iterator[Finding]:
+    """Search bands that lack an end, are upside down, or count bins that are not searched."""
+    missing_ends = [path for path in ENDS if not grid.values_of(path).size]
+    if 0 < len(missing_ends) < len(ENDS):
+        problem = "is left out, and a beat tells of range and velocity both"
+        yield Finding(tuple(missing_ends[0].split(".")), problem, "give all four ends, or none")
+    for low, high in (RANGES, VELOCITIES):
+        least_span = _least_weighted_sum(grid, {high: 1.0, low: -1.0})
+        if least_span is not None and least_span <= 0:
+            yield grid.make_finding(
+                high, f"must exceed {low}, and is {-least_span:.6g} below", "raise it"
+            )
+    if not missing_ends and grid.has_point({BINS_COUNTED_PATH: _equals("all")}):
+        problem = "counts bins that instrument.processing.search leaves out"
+        yield grid.make_finding(
+            BINS_COUNTED_PATH, problem, "write 'bins_counted: half', or leave the band out"
+        )
+
+
+# Effects
+
+
+class ParameterRequirement(NamedTuple):
+    """A parameter that has no meaning with some values of another."""
+
+    path: str
+    needs_other: Condition
+    """True if values of it need the other."""
+    other_path: str
+    """Parameter that must then have another value."""
+    is_unmet: Condition
+    """True if values of that one will not do."""
+    problem: str
+    remedy: str
+    holds_if_forced_on: bool = False
+    """True if the parameter's effect has the same need wherever it is forced on."""
+
+
+def _require_positive(path: str, needs_other: Condition, other_path: str) -> ParameterRequirement:
+    return ParameterRequirement(
+        path,
+        needs_other,
+        other_path,
+        _is_zero,
+        f"needs {other_path}, which is 0",
+        f"set {other_path}",
+    )
+
+
+_SINGLE_MODE_PROBLEM_AND_REMEDY = (
+    "counts by the mode that a coherent receiver sees, and here all light in the aperture does",
+    "take a coherent receiver of coupling: single_mode",
+)
+REQUIREMENTS = (
+    *(
+        ParameterRequirement(
+            path, lambda value: value != 0, other, _equals(word), *_SINGLE_MODE_PROBLEM_AND_REMEDY
+        )
+        for path in (beam.SCAN_RATE, beam.SEPARATION, beam.MISALIGNMENT)
+        for other, word in ((beam.COUPLING, beam.APERTURE), (beam.ARCHITECTURE, "direct"))
+    ),
+    *(
+        ParameterRequirement(
+            path,
+            _differs_from(default),
+            RECORD,
+            _equals("real"),
+            "is one of I and Q, and the record is real",
+            "set instrument.receiver.record: complex",
+        )
+        for path, default in ((iq_imbalance.GAIN, 1.0), (iq_imbalance.PHASE, 0.0))
+    ),
+    _require_positive("instrument.processing.bits", _is_positive, FULL_SCALE_PATH),
+    ParameterRequirement(
+        circulator_leak.PATH,
+        _is_positive,
+        circulator_leak.ISOLATION,
+        lambda ratio: ratio >= 1e30,
+        "is that of light which leaks, and none does at an isolation of 300 dB",
+        "set instrument.telescope.isolation",
+    ),
+    ParameterRequirement(
+        circulator_leak.PATH,
+        _is_positive,
+        looks.NUMBER,
+        _exceeds_one,
+        "is that of a line which is known in one record of each segment alone",
+        "take instrument.looks.number: 1",
+    ),
+    ParameterRequirement(
+        circulator_leak.PATH,
+        _is_positive,
+        RANGES[0],
+        _is_positive,
+        "is that of a line which masks bins, and no law joins that with a search band",
+        "leave instrument.processing.search out",
+    ),
+    _require_positive(
+        "atmosphere.profile", lambda p: np.isin(p, ("exponential", "layer")), EXTINCTION_PATH
+    ),
+    ParameterRequirement(
+        "target.roughness",
+        _is_positive,
+        beam.ARCHITECTURE,
+        _equals("direct"),
+        "makes speckle, of which direct detection averages over an unknown number",
+        "take a coherent receiver",
+        holds_if_forced_on=True,
+    ),
+    ParameterRequirement(
+        "target.roughness",
+        _is_positive,
+        "footprint.speckle",
+        _equals("developed"),
+        "says how rough the target is, which developed speckle takes to be without limit",
+        "set footprint.speckle: none",
+    ),
+    ParameterRequirement(
+        "target.sun_distance",
+        lambda distance: (distance > 0) & (distance < SUN_RADIUS),
+        beam.WAVELENGTH,
+        _is_positive,
+        f"must be 0, for no sun, or at least the sun's radius, {SUN_RADIUS:g} m",
+        "set it to 1 au or so",
+    ),
+)
+
+
+def _nesting_findings(grid: GridValues) -> Iterator[Finding]:
+    """Effects that are on within others that are off."""
+    outer_of_effect = {effect.name: effect.within for effect in EFFECTS}
+    for name, outer in outer_of_effect.items():
+        while outer and grid.effect_modes.get(name) == ON:
+            if grid.effect_modes.get(outer) == OFF:
+                problem = f"acts within {outer}, which is off"
+                yield _mode_finding(name, problem, f"turn {outer} on, or leave {name} out")
+            outer = outer_of_effect[outer]
+
+
+def _requirement_findings(grid: GridValues) -> Iterator[Finding]:
+    """Parameters of effects without others that they need."""
+    for requirement in REQUIREMENTS:
+        owning_effect = next(
+            effect
+            for effect in EFFECTS
+            if any(parameter.path == requirement.path for parameter in effect.parameters)
+        )
+        mode = grid.effect_modes.get(owning_effect.name, OFF)
+        remedy = f"{requirement.remedy}, or effects.{owning_effect.name}: off"
+        if mode != OFF and grid.has_point(
+            {
+                requirement.path: requirement.needs_other,
+                requirement.other_path: requirement.is_unmet,
+            }
+        ):
+            yield grid.make_finding(requirement.path, requirement.problem, remedy)
+        elif (
+            requirement.holds_if_forced_on
+            and mode == ON
+            and grid.has_point({requirement.other_path: requirement.is_unmet})
+        ):
+            yield _mode_finding(owning_effect.name, requirement.problem, remedy)
+
+
+def _record_findings(grid: GridValues) -> Iterator[Finding]:
+    """Complex records of direct detection; filters before the ADC that let noise fold, or stay."""
+    if grid.has_point({RECORD: _equals("complex"), beam.ARCHITECTURE: _equals("direct")}):
+        problem = "samples I and Q, of which direct detection has one"
+        yield grid.make_finding(RECORD, problem, "take a coherent receiver, or record: real")
+    if (
+        _least_weighted_sum(grid, {SAMPLE_RATE_PATH: 1.0, ANTIALIAS_BANDWIDTH_PATH: -1.0}) or 0.0
+    ) < 0.0:
+        problem = (
+            "must be at most the sample rate over the whole grid: a wider filter keeps no alias"
+        )
+        yield grid.make_finding(
+            ANTIALIAS_BANDWIDTH_PATH, f"{problem} out", "lower it, or write 'none'"
+        )
+    if grid.has_point(
+        {
+            ANTIALIAS_BANDWIDTH_PATH: _is_positive,
+            "instrument.receiver.noise_shape": _equals("white"),
+        }
+    ):
+        problem = "shapes the noise, which noise_shape: white leaves as it is"
+        yield grid.make_finding(
+            ANTIALIAS_BANDWIDTH_PATH, problem, "take noise_shape: receiver, or write 'none'"
+        )
+
+
+def undrawn_effect_findings(grid: GridValues) -> Iterator[Finding]:
+    """Random effects that a grid has and, without draws, can't simulate."""
+    problem = "is simulated by draws, and the study has none"
+    for effect in EFFECTS:
+        if effect.is_random and grid.effect_modes.get(effect.name) == ON:
+            yield _mode_finding(
+                effect.name, problem, "set draws.limit or draws.number, or leave it out"
+            )
+    for effect, parameter in _active_random_parameters(grid):
+        remedy = (
+            "set draws.limit to draw until accuracy.tolerance is met, draws.number to draw so many "
+            f"times, or effects.{effect.name}: off"
+        )
+        yield grid.make_finding(parameter.path, problem, remedy)
+
+
+def flight_effect_findings(grid: GridValues, draws: SceneDraws) -> Iterator[Finding]:
+    """Random effects and methods that are asked for in a flight, and that only grids draw.
+
+    All other random effects are drawn; a target's own parameters are told where they stand.
+    """
+    problem = "is not drawn in flights"
+    for effect in EFFECTS:
+        is_of_target = any(parameter.path.startswith("target.") for parameter in effect.parameters)
+        if (
+            (effect.turn or is_of_target)
+            and effect.is_random
+            and grid.effect_modes.get(effect.name) == ON
+        ):
+            instead_text = ": beams wander by platform.jitter" if effect.turn is not None else ""
+            yield _mode_finding(effect.name, problem, f"leave it out{instead_text}")
+    yield from spectra_findings(draws, grid)
+    if grid.has_point({waveform.SHOT_DETECTION: _equals(waveform.ANY_TWO)}):
+        problem, remedy = "is not known to flights, which pair peaks", "take both_chirps"
+        yield grid.make_finding(
+            waveform.SHOT_DETECTION, problem, f"{remedy}, or study a flat target"
+        )
+    if not draws.draws_whole_spectra and grid.has_point(
+        {waveform.PEAKS: _equals(waveform.STRONGEST)}
+    ):
+        problem = f"is found in whole spectra, which draws.method {draws.method!r} does not draw"
+        yield grid.make_finding(
+            waveform.PEAKS, problem, f"set draws.method: {SPECTRA_METHOD}, or take all"
+        )
+    voted_on = {looks.NUMBER: _exceeds_one, looks.COMBINE: _equals(looks.BINARY)}
+    if grid.has_point(voted_on | {"footprint.speckle": _equals("developed")}):
+        problem = "counts records, and flights draw no powers of echoes that fade in several"
+        yield grid.make_finding(looks.COMBINE, problem, "take power, or footprint.speckle: none")
+
+
+def _mode_finding(effect: str, problem: str, remedy: str) -> Finding:
+    """Mistakes in an effect that is on."""
+    return Finding(("effects", effect), problem, remedy, ON)
+
+
+def _active_random_parameters(grid: GridValues) -> Iterator[tuple[Effect, Parameter]]:
+    """Random effects that are not off, each with a parameter by which the scene has it."""
+    for effect in EFFECTS:
+        if effect.is_random and grid.effect_modes.get(effect.name, OFF) != OFF:
+            for parameter in effect.parameters:
+                # One that is something by default only says how an effect acts.
+                is_not_default = _differs_from(parameter.default)  # type: ignore[arg-type]
+                if parameter.brings and grid.has_point({parameter.path: is_not_default}):
+                    yield effect, parameter
+
+
+# Detectors and estimators
+
+
+def is_detector_or_estimator(path: str) -> bool:
+    """Return true if a parameter sets the detector or estimator for whole spectra."""
+    return path.startswith((DETECTOR, ESTIMATOR))
+
+
+def spectra_findings(draws: Draws | SceneDraws, grid: GridValues) -> Iterator[Finding]:
+    """Methods without spectra to look at, spectra without draws, CFAR windows that do not fit."""
+    yield from _drawn_noise_findings(grid, draws.method)
+    if not draws.draws_whole_spectra:
+        remedy = f"set draws: {{method: {SPECTRA_METHOD}, number: 1000}}, or leave it out"
+        problem = f"looks at whole spectra, which draws.method {draws.method!r} does not draw"
+        for path in _changed_method_paths(grid):
+            yield grid.make_finding(path, problem, remedy)
+    elif not draws.has_draws:
+        problem, remedy = "draws whole spectra, and draws none", "set draws.number or draws.limit"
+        yield Finding(("draws", "method"), problem, remedy, draws.method)
+    else:
+        yield from _cfar_window_findings(grid)
+
+
+def _changed_method_paths(grid: GridValues) -> list[str]:
+    """Methods' parameters that are not at their defaults."""
+    paths_on_axes = [
+        parameter.path
+        for axis in grid.axes
+        for parameter in axis.parameters
+        if is_detector_or_estimator(parameter.path)
+    ]
+    values = grid.values
+    changed_paths = [
+        path for path in DEFAULTS if values.get(path, DEFAULTS[path]) != DEFAULTS[path]
+    ]
+    return [*paths_on_axes, *(path for path in changed_paths if path not in paths_on_axes)]
+
+
+def _cfar_window_findings(grid: GridValues) -> Iterator[Finding]:
+    """CFAR windows that are odd or too wide, and ranks beyond them, by the grid's extremes."""
+    training, guard, rank = (
+        grid.values_of(path) for path in (TRAINING_PATH, GUARD_PATH, RANK_PATH)
+    )
+    if (training % 2 == 1).any():
+        yield grid.make_finding(TRAINING_PATH, "must be even", "half of them stand on either side")
+    if training.size and rank.size and rank.max() > training.min():
+        problem = f"must be at most detector.training, {training.min():g}, over the whole grid"
+        yield grid.make_finding(RANK_PATH, problem, "lower it, or write 'auto'")
+    if not grid.has_values(TRAINING_PATH, GUARD_PATH, FFT_SIZE_PATH):
+        return
+    n_bins = int(grid.values_of(FFT_SIZE_PATH).min()) // 2 - 1
+    n_bins_needed = max(int(training.max() + 2 * guard.max()) + 1, _SPECTRUM_BINS_MIN)
+    if n_bins < n_bins_needed:
+        problem = (
+            f"leaves {n_bins} bins between DC and Nyquist, and detectors need {n_bins_needed} over "
+            "the "
+        )
+        yield grid.make_finding(
+            FFT_SIZE_PATH, f"{problem}whole grid", "lengthen it, or take fewer training cells"
+        )

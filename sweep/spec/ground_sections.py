@@ -1,0 +1,411 @@
+"""Ground of a scene: real terrain, heights from files, planes, and what is drawn at random."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import replace
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+import sweep.spec.fields as declare
+from sweep.model.ground import LAWS
+from sweep.scenes.rasters import BYTES_PER_CELL, GRID_CELLS_MAX, raster_digest, read_raster
+from sweep.scenes.scene_files import require_memory
+from sweep.spec.fields import SpecFiles, SpecSection
+from sweep.spec.sections import REFLECTANCE_FIELD
+
+if TYPE_CHECKING:
+    from sweep.scenes.terrain import Terrain
+
+SQUARE_STEPS_MAX = 7000
+"""Grid steps along one side of a square."""
+_RANDOM_STREAMS = ("relief", "hills", "craters", "boulders", "trees")
+
+Vector = tuple[float, ...]
+
+
+def random_generator(purpose: str, seed: int) -> np.random.Generator:
+    """Random numbers of one use: the same seed gives craters and boulders unlike places."""
+    key = (_RANDOM_STREAMS.index(purpose),)
+    return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=key)))
+
+
+class Material(SpecSection):
+    """Optical properties of a surface."""
+
+    reflectance: float = REFLECTANCE_FIELD
+    reflectance_law: str = declare.choice("How it scatters", LAWS, "lambert")
+
+
+OPTICAL_FIELDS = tuple(Material.model_fields)
+"""Fields that rays know nothing of."""
+
+
+class Relief(SpecSection):
+    """Fractal relief, for what a survey is too coarse to show."""
+
+    hurst: float = declare.number("Hurst exponent", "0.9", "1e-3", "0.999")
+    rms_slope: float = declare.number(
+        "Standard deviation of height differences over the baseline, divided by it",
+        "0.1", "0", "10",
+    )  # fmt: skip
+    baseline: float = declare.positive_length("Distance at which the slope is stated", "10 m")
+    seed: int = declare.seed()
+
+    def draw_heights(self, shape: tuple[int, int], spacing: tuple[float, float]) -> np.ndarray:
+        """Heights on a grid [m], of mean 0."""
+        from sweep.scenes.terrain import draw_fractal_relief
+
+        heights = draw_fractal_relief(
+            random_generator("relief", self.seed),
+            shape=shape,
+            spacing=spacing,
+            **self.model_dump(include={"hurst", "rms_slope", "baseline"}),
+        )
+        return np.asarray(heights - heights.mean())
+
+
+class Craters(SpecSection):
+    """Simple craters by the lunar size-frequency law."""
+
+    smallest: float = declare.positive_length("Smallest diameter, three grid steps or more", "20 m")
+    largest: float = declare.positive_length("Largest diameter", "300 m")
+    least_fresh: float = declare.number(
+        "Freshness of the most worn, against 1", "0.1", "0", "1", default=0.1
+    )
+    equilibrium_diameter: float | None = declare.positive_length(
+        "Diameter up to which craters have worn each other down; all by default", "100 m",
+        default=None,
+    )  # fmt: skip
+    seed: int = declare.seed()
+
+    def carve_into(self, terrain: Terrain) -> Terrain:
+        """Terrain with the craters in it."""
+        from sweep.scenes.scattered_objects import carve_craters, draw_craters, lunar_crater_law
+
+        equilibrium_diameter = (
+            math.inf if self.equilibrium_diameter is None else self.equilibrium_diameter
+        )
+        craters = draw_craters(
+            random_generator("craters", self.seed),
+            lunar_crater_law(equilibrium_diameter=equilibrium_diameter),
+            bounds=terrain.bounds,
+            **self.model_dump(include={"smallest", "largest", "least_fresh"}),
+        )
+        return carve_craters(terrain, craters)
+
+
+def _check_memory(n_nodes: int) -> None:
+    """Refuse a grid whose triangles would take more memory than there is."""
+    remedy = "take a coarser grid, or a smaller part of it"
+    require_memory(f"a ground of {n_nodes:,} heights", BYTES_PER_CELL * n_nodes, remedy)
+
+
+class Ground(Material, ABC):
+    """A grid of heights and what is done to it, in this order: smooth, refine, relief, craters."""
+
+    smoothing: float = declare.length(
+        "Standard deviation of a Gaussian that the heights are blurred by", "10 m", "0 m",
+        default=0.0,
+    )  # fmt: skip
+    factor: int = declare.count(
+        "New grid steps to each old one, by a cubic spline", "8", "1", "1000", default=1
+    )
+    relief: Relief | None = None
+    craters: Craters | None = None
+
+    def build_terrain(self, files: SpecFiles) -> Terrain:
+        """Return the ground in its own coordinates.
+
+        A `SceneError` for an unfit file, a ValueError for a grid that can not hold what it should.
+        """
+        return self.process(self.unprocessed_terrain(files))
+
+    def process(self, terrain: Terrain) -> Terrain:
+        """Return the survey smoothed, refined, with its relief and its craters."""
+        from sweep.scenes.terrain import refine, smooth
+
+        if terrain.heights.size * self.factor**2 > GRID_CELLS_MAX:
+            raise ValueError(
+                f"refined {self.factor} times it has more than {GRID_CELLS_MAX:.0e} nodes"
+            )
+        _check_memory(terrain.heights.size * self.factor**2)
+        if self.smoothing:
+            terrain = smooth(terrain, standard_deviation=self.smoothing)
+        if self.factor > 1:
+            terrain = refine(terrain, factor=self.factor)
+        if self.relief is not None:
+            heights = terrain.heights + self.relief.draw_heights(
+                terrain.heights.shape, terrain.spacing
+            )
+            terrain = replace(terrain, heights=heights)
+        return terrain if self.craters is None else self.craters.carve_into(terrain)
+
+    @abstractmethod
+    def unprocessed_terrain(self, files: SpecFiles) -> Terrain:
+        """Return the ground before smoothing, refining, relief and craters."""
+
+    def check_grid(self) -> None:
+        """Raise a ValueError for a grid that, by its fields alone, can not be."""
+
+    def grid_step(self) -> float | None:
+        """Grid step [m], the larger one; None where only a file knows it."""
+        return None
+
+
+class PlacedGround(Ground):
+    """Ground without coordinates of its own."""
+
+    position: Vector = declare.position(
+        "Where the middle of its grid lies, its heights above that", default=(0.0, 0.0, 0.0)
+    )
+
+    def unprocessed_terrain(self, files: SpecFiles) -> Terrain:
+        """Return the ground before smoothing, refining, relief and craters."""
+        terrain = self.unplaced_terrain(files)
+        (rows, columns), (dx, dy) = terrain.heights.shape, terrain.spacing
+        corner = np.array([-(columns - 1) / 2 * dx, -(rows - 1) / 2 * dy, 0.0])
+        return replace(terrain, origin=corner + self.position)
+
+    @abstractmethod
+    def unplaced_terrain(self, files: SpecFiles) -> Terrain:
+        """Heights, wherever they are."""
+
+
+# Ground of surveys and files
+
+
+class JacksboroGround(PlacedGround):
+    """The Jacksboro fault, Tennessee: real terrain that is always there, at posts of 74 m x 92 m.
+
+    Heights are above sea level.
+    """
+
+    kind: Literal["jacksboro"]
+    size: float | None = declare.length(
+        "Side of the square cut from it; all of it by default", "3 km", "1 km", default=None
+    )
+    middle: Vector = declare.position(
+        "Middle of that square, eastwards and northwards from that of the survey",
+        dimensions=2, default=(0.0, 0.0),
+    )  # fmt: skip
+
+    def unplaced_terrain(self, files: SpecFiles | None) -> Terrain:
+        """Heights of the survey."""
+        from sweep.scenes.rasters import read_jacksboro
+        from sweep.scenes.terrain import cut_square
+
+        survey = read_jacksboro()
+        return (
+            survey if self.size is None else cut_square(survey, centre=self.middle, size=self.size)
+        )  # type: ignore[arg-type]
+
+    def check_grid(self) -> None:
+        """Look for ground where the piece is cut."""
+        self.unplaced_terrain(None)
+
+    def grid_step(self) -> float | None:
+        """Grid step from south to north [m]."""
+        return max(abs(step) for step in self.unplaced_terrain(None).spacing) / self.factor
+
+
+_NO_DATA_FIELD = declare.number(
+    "Value that stands for a missing height, where the file does not declare it",
+    "-9999", "-1e39", "1e39", default=None,
+)  # fmt: skip
+_HEIGHT_SCALE_FIELD = declare.number(
+    "Metres to a unit of the file's heights", "0.5", "1e-9", "1e9", default=1.0
+)
+
+
+class RasterGround(Ground):
+    """Heights of a georeferenced raster, such as a GeoTIFF, in its own coordinates."""
+
+    kind: Literal["raster"]
+    file: str = declare.file_path(
+        "The raster: GeoTIFF or another format of GDAL", digest=raster_digest
+    )
+    band: int = declare.count("Band that holds the heights", "1", default=1)
+    scale: float = _HEIGHT_SCALE_FIELD
+    window: Vector | None = declare.list_of(
+        declare.quantity_rule("Coordinate", "", "500000"), 4, 4, None,
+        description="West, south, east and north of the part to read, in the raster's coordinates",
+    )  # fmt: skip
+    metres_per_degree: Vector | None = declare.list_of(
+        declare.quantity_rule("Metres", "", "110900", "1e-6"), 2, 2, None,
+        description="Metres of a degree eastwards and northwards, of a raster in degrees",
+    )  # fmt: skip
+    metres_per_unit: Vector | None = declare.list_of(
+        declare.quantity_rule("Metres", "", "0.5", "1e-6"), 2, 2, None,
+        description="Metres on the ground to a unit of the raster's coordinates, eastwards and "
+        "northwards, of a map whose scale differs from that of the ground",
+    )  # fmt: skip
+    height_unit: str | None = declare.text(
+        "Unit of the heights, where the file does not tell it: m, ft, sft (US survey foot)", None
+    )
+    no_data: float | None = _NO_DATA_FIELD
+    pixel: float | None = declare.positive_length(
+        "Size of a pixel, of a raster that states no scale", "1 m", default=None
+    )
+
+    def unprocessed_terrain(self, files: SpecFiles) -> Terrain:
+        """Heights of the raster."""
+        field_names = {"band", "window", "metres_per_degree", "metres_per_unit", "height_unit"}
+        terrain = read_raster(
+            files.resolve(self.file, raster_digest),
+            **self.model_dump(include={*field_names, "no_data", "pixel"}),
+            has_height_scale=self.scale != 1.0,
+        )
+        return replace(terrain, heights=terrain.heights * self.scale)
+
+
+class ArrayGround(PlacedGround):
+    """Heights of a NumPy file."""
+
+    kind: Literal["array"]
+    file: str = declare.file_path("The file, .npy or .npz")
+    spacing: Vector = declare.vector(
+        "Step from column to column and from row to row; the second is below 0 where row 0 "
+        "is the northern one",
+        "m", "5 m", dimensions=2,
+    )  # fmt: skip
+    name: str | None = declare.text("Array of an .npz that holds the heights", None)
+    no_data: float | None = _NO_DATA_FIELD
+    scale: float = _HEIGHT_SCALE_FIELD
+
+    def unplaced_terrain(self, files: SpecFiles) -> Terrain:
+        """Heights of the file."""
+        from sweep.scenes.rasters import read_array
+
+        spacing, no_data = (self.spacing[0], self.spacing[1]), self.no_data
+        path = files.resolve(self.file)
+        terrain = read_array(path, spacing=spacing, name=self.name, no_data=no_data)
+        return replace(terrain, heights=terrain.heights * self.scale)
+
+
+class ImageGround(PlacedGround):
+    """Heights of a grey image: row 0 is the northern one."""
+
+    kind: Literal["image"]
+    file: str = declare.file_path("The image, of 8 or 16 bits")
+    pixel: float = declare.positive_length("Size of a pixel", "2 m")
+    white: float = declare.length("Height of full white", "49 m")
+    black: float = declare.length("Height of black", "0 m", default=0.0)
+
+    def unplaced_terrain(self, files: SpecFiles) -> Terrain:
+        """Heights of the image."""
+        from sweep.scenes.rasters import read_image
+
+        path = files.resolve(self.file)
+        return read_image(path, pixel=self.pixel, black=self.black, white=self.white)
+
+
+# Ground that no file holds
+
+
+def _nodes_per_side(side: float, step: float) -> int:
+    """Nodes of a grid of at least a side's length."""
+    return math.ceil(side / step * (1 - 1e-12)) + 1
+
+
+class SquareGround(PlacedGround):
+    """A square of ground on a grid that is stated."""
+
+    size: float = declare.positive_length("Side of the square", "3 km")
+
+    def unrefined_step(self) -> float:
+        """Grid step before refining [m]; one cell without a spacing."""
+        spacing = self.spacing  # type: ignore[attr-defined]
+        return float(self.size if spacing is None else spacing)
+
+    def flat_terrain(self) -> Terrain:
+        """Return the grid, with heights of 0."""
+        from sweep.scenes.terrain import Terrain
+
+        self.check_grid()
+        step, n_nodes = self.unrefined_step(), _nodes_per_side(self.size, self.unrefined_step())
+        _check_memory(n_nodes * n_nodes)
+        return Terrain(np.zeros((n_nodes, n_nodes)), (step, step), np.zeros(3))
+
+    def check_grid(self) -> None:
+        """Look at the number of grid steps."""
+        n_steps = _nodes_per_side(self.size, self.unrefined_step()) - 1
+        if not 1 <= n_steps <= SQUARE_STEPS_MAX:
+            raise ValueError(
+                f"a side of {self.size:g} m has {n_steps} steps of {self.unrefined_step():g} m, "
+                f"and takes {SQUARE_STEPS_MAX} at most"
+            )
+
+    def grid_step(self) -> float | None:
+        """Grid step [m]."""
+        return self.unrefined_step() / self.factor
+
+
+class PlaneGround(SquareGround):
+    """A square plane."""
+
+    kind: Literal["plane"]
+    height: float = declare.length("Height of its middle", "0 m", default=0.0)
+    slope: float = declare.angle("Angle from the level", "10 deg", "0 deg", "80 deg", default=0.0)
+    uphill: float = declare.angle("Heading in which it rises", "90 deg", default=0.0)
+    spacing: float | None = declare.positive_length(
+        "Grid step, for relief and craters; one cell by default", "5 m", default=None
+    )
+
+    def unplaced_terrain(self, files: SpecFiles) -> Terrain:
+        """Return the sloping plane."""
+        terrain = self.flat_terrain()
+        tangent, node_numbers = math.tan(self.slope), np.arange(len(terrain.heights))
+        rise_along_side = (node_numbers - node_numbers.mean()) * terrain.spacing[0] * tangent
+        heights = (
+            math.cos(self.uphill) * rise_along_side
+            + math.sin(self.uphill) * rise_along_side[:, None]
+        )
+        return replace(terrain, heights=heights + self.height)
+
+
+class ReliefGround(Relief, SquareGround):
+    """Fractal ground, of mean height 0."""
+
+    kind: Literal["relief"]
+    spacing: float = declare.positive_length("Grid step", "5 m")
+
+    def unplaced_terrain(self, files: SpecFiles) -> Terrain:
+        """Return the fractal ground, drawn by its seed."""
+        terrain = self.flat_terrain()
+        shape = len(terrain.heights), len(terrain.heights)
+        return replace(terrain, heights=self.draw_heights(shape, terrain.spacing))
+
+
+class HillsGround(SquareGround):
+    """Smooth rolling ground, of mean height 0."""
+
+    kind: Literal["hills"]
+    spacing: float = declare.positive_length("Grid step", "1 m")
+    rms_height: float = declare.length("Standard deviation of the height", "10 m", "0 m")
+    correlation_length: float = declare.positive_length(
+        "Distance at which the correlation of heights is 1/e", "80 m"
+    )
+    seed: int = declare.seed()
+
+    def check_grid(self) -> None:
+        """Look at the number of grid steps, and at their size."""
+        super().check_grid()
+        if not self.correlation_length > 3 * self.spacing:
+            raise ValueError("hills need a correlation length over three grid steps")
+
+    def unplaced_terrain(self, files: SpecFiles) -> Terrain:
+        """Return the hills, drawn by their seed."""
+        from sweep.scenes.terrain import draw_hills
+
+        terrain = self.flat_terrain()
+        heights = draw_hills(
+            random_generator("hills", self.seed),
+            shape=(len(terrain.heights), len(terrain.heights)),
+            spacing=terrain.spacing,
+            rms_height=self.rms_height,
+            correlation_length=self.correlation_length,
+        )
+        return replace(terrain, heights=heights)

@@ -1,0 +1,443 @@
+"""Mistakes in a study of a scene beyond its single fields.
+
+Names and references, objects, files, the flight, and axes that would move the rays.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import sweep.spec.fields as declare
+import sweep.spec.flight_sections as flight_sections
+import sweep.spec.scene_sections as scene_sections
+from sweep.model import beam
+from sweep.model.ground import pattern as beamlet_pattern
+from sweep.model.outputs import CYCLES, NAVIGATION, POINTS, SHOTS, STATISTICS
+from sweep.model.resolution import PATTERN
+from sweep.scenes.map_frames import metres_per_height_unit
+from sweep.scenes.scene_files import SceneError
+from sweep.spec.axes import parameter_location
+from sweep.spec.fields import SpecFiles, iter_file_paths, read_or_none
+from sweep.spec.grid_checks import GridValues
+from sweep.spec.grid_checks import raw_value_at as raw_value_at
+from sweep.spec.ground_sections import Craters, Ground, JacksboroGround, RasterGround
+from sweep.spec.rules import Finding, Location, suggest_similar_name
+from sweep.spec.sections import default_value
+from sweep.units import QuantityError, read_unit
+
+SHOTS_PER_SCANNER_MAX = 10**9
+"""Shots of a scanner at most, as arrays of them are made."""
+
+RESERVED_SCANNER_NAMES = ("scene_map",)
+"""Names that a store has for other groups than its scanners."""
+_POSITIONED_SOLIDS = (scene_sections.Sphere, scene_sections.Box)
+OBJECTS_LOCATION: Location = ("scene", "objects")
+_ATTITUDE_TRIAL_TIMES = 257
+"""Times at which an attitude is tried."""
+
+
+def _raw_section(raw_spec: Mapping[str, Any], *path: str | int) -> dict[str, Any]:
+    """Return a mapping in a spec; empty where there is none."""
+    raw_section = raw_value_at(raw_spec, ".".join(map(str, path)))
+    return dict(raw_section) if isinstance(raw_section, Mapping) else {}
+
+
+def _read_sections(raw_sections: Mapping[str, Any], annotation: Any) -> dict[str, Any]:
+    """Parts of a kind in a section that can be read, by name."""
+    sections = {name: read_or_none(annotation, value) for name, value in raw_sections.items()}
+    return {name: section for name, section in sections.items() if section is not None}
+
+
+def scene_findings(raw_spec: Mapping[str, Any], base: Path | None) -> list[Finding]:
+    """Mistakes in scene, platform and scanners beyond their single fields.
+
+    Sections that cannot be read are passed over; files are left alone without a base.
+    """
+    objects = _read_sections(
+        _raw_section(raw_spec, *OBJECTS_LOCATION), scene_sections.AnySceneObject
+    )
+    scanners = _read_sections(_raw_section(raw_spec, "scanners"), flight_sections.AnyScanner)
+    platform = read_or_none(flight_sections.Platform, raw_spec.get("platform"))
+    findings = [
+        *_name_findings(
+            raw_spec, OBJECTS_LOCATION, lambda name: name == scene_sections.WORLD_ORIGIN, "scene"
+        ),
+        *_name_findings(
+            raw_spec, ("scanners",), lambda name: name in RESERVED_SCANNER_NAMES, "store"
+        ),
+        *_reference_findings(raw_spec, objects),
+    ]
+    for name, scene_object in objects.items():
+        findings += _object_findings(scene_object, (*OBJECTS_LOCATION, name))
+    file_findings = [] if base is None else list(_file_findings(objects, platform, base))
+    known_locations = {finding.location for finding in file_findings}
+    flight_findings = _flight_findings(platform, scanners, objects, base)
+    return (
+        findings
+        + file_findings
+        + [finding for finding in flight_findings if finding.location not in known_locations]
+    )
+
+
+# Names, references, files
+
+
+def _name_findings(
+    raw_spec: Mapping[str, Any],
+    section_location: Location,
+    is_taken: Callable[[str], bool],
+    owner: str,
+) -> Iterator[Finding]:
+    """Names of objects or scanners that can't be, and a section without any."""
+    raw_sections = _raw_section(raw_spec, *section_location)
+    for name in raw_sections:
+        try:
+            declare.name_rule("Name").read(name)
+        except QuantityError as error:
+            yield Finding((*section_location, name), "is no name", error.suggestion)
+        if is_taken(name):
+            yield Finding((*section_location, name), f"is a name that the {owner} has taken")
+    if not raw_sections and isinstance(
+        raw_value_at(raw_spec, ".".join(map(str, section_location))), Mapping
+    ):
+        yield Finding(section_location, "holds nothing", "name at least one")
+
+
+def _reference_findings(
+    raw_spec: Mapping[str, Any], objects: Mapping[str, Any]
+) -> Iterator[Finding]:
+    """Report references to objects that are missing or no ground, and a position of the origin."""
+    raw_objects = _raw_section(raw_spec, *OBJECTS_LOCATION)
+    if not raw_objects:
+        return
+    origin = _raw_section(raw_spec, "scene").get("origin", scene_sections.WORLD_ORIGIN)
+    if isinstance(origin, str) and origin != scene_sections.WORLD_ORIGIN:
+        yield from _ground_reference_findings(
+            origin, ("scene", "origin"), raw_objects, objects, ", or 'world'"
+        )
+        if any(getattr(objects.get(origin), "position", None) or ()):
+            problem, remedy = "places the scene's origin, which lies at zero", "leave it out, or "
+            yield Finding(
+                (*OBJECTS_LOCATION, origin, "position"), problem, f"{remedy}take another origin"
+            )
+    for name, raw_object in raw_objects.items():
+        ground_name = raw_object.get("on") if isinstance(raw_object, Mapping) else None
+        if isinstance(ground_name, str):
+            yield from _ground_reference_findings(
+                ground_name, (*OBJECTS_LOCATION, name, "on"), raw_objects, objects, ""
+            )
+
+
+def _ground_reference_findings(
+    name: str,
+    location: Location,
+    raw_objects: Mapping[str, Any],
+    objects: Mapping[str, Any],
+    extra_remedy: str,
+) -> Iterator[Finding]:
+    """One reference to a ground."""
+    grounds = [key for key, scene_object in objects.items() if isinstance(scene_object, Ground)]
+    remedy = f"the grounds are {', '.join(grounds)}" if grounds else "add a ground"
+    remedy += extra_remedy
+    if name not in raw_objects:
+        problem = "is no object of the scene"
+        yield Finding(
+            location, problem, suggest_similar_name(name, raw_objects, fallback=remedy), name
+        )
+    elif name in objects and name not in grounds:
+        yield Finding(location, "is no ground", remedy, name)
+
+
+def _file_findings(
+    objects: Mapping[str, Any], platform: flight_sections.Platform | None, base: Path
+) -> Iterator[Finding]:
+    """Files that are missing or can not be read."""
+    located_sections: list[tuple[Location, Any]] = [
+        ((*OBJECTS_LOCATION, name), section) for name, section in objects.items()
+    ]
+    located_sections += [] if platform is None else [(("platform",), platform)]
+    for location, section in located_sections:
+        for key_path, rule, file in iter_file_paths(section):
+            path = SpecFiles(base).resolve(file)
+            try:
+                rule.digest(path)
+            except SceneError as error:
+                is_companion = error.file != str(path)
+                companion_text = f"needs {error.file}, which " if is_companion else ""
+                problem = f"names a file that {companion_text}{error.problem}"
+                yield Finding((*location, *key_path), problem, error.remedy, file)
+
+
+# Objects
+
+
+def _construction_findings(construct: Callable[[], object], location: Location) -> list[Finding]:
+    """Refusal of the model to make a part."""
+    try:
+        construct()
+    except (ValueError, ArithmeticError) as error:
+        return [Finding(location, f"can not be made: {error}")]
+    return []
+
+
+def _object_findings(scene_object: Any, location: Location) -> Iterator[Finding]:
+    """Mistakes in an object at a location, its references and files apart."""
+    if isinstance(scene_object, Ground):
+        yield from _ground_findings(scene_object, location)
+    if isinstance(scene_object, RasterGround) and scene_object.height_unit is not None:
+        try:
+            metres_per_height_unit(scene_object.height_unit)
+        except QuantityError as error:
+            yield Finding((*location, "height_unit"), error.rule, "write m, ft or sft")
+    if isinstance(scene_object, scene_sections.SolidObject):
+        yield from _solid_findings(scene_object, location)
+    if isinstance(scene_object, scene_sections.Boulders):
+        yield from _diameter_findings(scene_object, location)
+    if (
+        isinstance(scene_object, scene_sections.Trees)
+        and not scene_object.tree.crown_base < scene_object.tree.height
+    ):
+        base_text, top_text = (
+            f"{scene_object.tree.crown_base:g} m",
+            f"{scene_object.tree.height:g} m",
+        )
+        field_location = (*location, "tree", "crown_base")
+        if "crown_base" in scene_object.tree.model_fields_set:
+            yield Finding(
+                field_location, f"must lie below the top, {top_text}", "lower it", base_text
+            )
+        else:
+            yield Finding(
+                field_location,
+                f"is {base_text} by default, and must lie below the top, {top_text}",
+                "lower it",
+            )
+
+
+def _diameter_findings(
+    section: scene_sections.Boulders | Craters, location: Location
+) -> Iterator[Finding]:
+    """Diameters without a range."""
+    if not section.smallest < section.largest:
+        problem = f"must exceed the smallest diameter, {section.smallest:g} m"
+        yield Finding((*location, "largest"), problem, "", f"{section.largest:g} m")
+
+
+def _ground_findings(ground: Ground, location: Location) -> Iterator[Finding]:
+    """Report a grid that can not be made, or that can not hold its craters."""
+    field_name = "middle" if isinstance(ground, JacksboroGround) else "spacing"
+    construction_findings = _construction_findings(ground.check_grid, (*location, field_name))
+    yield from construction_findings
+    if ground.craters is None:
+        return
+    yield from _diameter_findings(ground.craters, (*location, "craters"))
+    step, smallest = None if construction_findings else ground.grid_step(), ground.craters.smallest
+    if step is not None and smallest < 3 * step:
+        problem, remedy = (
+            f"must be three grid steps of {step:.3g} m or more",
+            "raise it, or make the ",
+        )
+        field_location = (*location, "craters", "smallest")
+        yield Finding(field_location, problem, f"{remedy}grid finer", f"{smallest:g} m")
+
+
+def _solid_findings(
+    scene_object: scene_sections.SolidObject, location: Location
+) -> Iterator[Finding]:
+    """Report a solid that is placed twice or nowhere, or whose lengths have no unit."""
+    position_location = (*location, "position")
+    if scene_object.motion is not None and scene_object.position is not None:
+        problem = "stands beside a motion, whose path places the object"
+        yield Finding(position_location, problem, "leave one of them out")
+    if (
+        isinstance(scene_object, _POSITIONED_SOLIDS)
+        and scene_object.motion is None
+        and scene_object.position is None
+    ):
+        yield Finding(position_location, "is missing", "write e.g. 'position: [0 m, 0 m, 10 m]'")
+    yield from _construction_findings(scene_object.rotation.to_quaternion, (*location, "rotation"))
+    if isinstance(scene_object, scene_sections.MeshObject) and scene_object.unit is not None:
+        try:
+            read_unit(scene_object.unit, si_unit="m", example="mm")
+        except QuantityError as error:
+            yield Finding((*location, "unit"), error.rule, error.suggestion, scene_object.unit)
+
+
+# The flight: paths, attitudes, scan patterns, and targets that move
+
+
+def _flight_findings(
+    platform: flight_sections.Platform | None,
+    scanners: Mapping[str, Any],
+    objects: Mapping[str, Any],
+    base: Path | None,
+) -> list[Finding]:
+    """Mistakes in platform, scanners and moving objects, of those that can be read."""
+    span: flight_sections.TimeSpan | None = None
+    findings: list[Finding] = []
+    files = SpecFiles(base or Path())
+    if platform is not None and (base is not None or not _reads_tables(platform)):
+        with contextlib.suppress(SceneError):  # which is found where the path is made
+            files = replace(files, time_origin=platform.read_time_origin(files))
+        findings += _motion_findings(platform, ("platform",), files, None)
+        if not findings:
+            path = platform.path.build_path(files)
+            span = path.start, path.stop
+    for name, scanner in scanners.items():
+        findings += _scanner_findings(scanner, ("scanners", name), span)
+    for name, scene_object in objects.items():
+        motion = getattr(scene_object, "motion", None)
+        if motion is not None and span is not None and (base or not _reads_tables(motion)):
+            findings += _motion_findings(motion, (*OBJECTS_LOCATION, name, "motion"), files, span)
+    return findings
+
+
+def _reads_tables(motion: flight_sections.RigidMotion) -> bool:
+    """Return true if a path or an attitude is read from a table."""
+    return motion.path.kind == "waypoints" or motion.attitude.kind == "track"
+
+
+def _motion_findings(
+    motion: flight_sections.RigidMotion,
+    location: Location,
+    files: SpecFiles,
+    span: flight_sections.TimeSpan | None,
+) -> Iterator[Finding]:
+    """Report a path or attitude that can not be flown, or a path shorter than the flight."""
+    field_name = "path"
+    try:
+        path = motion.path.build_path(files, span)
+        field_name = "attitude"
+        motion.build_attitude(files, path)
+        field_name = "mounting"
+        flight = motion.build_flight(files, span)
+        field_name = "attitude"
+        flight.state(np.linspace(path.start, path.stop, _ATTITUDE_TRIAL_TIMES))
+    except SceneError as error:
+        yield Finding(
+            (*location, field_name, "file"), f"names a file that {error.problem}", error.remedy
+        )
+        return
+    except (ValueError, ArithmeticError) as error:
+        yield Finding((*location, field_name), f"can not be made: {error}")
+        return
+    if span is not None and not (path.start <= span[0] and path.stop >= span[1]):
+        problem = (
+            f"lasts from {path.start:g} to {path.stop:g} s, and the flight from {span[0]:g} to "
+            f"{span[1]:g} s"
+        )
+        yield Finding((*location, "path"), problem, "make it last throughout the flight")
+
+
+def _scanner_findings(
+    scanner: Any, location: Location, span: flight_sections.TimeSpan | None
+) -> Iterator[Finding]:
+    """Report a scan pattern that can not be made, or makes no whole cycle or too many shots."""
+    construction_findings = _construction_findings(scanner.build_pattern, location)
+    yield from construction_findings
+    if construction_findings or span is None:
+        return
+    pattern = scanner.build_pattern()
+    shots_per_cycle = flight_sections.shots_per_cycle(pattern)
+    shots, flight = pattern.number(span[1] - span[0]), f"in a flight of {span[1] - span[0]:.6g} s"
+    if shots < shots_per_cycle:
+        problem = f"makes no whole cycle of {shots_per_cycle} shots {flight}"
+        yield Finding((*location, "rate"), problem, "raise it, or lengthen the flight")
+    elif shots > SHOTS_PER_SCANNER_MAX:
+        problem = (
+            f"makes {shots:.3g} shots {flight}, and a scanner has at most "
+            f"{SHOTS_PER_SCANNER_MAX:.0e}"
+        )
+        remedy = "lower the rate, or shorten the flight: mind times and speeds in platform.path"
+        yield Finding((*location, "rate"), problem, remedy)
+
+
+# Axes: what may vary while the light falls where it fell
+
+
+def stored_names() -> frozenset[str]:
+    """Names of a store's arrays and dimensions."""
+    output_tables = (SHOTS, CYCLES, STATISTICS, POINTS, NAVIGATION)
+    dims = (output.dims for table in output_tables for output in table.values())
+    return frozenset().union(*output_tables, *dims)
+
+
+_OTHER_STUDY_REMEDY = "make another study of it"
+_BEAM_PATHS = (
+    beam.DIVERGENCE,
+    beam.WAIST,
+    beam.QUALITY,
+    beam.FOCUS,
+    beam.RECEIVED_WAIST,
+    beam.COUPLING,
+)
+_ARRANGEMENT_PATHS = (
+    PATTERN, "footprint.phases", beam.ARCHITECTURE, beam.COUPLING, beam.WAIST, beam.FOCUS
+)  # fmt: skip
+"""Parameters that say where beamlets go."""
+_MOVES_BEAMLETS_REFUSAL = (
+    "moves the beamlets, and a study casts its rays once",
+    _OTHER_STUDY_REMEDY,
+)
+_AXIS_REFUSALS = {
+    "footprint.speckle": ("", ""),  # which moves no beamlet
+    "target.": ("is given by the scene, shot by shot", "change the scene or the flight"),
+    **dict.fromkeys((*_BEAM_PATHS, "footprint."), _MOVES_BEAMLETS_REFUSAL),
+    "accuracy.": ("says how closely to compute, the same for a whole study", _OTHER_STUDY_REMEDY),
+}
+
+
+def axis_refusal(path: str) -> tuple[str, str]:
+    """Why an axis can't set a parameter, and a remedy; empty where it can."""
+    return next(
+        (
+            refusal
+            for path_prefix, refusal in _AXIS_REFUSALS.items()
+            if path.startswith(path_prefix)
+        ),
+        ("", ""),
+    )
+
+
+def variation_findings(
+    parameters: Mapping[str, Any], path: str, values: Iterable[Any], location: Location
+) -> list[Finding]:
+    """Mistakes in one of the parameters taking several values, which stand at a location."""
+    problem, remedy = axis_refusal(path)
+    if problem:
+        return [Finding(location, problem, remedy)]
+    if path == beam.WAVELENGTH and not beam.is_thesis(parameters):
+        problem = "moves the beamlets, as the beam's radius follows from it, and rays are cast once"
+        return [Finding(location, problem, f"{_OTHER_STUDY_REMEDY}, or take coupling: aperture")]
+    if path != beam.ARCHITECTURE:
+        return []
+    variants = [parameters, *({**parameters, path: str(value)} for value in values)]
+    is_direct = {variant[path] == "direct" for variant in variants}
+    if len(set(map(beamlet_pattern, variants))) > 1 or (
+        len(is_direct) > 1 and not all(map(beam.is_thesis, variants))
+    ):
+        problem = "moves the beamlets between direct detection and the others"
+        remedy = f"{_OTHER_STUDY_REMEDY}, or take coherent phases and coupling: aperture"
+        return [Finding(location, problem, remedy)]
+    return []
+
+
+def scene_axis_findings(grid: GridValues) -> Iterator[Finding]:
+    """Axes of what can not vary on one geometry."""
+    parameters = {path: default_value(path) for path in _ARRANGEMENT_PATHS} | dict(grid.values)
+    if parameters[PATTERN] in ("line", "square"):
+        problem = "stands for a plane alone, and the ground of a scene is none"
+        yield Finding(("footprint", "pattern"), problem, "take hexagonal", parameters[PATTERN])
+    for axis in grid.axes:
+        for parameter in axis.parameters:
+            location = parameter_location(parameter.path, grid.axes)
+            yield from variation_findings(parameters, parameter.path, parameter.values, location)
+        if axis.is_zipped and axis.name in stored_names():
+            problem = "bears the name of something stored"
+            yield Finding(("axes", axis.name), problem, "take a word such as 'cut'")

@@ -1,0 +1,601 @@
+"""A scene: meshes and solids, objects on its ground, and the other parts of a study."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+import sweep.spec.fields as declare
+from sweep.scenes.scene_files import SceneError
+from sweep.spec.fields import SpecFiles, SpecSection
+from sweep.spec.flight_sections import Orientation, RigidMotion, TimeSpan
+from sweep.spec.ground_sections import (
+    ArrayGround,
+    Ground,
+    HillsGround,
+    ImageGround,
+    JacksboroGround,
+    Material,
+    PlacedGround,
+    PlaneGround,
+    RasterGround,
+    ReliefGround,
+    random_generator,
+)
+from sweep.spec.rules import rule_error
+from sweep.spec.sections import SPECTRA_METHOD, sunlight_field
+
+if TYPE_CHECKING:
+    from sweep.model.geometry.mesh import Mesh, Surface
+    from sweep.model.geometry.platform import Flight
+    from sweep.model.geometry.rays import Caster
+    from sweep.scenes.meshes import Facets, MeshReport
+    from sweep.scenes.scattered_objects import SizeFrequencyLaw
+    from sweep.scenes.terrain import Terrain
+
+
+Vector = tuple[float, ...]
+
+WORLD_ORIGIN = "world"
+"""The origin of a scene whose coordinates are as they are."""
+
+
+class SolidObject(Material, ABC):
+    """An object of its own, at rest or moving.
+
+    One that moves is placed by its path; its rotation is that in the moving body's frame.
+    """
+
+    position: Vector | None = declare.position(
+        "Where its own zero lies; its coordinates as they are", default=None
+    )
+    rotation: Orientation = Orientation()
+    motion: RigidMotion | None = None
+
+    def build_facets(self, files: SpecFiles) -> Facets:
+        """Its facets, turned, about its own zero; a `SceneError` for an unfit file."""
+        return self.unrotated_facets(files).transform(rotation=self.rotation.to_quaternion())
+
+    @abstractmethod
+    def unrotated_facets(self, files: SpecFiles) -> Facets:
+        """Its facets before they are turned."""
+
+
+class MeshObject(SolidObject):
+    """A mesh from a file."""
+
+    kind: Literal["mesh"]
+    file: str = declare.file_path(
+        "The mesh: STL, OBJ, PLY, OFF or glTF; polygons are cut into triangles"
+    )
+    unit: str | None = declare.text("Unit of its lengths; the file's own, or m", None)
+    up: str | None = declare.choice("Its vertical axis; y for glTF, else z", ("y", "z"), None)
+    scale: float = declare.number("Factor on all lengths", "2", "1e-9", "1e9", default=1.0)
+
+    def unrotated_facets(self, files: SpecFiles) -> Facets:
+        """Its facets before they are turned."""
+        from sweep.scenes.meshes import read_mesh
+
+        return read_mesh(files.resolve(self.file), unit=self.unit, up=self.up, scale=self.scale)
+
+
+class Sphere(SolidObject):
+    """A sphere of triangles whose corners lie on it."""
+
+    kind: Literal["sphere"]
+    radius: float = declare.positive_length("Radius", "1 m")
+    subdivisions: int = declare.count(
+        "Times that an icosahedron's faces are cut in four", "4", "0", "8", default=4
+    )
+
+    def unrotated_facets(self, files: SpecFiles) -> Facets:
+        """Its facets about its centre."""
+        from sweep.scenes.meshes import sphere_facets
+
+        return sphere_facets(radius=self.radius, subdivisions=self.subdivisions)
+
+
+class Box(SolidObject):
+    """A box."""
+
+    kind: Literal["box"]
+    size: Vector = declare.vector("Length along x, y and z", "m", "2 m")
+
+    def unrotated_facets(self, files: SpecFiles) -> Facets:
+        """Its facets about its middle."""
+        from sweep.scenes.meshes import box_facets
+
+        return box_facets(size=self.size)
+
+
+class MartianRocks(SpecSection):
+    """Rocks of the Martian plains (Golombek and Rapp 1997)."""
+
+    kind: Literal["martian_rocks"]
+    abundance: float = declare.number("Fraction of the ground under rocks", "5 %", "1e-9", "0.9")
+
+    def size_frequency_law(self) -> SizeFrequencyLaw:
+        """Size-frequency law."""
+        from sweep.scenes.scattered_objects import MartianRockLaw
+
+        return MartianRockLaw(self.abundance)
+
+
+class PowerLaw(SpecSection):
+    """A number per area that falls with a power of the diameter."""
+
+    kind: Literal["power"]
+    density: float = declare.quantity(
+        "Number per area of 1 m or larger", "m^-2", "0.01 m^-2", "1e-12 m^-2", "1e6 m^-2"
+    )
+    exponent: float = declare.number("Exponent", "2.5", "1e-3", "20")
+
+    def size_frequency_law(self) -> SizeFrequencyLaw:
+        """Size-frequency law."""
+        from sweep.scenes.scattered_objects import LeastPowerLaw
+
+        return LeastPowerLaw(((self.density, self.exponent),))
+
+
+class Boulders(Material):
+    """Half-ellipsoids on a ground."""
+
+    kind: Literal["boulders"]
+    on: str = declare.name("Ground that they lie on")
+    law: Annotated[MartianRocks | PowerLaw, Field(discriminator="kind")]
+    smallest: float = declare.positive_length("Smallest diameter", "0.5 m")
+    largest: float = declare.positive_length("Largest diameter", "3 m")
+    centre: Vector = declare.position(
+        "Middle of the square that they lie in", dimensions=2, default=(0.0, 0.0)
+    )
+    within: float | None = declare.positive_length(
+        "Side of that square; all of the ground by default", "200 m", default=None
+    )
+    height_ratio: float = declare.number("Height over diameter", "0.5", "1e-6", "10", default=0.5)
+    elongation: float = declare.number(
+        "Largest ratio of long to short axis", "1.5", "1", "10", default=1.5
+    )
+    subdivisions: int = declare.count("Refinement of their shape", "2", "0", "4", default=2)
+    seed: int = declare.seed()
+
+    def build_facets(self, ground: Terrain) -> Facets:
+        """Their facets on a ground in the scene's frame.
+
+        A ValueError for too many of them, or none of the ground within the square.
+        """
+        from sweep.scenes.scattered_objects import draw_boulders
+        from sweep.scenes.terrain import square_bounds
+
+        bounds = None
+        if self.within is not None:
+            bounds = square_bounds(ground, centre=self.centre, size=self.within)
+        field_names = {"smallest", "largest", "height_ratio", "elongation", "subdivisions"}
+        rng, law = random_generator("boulders", self.seed), self.law.size_frequency_law()
+        return draw_boulders(
+            rng, law, ground, bounds=bounds, **self.model_dump(include=field_names)
+        )
+
+
+class TreeMeasures(SpecSection):
+    """Mean measures of the trees of a clump."""
+
+    height: float = declare.positive_length("From the ground to the top", "12 m", default=12.0)
+    crown_diameter: float = declare.positive_length("Across", "7 m", default=7.0)
+    crown_base: float = declare.length("Height of its lower end", "3 m", "0 m", default=3.0)
+    trunk_diameter: float = declare.positive_length("At the ground", "40 cm", default=0.4)
+    leaf_length: float = declare.positive_length("Long diagonal of a leaf", "30 cm", default=0.30)
+    leaf_width: float = declare.positive_length("Short diagonal of a leaf", "20 cm", default=0.20)
+    leaf_area_index: float = declare.number(
+        "One-sided leaf area over that of the outline", "2", "0", "20", default=2.0
+    )
+    variation: float = declare.number(
+        "Share by which sizes vary to each side", "0.25", "0", "0.99", default=0.25
+    )
+
+
+class Trees(SpecSection):
+    """A clump of broad-leaved trees on a ground, of two materials."""
+
+    kind: Literal["trees"]
+    on: str = declare.name("Ground that they grow on")
+    centre: Vector = declare.position("Middle of the clump", dimensions=2, default=(0.0, 0.0))
+    radius: float = declare.positive_length("Trunks stand within it", "15 m")
+    number: int = declare.count("Trees", "7", at_most="10000")
+    tree: TreeMeasures = TreeMeasures()
+    leaf: Material
+    trunk: Material
+    seed: int = declare.seed()
+
+    def build_facets(self, ground: Terrain) -> Facets:
+        """Leaves (surface 0) and trunks (1) on a ground in the scene's frame.
+
+        A ValueError if there is no room for them, or one would stand off the ground.
+        """
+        from sweep.scenes.scattered_objects import MeanTree, plant_clump
+
+        return plant_clump(
+            random_generator("trees", self.seed),
+            ground,
+            centre=(self.centre[0], self.centre[1]),
+            radius=self.radius,
+            number=self.number,
+            tree=MeanTree(**self.tree.model_dump()),
+        )
+
+
+AnySceneObject = Annotated[
+    JacksboroGround
+    | RasterGround
+    | ArrayGround
+    | ImageGround
+    | PlaneGround
+    | ReliefGround
+    | HillsGround
+    | MeshObject
+    | Sphere
+    | Box
+    | Boulders
+    | Trees,
+    Field(discriminator="kind"),
+]
+
+
+def has_relief(scene_object: SpecSection) -> bool:
+    """Return true for ground that is no plane, and for what stands on it in numbers."""
+    if isinstance(scene_object, PlaneGround):
+        return scene_object.relief is not None or scene_object.craters is not None
+    return isinstance(scene_object, Ground | Boulders | Trees)
+
+
+def named_materials(name: str, scene_object: SpecSection) -> list[tuple[str, Material]]:
+    """Materials of an object with the names of their surfaces, in the order that faces count."""
+    if isinstance(scene_object, Trees):
+        return [(f"{name}.leaf", scene_object.leaf), (f"{name}.trunk", scene_object.trunk)]
+    assert isinstance(scene_object, Material)
+    return [(name, scene_object)]
+
+
+class Scene(SpecSection):
+    """Scene that the instrument flies over."""
+
+    origin: str = declare.name(
+        "Ground whose middle is the zero of all positions, or 'world'", WORLD_ORIGIN
+    )
+    objects: dict[str, AnySceneObject] = Field(description="What there is, by name")
+    solar_irradiance: float = sunlight_field("scene")
+
+
+class SceneDraws(SpecSection):
+    """Random realisations of the flight's radiometry."""
+
+    number: int = declare.count("Draws", "1000", at_most="1e9", default=1)
+    method: str = declare.choice(
+        "Draw against the probabilities, add noise to the bins, or draw whole spectra of each "
+        "shot for instrument.processing.detector and .estimator to look at",
+        ("probabilities", "noise", SPECTRA_METHOD),
+    )
+    returns: int = declare.count("Points kept of a shot at most", "4", at_most="64", default=4)
+
+    @property
+    def has_draws(self) -> bool:
+        """True, as a point cloud has one draw at the least."""
+        return True
+
+    @property
+    def draws_whole_spectra(self) -> bool:
+        """True if a detector and an estimator look at whole spectra."""
+        return self.method == SPECTRA_METHOD
+
+
+class Navigation(SpecSection):
+    """Velocity and altitude from each measurement cycle."""
+
+    test_level: float = declare.number(
+        "Chance that a test for faulty beams rejects a good cycle; 0 leaves it out",
+        "0.001", "0", "0.5", default=0.0,
+    )  # fmt: skip
+    ground_slope: float = declare.number(
+        "Standard deviation of the ground's slope, as far as it is known beforehand; 10 leaves "
+        "the slope to the points, 0 says that the ground is level",
+        "0.1", "0", "10", default=10.0,
+    )  # fmt: skip
+    relief: float = declare.length(
+        "Standard deviation of the ground's height about a plane; 0 says that it is a plane",
+        "1 m", "0 m", default=0.0,
+    )  # fmt: skip
+    terrain_slope: float = declare.number(
+        "Standard deviation of the slope of the surface that a single beam meets, as far as it is "
+        "known beforehand: it moves the range unseen while the beam slides, and is in the standard "
+        "errors of points",
+        "0.1", "0", "10", default=0.2,
+    )  # fmt: skip
+    target_speed: float = declare.quantity(
+        "Standard deviation of each component of the velocity of what the beams hit, as far as it "
+        "is known beforehand; it is in the standard errors of points",
+        "m/s", "10 m/s", "0 m/s", "10 km/s", default=0.0,
+    )  # fmt: skip
+    target_acceleration: float = declare.quantity(
+        "Standard deviation of the acceleration of what the beams hit, as far as it is known "
+        "beforehand; it is in the standard errors of points",
+        "m/s^2", "3 m/s^2", "0 m/s^2", "1000 m/s^2", default=0.0,
+    )  # fmt: skip
+
+
+class ErrorFloor(SpecSection):
+    """Standard deviations of an instrument's errors that no echo is strong enough to lower."""
+
+    pointing_error: float = declare.angle(
+        "Error of each beam's known direction, on each of two axes; the same all flight long, and "
+        "independent from beam to beam. Moves points, and velocities by as much of the velocity "
+        "across the beam",
+        "0.1 mrad", "0 rad", "10 deg", default=0.0,
+    )  # fmt: skip
+    clock_error: float = declare.number(
+        "Relative error of the sampling clock, common to all beams: scales ranges and velocities",
+        "1e-6", "0", "0.1", default=0.0,
+    )  # fmt: skip
+    wavelength_error: float = declare.number(
+        "Relative error of the known wavelength, common to all beams: scales velocities",
+        "1e-7", "0", "0.1", default=0.0,
+    )  # fmt: skip
+    vibration: float = declare.quantity(
+        "Velocity of the instrument's vibration along the beam, independent from shot to shot",
+        "m/s", "1 cm/s", "0 m/s", "1 km/s", default=0.0,
+    )  # fmt: skip
+    range_noise: float = declare.length(
+        "Error of ranges, independent from shot to shot", "1 cm", "0 m", "1 km", default=0.0
+    )
+
+
+_CLIPPING_NOTE = "what lies beyond is clipped and reported as invalid"
+
+
+class Interface(SpecSection):
+    """Reports of the unit as its interface control document states them; no part of the study's id.
+
+    ``sweep export --as reports`` makes them of stored points: nothing is computed anew.
+    """
+
+    range_quantum: float | None = declare.length(
+        "Step in which ranges are reported", "2 mm", "1 nm", "1 km", default=None
+    )
+    radial_velocity_quantum: float | None = declare.quantity(
+        "Step in which radial velocities are reported",
+        "m/s", "1 mm/s", "1e-9 m/s", "1 km/s", default=None,
+    )  # fmt: skip
+    min_range: float | None = declare.length(
+        f"Least range that a report can hold; {_CLIPPING_NOTE}", "10 m", "0 m", default=None
+    )
+    max_range: float | None = declare.length(
+        f"Largest range that a report can hold; {_CLIPPING_NOTE}", "5 km", "0 m", default=None
+    )
+    min_radial_velocity: float | None = declare.quantity(
+        f"Least radial velocity that a report can hold, positive when closing; {_CLIPPING_NOTE}",
+        "m/s", "-60 m/s", default=None,
+    )  # fmt: skip
+    max_radial_velocity: float | None = declare.quantity(
+        f"Largest radial velocity that a report can hold, positive when closing; {_CLIPPING_NOTE}",
+        "m/s", "220 m/s", default=None,
+    )  # fmt: skip
+    rate: float | None = declare.quantity(
+        "Reports of each beam per second; without it every shot is a report",
+        "Hz", "20 Hz", "1e-6 Hz", "1e9 Hz", default=None,
+    )  # fmt: skip
+    value: str = declare.choice(
+        "What a report holds of the valid shots in its period: their mean, or the last",
+        ("mean", "last"),
+    )
+    valid_shots: int = declare.count(
+        "Valid shots in its period that a report needs to be valid", "3", default=1
+    )
+    latency: float = declare.duration(
+        "Age of the measurement at the report's time stamp", "40 ms", "0 s", "1e4 s", default=0.0
+    )
+
+    @model_validator(mode="after")
+    def _check_limits_and_period(self) -> Self:
+        """Refuse limits that leave nothing between them, and numbers of shots without a period."""
+        for name in ("range", "radial_velocity"):
+            low, high = getattr(self, f"min_{name}"), getattr(self, f"max_{name}")
+            if low is not None and high is not None and low >= high:
+                problem = f"has a min_{name} that is not below its max_{name}"
+                raise rule_error(problem, f"write a lower min_{name}, or leave it out")
+        if self.rate is None and self.valid_shots > 1:
+            problem = (
+                f"wants {self.valid_shots} valid_shots, and without a rate a report is one shot"
+            )
+            raise rule_error(problem, "add e.g. 'rate: 20 Hz', or leave valid_shots out")
+        return self
+
+
+class SceneStorage(SpecSection):
+    """Division of results in the store; part of a study's identity."""
+
+    block_shots: int = declare.count("Shots that one block holds at most", "4096", default=4096)
+    block_draws: int = declare.count("Draws that one block holds at most", "64", default=64)
+
+
+# The scene, built: its objects as bodies that rays can be cast at
+
+
+class BuiltScene(NamedTuple):
+    """Bodies that rays are cast at, in the scene's frame."""
+
+    caster: Caster
+    """The bodies: all that rests is the first, if there is any, and each that moves another."""
+    surfaces: tuple[Surface, ...]
+    """Surfaces by their numbers."""
+    body_flights: tuple[Flight | None, ...]
+    """Motion of each of the caster's bodies; None for one at rest."""
+    mesh_reports: tuple[str, ...]
+    """Report of what loading found and mended, a line an object."""
+    origin: np.ndarray
+    """(3,): what was subtracted from the objects' own coordinates [m]."""
+    warnings: tuple[str, ...] = ()
+    """What is doubtful about the scene's files."""
+
+
+def scene_surfaces(scene: Scene) -> tuple[Surface, ...]:
+    """Surfaces of a scene in the order of their numbers."""
+    from sweep.model.geometry.mesh import Surface
+
+    return tuple(
+        Surface(name, material.reflectance, material.reflectance_law)
+        for key, scene_object in scene.objects.items()
+        for name, material in named_materials(key, scene_object)
+    )
+
+
+def scene_projection(scene: Scene, files: SpecFiles) -> str:
+    """WKT of the map projection of a scene's coordinates [m], or ''.
+
+    It is empty where rasters state none, or several. The scene's origin has to be added to
+    coordinates in a store.
+    """
+    from sweep.scenes.map_projection import metric_projection_wkt
+    from sweep.scenes.rasters import raster_digest
+
+    rasters = [
+        scene_object
+        for scene_object in scene.objects.values()
+        if isinstance(scene_object, RasterGround)
+    ]
+    projections = {
+        metric_projection_wkt(
+            files.resolve(scene_object.file, raster_digest), scene_object.metres_per_unit
+        )
+        for scene_object in rasters
+    }
+    return projections.pop() if len(projections) == 1 else ""
+
+
+def build_scene(scene: Scene, files: SpecFiles, span: TimeSpan) -> BuiltScene:
+    """Build a scene; a `SceneError` for an unfit file or object.
+
+    An object that stays in place does so for the `span` of the flight [s].
+    """
+    from sweep.model.geometry.mesh import merge
+    from sweep.model.geometry.rays import Caster
+
+    origin, grounds, warnings = _build_grounds(scene, files)
+    resting_meshes: list[Mesh] = []
+    moving_meshes: list[tuple[Mesh, Flight]] = []
+    reports = []
+    first_surface = 0
+    for name, scene_object in scene.objects.items():
+        try:
+            mesh, report = _build_mesh(
+                _build_object_facets(name, scene_object, grounds, origin, files), first_surface
+            )
+            motion = scene_object.motion if isinstance(scene_object, SolidObject) else None
+            if motion is None:
+                resting_meshes.append(mesh)
+            else:
+                moving_meshes.append((mesh, motion.build_flight(files, span)))
+        except (ValueError, ArithmeticError) as error:
+            raise _object_error(name, error) from None
+        del mesh
+        reports.append(f"{name}: {report.summary()}")
+        first_surface += len(named_materials(name, scene_object))
+    del grounds  # before the trees are built, which take the most memory
+    merged_meshes = [merge(resting_meshes)] if resting_meshes else []
+    resting_meshes.clear()
+    return BuiltScene(
+        Caster([*merged_meshes, *(mesh for mesh, _ in moving_meshes)]),
+        scene_surfaces(scene),
+        (*(None for _ in merged_meshes), *(flight for _, flight in moving_meshes)),
+        tuple(reports),
+        origin,
+        warnings,
+    )
+
+
+def _build_mesh(facets: Facets, first_surface: int) -> tuple[Mesh, MeshReport]:
+    """Mesh of facets whose surfaces are numbered from `first`, and its report."""
+    surface = (facets.surface + first_surface).astype(np.int16)
+    return replace(facets, surface=surface).to_mesh()
+
+
+def _object_error(name: str, error: Exception) -> SceneError:
+    """Mistakes in an object, as users are told it."""
+    return SceneError(f"scene.objects.{name}", f"can not be made: {error}", "change it")
+
+
+def _build_grounds(
+    scene: Scene, files: SpecFiles
+) -> tuple[np.ndarray, dict[str, Terrain], tuple[str, ...]]:
+    """Return the scene's origin, its grounds in the scene's frame, and what is doubtful of them."""
+    from sweep.scenes.map_frames import require_one_map
+    from sweep.scenes.tiles import join_tiles
+
+    ground_sections = {
+        name: ground_section
+        for name, ground_section in scene.objects.items()
+        if isinstance(ground_section, Ground)
+    }
+    terrains: dict[str, Terrain] = {}
+    for name, ground_section in ground_sections.items():
+        try:
+            terrains[name] = ground_section.unprocessed_terrain(files)
+        except (ValueError, ArithmeticError) as error:
+            raise _object_error(name, error) from None
+    map_frames = [
+        (name, terrain.map_frame)
+        for name, terrain in terrains.items()
+        if terrain.map_frame is not None
+    ]
+    require_one_map(map_frames)
+    names_without_crs = [name for name, map_frame in map_frames if not map_frame.wkt]
+    joined_terrains, warnings = join_tiles({name: terrains[name] for name, _ in map_frames})
+    if 0 < len(names_without_crs) < len(map_frames):
+        warnings += [
+            f"scene.objects.{name}: names no coordinate reference system, and is taken to lie on "
+            "the map of the other rasters"
+            for name in names_without_crs
+        ]
+    for name, terrain in (terrains | joined_terrains).items():
+        warnings += [f"scene.objects.{name}: {warning}" for warning in terrain.warnings]
+        try:
+            terrains[name] = ground_sections[name].process(terrain)
+        except (ValueError, ArithmeticError) as error:
+            raise _object_error(name, error) from None
+    origin = np.zeros(3)
+    if scene.origin in terrains:
+        origin = terrains[scene.origin].centre
+        if not np.isfinite(origin).all():
+            raise SceneError(
+                f"scene.objects.{scene.origin}",
+                "has a hole in its middle, which the scene's origin should be",
+                "take another origin, or 'world'",
+            )
+    grounds = {}
+    for name, terrain in terrains.items():
+        # One without coordinates of its own stands where its position says, beside the origin.
+        is_placed_in_scene = isinstance(scene.objects[name], PlacedGround) and name != scene.origin
+        shift = 0.0 if is_placed_in_scene else origin
+        grounds[name] = replace(terrain, origin=terrain.origin - shift)
+    return origin, grounds, tuple(warnings)
+
+
+def _build_object_facets(
+    name: str,
+    scene_object: Any,
+    grounds: Mapping[str, Terrain],
+    origin: np.ndarray,
+    files: SpecFiles,
+) -> Facets:
+    """Facets of an object in the scene's frame; of one that moves, in its own."""
+    if isinstance(scene_object, Ground):
+        return grounds[name].to_facets()
+    if isinstance(scene_object, Boulders | Trees):
+        return scene_object.build_facets(grounds[scene_object.on])
+    facets = scene_object.build_facets(files)
+    if scene_object.motion is not None:
+        return facets
+    position = -origin if scene_object.position is None else np.asarray(scene_object.position)
+    return replace(facets, origin=facets.origin + position)

@@ -1,0 +1,876 @@
+"""A study of a flat target over a grid, or of a flight over a scene; and what both have."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+from pydantic import ConfigDict, Field, PrivateAttr, ValidationError
+
+import sweep.spec.fields as declare
+import sweep.spec.scene_sections as scene_sections
+import sweep.spec.sections as sections
+from sweep.model import VERSION, accuracy, beam, looks, waveform
+from sweep.model.effects import circulator_leak
+from sweep.model.ground import pattern as beamlet_pattern
+from sweep.model.outputs import STRONGEST_OUTPUTS
+from sweep.model.resolution import BEAMLETS, is_open, rays_needed
+from sweep.model.threshold import WAYS
+from sweep.model.waveform import ENDS
+from sweep.safe_json import parse_json
+from sweep.spec.axes import (
+    Axis,
+    AxisParameter,
+    axis_identity,
+    first_values_on_axes,
+    read_axes,
+    read_in_unit,
+    remove_fields_on_axes,
+)
+from sweep.spec.fields import (
+    SpecFiles,
+    SpecSection,
+    identity_digest,
+    iter_file_paths,
+    iter_values,
+    read_or_none,
+    set_if_absent,
+    values_by_path,
+)
+from sweep.spec.figure_sections import (
+    NAVIGATION_SHOTS_MIN,
+    GridFigure,
+    SceneFigure,
+    grid_figure_findings,
+    scene_figure_findings,
+)
+from sweep.spec.flight_sections import AnyScanner, Platform, shots_per_cycle
+from sweep.spec.grid_checks import (
+    Condition,
+    GridValues,
+    flight_effect_findings,
+    grid_findings,
+    is_detector_or_estimator,
+    spectra_findings,
+    undrawn_effect_findings,
+)
+from sweep.spec.grid_checks import raw_value_at as raw_value_at
+from sweep.spec.ground_sections import OPTICAL_FIELDS
+from sweep.spec.rules import (
+    CustomRule,
+    Finding,
+    Location,
+    Mistake,
+    NumericRule,
+    Rule,
+    SpecError,
+    dotted_path,
+    format_raw_value,
+)
+from sweep.spec.scene_checks import (
+    axis_refusal,
+    scene_axis_findings,
+    scene_findings,
+    variation_findings,
+)
+from sweep.spec.yaml_document import (
+    Document,
+    InstrumentErrorFloor,
+    drop_extensions,
+    missing_instrument_remedy,
+    parse_document,
+    read_document,
+    resolve_instrument,
+    to_plain_data,
+    validation_findings,
+)
+from sweep.units import QuantityError
+
+if TYPE_CHECKING:
+    from sweep.model.geometry.mesh import Surface
+    from sweep.model.geometry.platform import Flight
+    from sweep.model.geometry.scanner import PointingJitter, Scanner
+
+
+GRID_POINTS_MAX = 10**15
+DRIFT_BINS_MIN = 2.0
+"""Drift of a speckled line within a record from which its stated errors are too small [bins]."""
+
+_DRIFT_SAMPLES = 1000
+"""Times of a flight at which its acceleration is looked at."""
+
+FILES_KEY = "files"
+"""Section of a stored study: the digest of each file by its path."""
+_SECTIONS_WITHOUT_DEFAULTS = ("question", "execution", "axes", "figures")
+"""Sections of a study of which no default is written out."""
+_AXES_RULE = CustomRule(description="What varies", reader=lambda axes: axes)
+"""Rule of axes, which `read_axes` has read before pydantic sees them."""
+
+
+class BaseSpec(SpecSection):
+    """A study as its user declared it, every value read and checked.
+
+    Made by `load` from a file and by `from_mapping` from plain data; values are SI.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", ignored_types=(cached_property,))
+
+    title: str = declare.text("What the study is called")
+    question: str = declare.text("The question that the study answers", "")
+    instrument: sections.Instrument
+    atmosphere: sections.Atmosphere = sections.Atmosphere()
+    footprint: sections.Footprint = sections.Footprint()
+    effects: sections.Effects = sections.Effects()
+    accuracy: sections.Accuracy = sections.Accuracy()
+    seed: int = declare.seed("Seed of all random draws")
+    execution: sections.Execution = sections.Execution()
+    axes: tuple[Axis, ...] = declare.field_of_rule(_AXES_RULE, ())
+
+    _yaml_mapping: dict[str, Any] = PrivateAttr(default_factory=dict)
+    _base: Path = PrivateAttr(default=Path())
+    _file_digests: dict[str, str] = PrivateAttr(default_factory=dict)
+    _instrument_floor: InstrumentErrorFloor | None = PrivateAttr(default=None)
+
+    @classmethod
+    def from_mapping(cls, mapping: Mapping[str, Any], *, base: Path | str = ".") -> Self:
+        """Spec from plain data, written as in a file.
+
+        Parameters
+        ----------
+        mapping : mapping
+            Content of a spec file; it is not changed.
+        base : path
+            Folder that the files which it names are relative to.
+
+        Raises
+        ------
+        SpecError
+            With every mistake in it.
+        """
+        if not isinstance(mapping, Mapping):
+            raise SpecError([Mistake("", "must be a mapping", format_raw_value(mapping))])
+        document = Document.from_plain_data(drop_extensions(to_plain_data(mapping)))
+        return cls.from_document(document, Path(base))
+
+    @classmethod
+    def from_stored(cls, json_text: str, base: Path | str | None = None) -> Self:
+        """Spec from the JSON that `to_json` gave, the same again but for its execution.
+
+        Files, relative to `base`, are not looked at before they are needed.
+        """
+        raw_spec = to_plain_data(parse_json(json_text))
+        if not isinstance(raw_spec, dict):
+            raise SpecError([Mistake("", "must be a mapping", format_raw_value(raw_spec))])
+        digests = raw_spec.pop(FILES_KEY, {})
+        spec = cls.from_document(Document(raw_spec), None)
+        spec._base, spec._file_digests = Path(base or "."), digests
+        return spec
+
+    @classmethod
+    def from_document(cls, document: Document, base: Path | None) -> Self:
+        """Spec from a document, which is changed.
+
+        Without a base it is a store's own document, whose files are left alone, and in which a
+        field and its axis may differ.
+        """
+        user_values = {} if base is None else _user_values_on_axes(document.content)
+        takes_floor = "error_floor" in cls.model_fields
+        is_instrument_resolved = resolve_instrument(
+            document, base or Path(), takes_floor=takes_floor
+        )
+        raw_spec = document.content
+        lacks_instrument = "instrument" not in raw_spec
+        filled_paths = [
+            path
+            for path, first_value in first_values_on_axes(raw_spec.get("axes")).items()
+            if cls.may_be_on_axis(path) and set_if_absent(raw_spec, path.split("."), first_value)
+        ]
+        axes, findings = read_axes(raw_spec.get("axes", {}))
+        all_axes_read = not findings
+        spec: Self | None = None
+        try:
+            spec = cls.model_validate({**raw_spec, "axes": axes})
+        except ValidationError as error:
+            findings += validation_findings(error, cls)
+        grid = GridValues.from_raw_spec(raw_spec, axes)
+        findings += grid_findings(grid)
+        findings += [*_size_findings(axes), *_segment_findings(grid), *_strongest_findings(grid)]
+        findings += cls.extra_findings(raw_spec, grid, base, all_axes_read)
+        findings += _contradiction_findings(user_values, axes)
+        # What is wrong with an axis or an instrument's file is told there, and there alone.
+        findings = [
+            finding
+            for finding in findings
+            if dotted_path(finding.location) not in filled_paths
+            and (is_instrument_resolved or finding.location[0] != "instrument")
+        ]
+        if lacks_instrument and filled_paths:  # an axis has filled in some of it
+            findings = [finding for finding in findings if finding.location[0] != "instrument"]
+            findings.insert(0, Finding(("instrument",), "is missing", missing_instrument_remedy()))
+        findings = document.findings + findings
+        if findings or spec is None:
+            raise SpecError(document.to_mistakes(findings))
+        spec._yaml_mapping = spec._fill_defaults(raw_spec)
+        spec._instrument_floor = document.instrument_floor
+        return spec
+
+    @classmethod
+    def may_be_on_axis(cls, path: str) -> bool:
+        """Return true: an axis may set every parameter of this kind of study."""
+        return True
+
+    @classmethod
+    def extra_findings(
+        cls, raw_spec: Mapping[str, Any], grid: GridValues, base: Path | None, all_axes_read: bool
+    ) -> list[Finding]:
+        """Mistakes in a spec as written beyond its single fields and its grid.
+
+        Files are left alone without a base. Not all axes may have been read.
+        """
+        return []
+
+    def parameters(self) -> dict[str, float | int | str]:
+        """SI values of all parameters by dotted path; of those on axes, the value off the axis."""
+        return {
+            path: value
+            for section in sections.MODEL_BY_SECTION
+            if section in type(self).model_fields
+            for path, value in values_by_path(getattr(self, section), (section,)).items()
+        }
+
+    def effect_modes(self) -> dict[str, str]:
+        """Mode of each effect by its name: `auto`, `on` or `off`."""
+        return values_by_path(self.effects)
+
+    def parameters_with(self, overrides: Mapping[str, object]) -> dict[str, float | int | str]:
+        """Parameters with some set anew, written as in a spec.
+
+        Parameters
+        ----------
+        overrides : mapping
+            Values by dotted path or its last part: ``{"range": "2 km"}``.
+
+        Raises
+        ------
+        SpecError
+            With every mistake in it, the combination's included.
+        """
+        parameters = self.parameters()
+        findings = []
+        for name, raw_value in overrides.items():
+            path, rule = _find_parameter(name, parameters | dict.fromkeys((*WAYS, *ENDS)))
+            if rule is None:
+                suggestion = sections.suggest_parameter(name, parameters)
+                findings.append(Finding((name,), "is no parameter", suggestion))
+                continue
+            try:
+                if path in WAYS:  # one takes another's place
+                    parameters = {
+                        other_path: other_value
+                        for other_path, other_value in parameters.items()
+                        if other_path not in WAYS
+                    }
+                parameters[path] = rule.read(raw_value)
+            except QuantityError as error:
+                findings.append(Finding((name,), error.rule, error.suggestion, raw_value))
+            findings += self.value_findings(path, parameters[path], (name,))
+        if not findings:
+            grid = GridValues(parameters, effect_modes=self.effect_modes())
+            findings = [*grid_findings(grid), *_strongest_findings(grid)]
+        if findings:
+            raise SpecError(Document({}).to_mistake(finding) for finding in findings)
+        return parameters
+
+    def value_findings(self, path: str, value: object, location: Location) -> list[Finding]:
+        """Mistakes in giving a parameter a value in this kind of study: none."""
+        return []
+
+    def axis_parameter(self, name: str) -> AxisParameter:
+        """Parameter on an axis, by its coordinate's name or dotted path; or a KeyError."""
+        for axis in self.axes:
+            for parameter in axis.parameters:
+                if name in (parameter.coordinate, parameter.path):
+                    return parameter
+        raise KeyError(name)
+
+    def read_coordinate(self, name: str, raw_value: object) -> float | int | str:
+        """Written value of a coordinate, in the unit that the coordinate is displayed in.
+
+        A KeyError where no axis has it, a `QuantityError` where the value cannot be read.
+        """
+        parameter = self.axis_parameter(name)
+        rule = sections.parameter_rules()[parameter.path]
+        if not isinstance(rule, NumericRule):
+            return str(rule.read(raw_value))
+        return read_in_unit(rule, raw_value, parameter.units)
+
+    def unstated_error_sentences(self) -> list[str]:
+        """Return sentences on errors whose size the spec does not state itself: none of a grid."""
+        return []
+
+    def identity(self) -> dict[str, Any]:
+        """Content that makes the study this one, in SI values.
+
+        Title, question, figures and execution are no part of it, nor are values that an axis
+        overrides. The order of the axes is: it lays out the arrays.
+        """
+        section_names = ("draws", "error_floor", "navigation", "storage")
+        return {
+            "model": VERSION,
+            "parameters": self.parameters_off_axes(),
+            "axes": [axis_identity(axis) for axis in self.axes],
+            "effects": self.effect_modes(),
+            "seed": self.seed,
+        } | {
+            name: values_by_path(getattr(self, name))
+            for name in section_names
+            if name in type(self).model_fields
+        }
+
+    def parameters_off_axes(self) -> dict[str, float | int | str]:
+        """SI values of the parameters that no axis overrides, by dotted path."""
+        paths_on_axes = {parameter.path for axis in self.axes for parameter in axis.parameters}
+        return {
+            path: value for path, value in self.parameters().items() if path not in paths_on_axes
+        }
+
+    @cached_property
+    def id(self) -> str:
+        """Hash of the identity, 32 hexadecimal digits."""
+        return identity_digest(self.identity())
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, type(self)):
+            return False
+        return (self._yaml_mapping, self._file_digests) == (
+            other._yaml_mapping,
+            other._file_digests,
+        )
+
+    def __hash__(self) -> int:
+        return hash(self.id)
+
+    def to_yaml_mapping(self) -> dict[str, Any]:
+        """Return the spec as a user would write it whole: no instrument file, no default left out.
+
+        What an axis sets is in no section: what the study holds is the same whether or not its
+        user wrote a value there too. Execution is left out, as it is no part of what a study is.
+        """
+        return copy.deepcopy(self._yaml_mapping)
+
+    def _fill_defaults(self, raw_spec: dict[str, Any]) -> dict[str, Any]:
+        """Return the spec with its defaults, without its execution and without what axes set."""
+        mapping = copy.deepcopy(
+            {name: value for name, value in raw_spec.items() if name != "execution"}
+        )
+        for path, rule, value in iter_values(self):
+            if path[0] not in _SECTIONS_WITHOUT_DEFAULTS:
+                set_if_absent(mapping, list(path), rule.format(value))
+        return remove_fields_on_axes(mapping)
+
+    def to_json(self) -> str:
+        """Return the spec as JSON text, for a store to hold, with the digests of its files."""
+        mapping = self.to_yaml_mapping() | (
+            {FILES_KEY: self._file_digests} if self._file_digests else {}
+        )
+        return json.dumps(mapping, ensure_ascii=False, allow_nan=False)
+
+
+def _find_parameter(name: str, known_paths: Mapping[str, object]) -> tuple[str, Rule | None]:
+    """Dotted path and rule of a parameter, by its path or its last part."""
+    rules = sections.parameter_rules()
+    paths = [path for path in known_paths if name in (path, sections.short_name(path))]
+    return (paths[0], rules[paths[0]]) if len(paths) == 1 else (name, None)
+
+
+def _segment_findings(grid: GridValues) -> Iterator[Finding]:
+    """Report segments whose beats do not tell range and velocity apart, and rules without laws."""
+    if grid.has_point({waveform.DOWN_SLOPE: lambda slope: slope == 1.0}):
+        problem = "is the slope of the segment 'up': range and velocity need two slopes"
+        yield grid.make_finding(waveform.DOWN_SLOPE, problem, "write another, or -1 for a triangle")
+    any_two_condition: dict[str, Condition] = {
+        waveform.SHOT_DETECTION: lambda rule: rule == waveform.ANY_TWO
+    }
+    slopes = {1.0, *grid.values_of(waveform.DOWN_SLOPE)}
+    if grid.has_point(
+        any_two_condition
+        | {waveform.DOPPLER_SLOPE: lambda doppler_slopes: np.isin(doppler_slopes, [*slopes])}
+    ):
+        problem = "is another segment's too, and these two tell neither range nor velocity: any_two"
+        yield grid.make_finding(
+            waveform.DOPPLER_SLOPE, problem, "write another, or take both_chirps"
+        )
+
+
+STRONGEST_PEAK_CONDITION: dict[str, Condition] = {
+    waveform.PEAKS: lambda peaks: peaks == waveform.STRONGEST
+}
+"""Condition on points whose segments report their strongest peak alone."""
+
+
+def _strongest_findings(grid: GridValues) -> Iterator[Finding]:
+    """Report the strongest peak alone where no law of it is known."""
+    several_looks: dict[str, Condition] = {
+        looks.NUMBER: lambda number: number > 1,
+        looks.COMBINE: lambda combination: combination != looks.COHERENT,
+    }
+    refused_combinations: tuple[tuple[dict[str, Condition], str, str], ...] = (
+        (several_looks, "is that of one record, and instrument.looks.number asks for several",
+         "combine: coherent"),
+        ({circulator_leak.PATH: lambda path: path > 0},
+         "may be the line of instrument.telescope.leak_path, whose noise has no law",
+         "leave the leak's path out"),
+        ({waveform.SHOT_DETECTION: lambda rule: rule == waveform.ANY_TWO},
+         "may be wrong in one of three segments, and shot_detection: any_two cannot tell in which",
+         "shot_detection: both_chirps"),
+    )  # fmt: skip
+    for conditions, problem, remedy in refused_combinations:
+        if grid.has_point(STRONGEST_PEAK_CONDITION | conditions):
+            yield grid.make_finding(waveform.PEAKS, problem, f"take all, or {remedy}")
+
+
+def _size_findings(axes: tuple[Axis, ...]) -> Iterator[Finding]:
+    """Report a grid too large to count."""
+    n_points = math.prod(axis.size for axis in axes)
+    if n_points > GRID_POINTS_MAX:
+        problem = f"make {n_points:.3g} points, and a study has at most {GRID_POINTS_MAX:.0e}"
+        yield Finding(("axes",), problem, "take fewer values")
+
+
+class GridSpec(BaseSpec):
+    """A study of a flat target over a grid of parameters, every value read and checked.
+
+    Made by `load` from a file and by `from_mapping` from plain data; values are SI.
+    """
+
+    target: sections.Target
+    draws: sections.Draws = sections.Draws()
+    storage: sections.Storage = sections.Storage()
+    figures: tuple[GridFigure, ...] = Field(
+        default=(), description="Figures and tables of the results"
+    )
+
+    @classmethod
+    def extra_findings(
+        cls, raw_spec: Mapping[str, Any], grid: GridValues, base: Path | None, all_axes_read: bool
+    ) -> list[Finding]:
+        """Figures of what the study lacks, random effects without draws, draws without an end."""
+        extra_variables = STRONGEST_OUTPUTS if grid.has_point(STRONGEST_PEAK_CONDITION) else ()
+        findings = (
+            list(grid_figure_findings(raw_spec, grid.axes, extra_variables))
+            if all_axes_read
+            else []
+        )
+        draws = read_or_none(sections.Draws, raw_spec.get("draws", {}))
+        if draws is not None:
+            findings += spectra_findings(draws, grid)
+            if draws.has_draws and grid.has_point(STRONGEST_PEAK_CONDITION):
+                problem = "has chances in closed form alone, and the study has draws"
+                findings.append(grid.make_finding(waveform.PEAKS, problem, "take all, or no draws"))
+            findings += () if draws.has_draws else undrawn_effect_findings(grid)
+            if draws.number and draws.limit:
+                problem = f"stands beside draws.number, {draws.number}: only one of them can say "
+                remedy = "keep limit to draw until accuracy.tolerance is met, or number to draw "
+                problem, remedy = f"{problem}how much to draw", f"{remedy}so many times"
+                findings.append(Finding(("draws", "limit"), problem, remedy, draws.limit))
+        return findings
+
+    @cached_property
+    def has_random_effects(self) -> bool:
+        """True if anything but noise may be random at any point."""
+        return any(
+            undrawn_effect_findings(GridValues(self.parameters(), self.axes, self.effect_modes()))
+        )
+
+    @property
+    def reports_strongest_peak(self) -> bool:
+        """True if segments report their strongest peak alone at any point."""
+        return GridValues(self.parameters(), self.axes).has_point(STRONGEST_PEAK_CONDITION)
+
+    def identity(self) -> dict[str, Any]:
+        """Content that makes the study this one, in SI values.
+
+        Settings of detectors and estimators for whole spectra count only if these are drawn.
+        """
+        identity = super().identity()
+        if not self.draws.draws_whole_spectra:
+            counted_parameters = {
+                p: v for p, v in identity["parameters"].items() if not is_detector_or_estimator(p)
+            }
+            identity["parameters"] = counted_parameters
+        return identity
+
+
+class SceneSpec(BaseSpec):
+    """A study of a flight over a scene, every value read and checked.
+
+    Made by `load` from a file and by `from_mapping` from plain data; values are SI.
+    """
+
+    scene: scene_sections.Scene
+    platform: Platform
+    scanners: dict[str, AnyScanner] = Field(description="Scan patterns by name")
+    draws: scene_sections.SceneDraws = scene_sections.SceneDraws()
+    error_floor: scene_sections.ErrorFloor = scene_sections.ErrorFloor()
+    navigation: scene_sections.Navigation = scene_sections.Navigation()
+    interface: scene_sections.Interface = Field(default_factory=scene_sections.Interface)
+    storage: scene_sections.SceneStorage = scene_sections.SceneStorage()
+    figures: tuple[SceneFigure, ...] = Field(
+        default=(), description="Figures and tables of the results"
+    )
+
+    @classmethod
+    def from_document(cls, document: Document, base: Path | None) -> Self:
+        """Spec from a document, which is changed, or all of its mistakes at once."""
+        spec = super().from_document(document, base)
+        if base is not None:
+            files = SpecFiles(base)
+            spec._base = base
+            paths_and_rules = [(file, rule) for _, rule, file in iter_file_paths(spec)]
+            spec._file_digests = {
+                file: rule.digest(files.resolve(file)) for file, rule in paths_and_rules
+            }
+        return spec
+
+    @classmethod
+    def extra_findings(
+        cls, raw_spec: Mapping[str, Any], grid: GridValues, base: Path | None, all_axes_read: bool
+    ) -> list[Finding]:
+        """Mistakes in scene, flight, files, random effects and figures."""
+        draws = (
+            read_or_none(scene_sections.SceneDraws, raw_spec.get("draws", {}))
+            or scene_sections.SceneDraws()
+        )
+        return [
+            *scene_findings(raw_spec, base),
+            *scene_axis_findings(grid),
+            *flight_effect_findings(grid, draws),
+            *scene_figure_findings(raw_spec, grid.axes if all_axes_read else None),
+        ]
+
+    @classmethod
+    def may_be_on_axis(cls, path: str) -> bool:
+        """Return true if an axis of this kind of study may set the parameter at a path."""
+        return not axis_refusal(path)[0]
+
+    def value_findings(self, path: str, value: object, location: Location) -> list[Finding]:
+        """Mistakes in a parameter taking a value without the geometry changing."""
+        return variation_findings(self.parameters(), path, [value], location)
+
+    @property
+    def base(self) -> Path:
+        """Folder that the scene's files are relative to."""
+        return self._base
+
+    @property
+    def files(self) -> SpecFiles:
+        """The scene's files, with the time in them at which the flight begins."""
+        files = SpecFiles(self._base, self._file_digests)
+        return replace(files, time_origin=self.platform.read_time_origin(files))
+
+    def parameters(self) -> dict[str, float | int | str]:
+        """SI values of all parameters by dotted path; of those on axes, the value off the axis."""
+        parameters = super().parameters()
+        if not self.draws.draws_whole_spectra:
+            parameters = {p: v for p, v in parameters.items() if not is_detector_or_estimator(p)}
+        n_rays = rays_needed(parameters, accuracy.Accuracy.of(parameters))
+        return parameters | {
+            "target.solar_irradiance": self.scene.solar_irradiance,
+            BEAMLETS: self.footprint.beamlets or n_rays,
+        }
+
+    @property
+    def is_ray_number_set_by_tolerance(self) -> bool:
+        """True if the tolerance says how many rays there are of each shot."""
+        return self.footprint.beamlets == 0 and is_open(self.parameters())
+
+    def surfaces(self) -> tuple[Surface, ...]:
+        """Surfaces by their numbers; no file is looked at."""
+        return scene_sections.scene_surfaces(self.scene)
+
+    def build_scene(self) -> scene_sections.BuiltScene:
+        """Build the scene; a `SceneError` for an unfit file or object."""
+        flight = self.build_flight()
+        return scene_sections.build_scene(self.scene, self.files, (flight.start, flight.stop))
+
+    def build_flight(self) -> Flight:
+        """Movement of the instrument in the scene's frame; a `SceneError` for an unfit table."""
+        return self.platform.build_flight(self.files)
+
+    def scan_pattern(self, name: str) -> Scanner:
+        """Return the scan pattern of a scanner."""
+        return self.scanners[name].build_pattern()
+
+    def shots_per_cycle(self, name: str) -> int:
+        """Shots of a measurement cycle of a scanner."""
+        return shots_per_cycle(self.scan_pattern(name))
+
+    @property
+    def has_navigation(self) -> bool:
+        """True if a scanner has the shots in a cycle that navigation takes."""
+        return any(self.shots_per_cycle(name) >= NAVIGATION_SHOTS_MIN for name in self.scanners)
+
+    def unstated_error_sentences(self) -> list[str]:
+        """Return sentences on errors whose size the spec does not state itself.
+
+        Those are the floor that its instrument brings, and errors that a navigation lacks.
+        """
+        sentences = []
+        floor_values, rules = (
+            dict(self.error_floor),
+            declare.rules_by_path(scene_sections.ErrorFloor, ""),
+        )
+        instrument_floor = self._instrument_floor
+        if instrument_floor and any(floor_values[name] for name in instrument_floor.fields):
+            fields = {
+                name: raw_value
+                for name, raw_value in instrument_floor.fields.items()
+                if floor_values[name]
+            }
+            brought_text = ", ".join(f"{name} {raw_value}" for name, raw_value in fields.items())
+            zero_text = ", ".join(f"{name}: {_smallest_value_text(rules[name])}" for name in fields)
+            sentences.append(
+                f"the instrument {instrument_floor.instrument} brings a floor of errors: "
+                f"{brought_text}. State "
+                f"error_floor in the study to change it; 'error_floor: {{{zero_text}}}' switches "
+                "it off"
+            )
+        if drift := self._line_drift_bins():
+            sentences.append(
+                f"the platform's acceleration drifts lines by up to {drift:.2g} bins within a "
+                "record: the standard errors of points on speckled ground, and of navigation, are "
+                "too small there, by 1.2 at 2.5 bins and by 1.7 at 5; shorter records drift less"
+            )
+        if not self.has_navigation:
+            return sentences
+        if not any(value for _, value in self.error_floor):
+            sentences.append(
+                "no floor of errors is stated (error_floor): velocity, altitude and their "
+                "covariances have the errors of noise and footprint alone, far below those of a "
+                "real instrument"
+            )
+        rough_objects = [
+            name
+            for name, scene_object in self.scene.objects.items()
+            if scene_sections.has_relief(scene_object)
+        ]
+        if rough_objects and not self.navigation.relief:
+            sentences.append(
+                f"no relief is stated (navigation.relief), and {', '.join(rough_objects)} is no "
+                "plane: the "
+                "altitude's variance knows of relief only by the residuals of the beams"
+            )
+        return sentences
+
+    def _line_drift_bins(self) -> float:
+        """Largest drift of a speckled line within a record by acceleration [bins].
+
+        0 below `DRIFT_MIN`, and for ground whose echoes have no developed speckle.
+        """
+        p = self.parameters()
+        if p["footprint.speckle"] != "developed":
+            return 0.0
+        sample_rate, wavelength = (
+            float(p[f"instrument.{name}"])
+            for name in ("processing.sample_rate", "laser.wavelength")
+        )
+        record_duration = float(np.max(waveform.record_length(p))) / sample_rate
+        flight = self.build_flight()
+        state = flight.state(np.linspace(flight.start, flight.stop, _DRIFT_SAMPLES))
+        acceleration_max = float(np.sqrt((state.acceleration**2).sum(axis=1)).max())
+        drift = 2 * acceleration_max * record_duration**2 / wavelength
+        return drift if drift > DRIFT_BINS_MIN else 0.0
+
+    def number_of_cycles(self, name: str) -> int:
+        """Whole measurement cycles of a scanner, all of whose shots begin during the flight."""
+        flight, pattern = self.build_flight(), self.scan_pattern(name)
+        return pattern.number(flight.stop - flight.start) // shots_per_cycle(pattern)
+
+    @property
+    def beamlet_pattern(self) -> str:
+        """Arrangement of the beamlets, `sweep.model.footprint.beamlets`'s word."""
+        return beamlet_pattern(self.parameters())
+
+    def footprint_angles(self) -> Callable[[np.ndarray], beam.Angles] | None:
+        """Angles of the beam's footprint by range; None where its divergence says all."""
+        parameters = self.parameters()
+        return None if beam.is_thesis(parameters) else partial(beam.angles, parameters)
+
+    def interface_with(self, overrides: Mapping[str, object]) -> scene_sections.Interface:
+        """Return the unit's interface with some fields set anew, written as in a spec."""
+        raw_fields = {
+            path[-1]: rule.format(value) for path, rule, value in iter_values(self.interface)
+        }
+        try:
+            return scene_sections.Interface.model_validate({**raw_fields, **overrides})
+        except ValidationError as error:
+            findings = validation_findings(error, scene_sections.Interface)
+        located_findings = [
+            replace(finding, location=("interface", *finding.location)) for finding in findings
+        ]
+        raise SpecError(map(Document({}).to_mistake, located_findings))
+
+    def pointing_jitter(self) -> PointingJitter | None:
+        """Random turns of the beams; None where there are none."""
+        from sweep.model.geometry.scanner import PointingJitter
+
+        sigma = self.platform.jitter
+        return PointingJitter(sigma, self.seed) if sigma else None
+
+    @property
+    def has_rotating_bodies(self) -> bool:
+        """True if any body of the scene turns."""
+        motions = (
+            getattr(scene_object, "motion", None) for scene_object in self.scene.objects.values()
+        )
+        return any(motion is not None and motion.attitude.kind != "fixed" for motion in motions)
+
+    def geometry_identity(self, name: str) -> dict[str, Any]:
+        """Content of what is seen through one scanner: all that rays depend on, and no more.
+
+        Names are no part of it, nor are reflectances, nor where files are: they count by content.
+        Objects count by their place in the scene, which their surfaces' numbers come from.
+        """
+        parameters, digests = self.parameters(), self._file_digests
+        index_by_name = {key: index for index, key in enumerate(self.scene.objects)}
+        objects = []
+        for scene_object in self.scene.objects.values():
+            values = values_by_path(scene_object, digests=digests)
+            values = {
+                path: value
+                for path, value in values.items()
+                if path.split(".")[-1] not in OPTICAL_FIELDS
+            }
+            objects.append(values | ({"on": index_by_name[values["on"]]} if "on" in values else {}))
+        return {
+            "objects": objects,
+            "origin": index_by_name.get(self.scene.origin, -1),
+            "platform": values_by_path(self.platform, digests=digests),
+            "scanner": values_by_path(self.scanners[name], digests=digests),
+            "model": VERSION,
+            "beamlets": parameters[BEAMLETS],
+            "pattern": self.beamlet_pattern,
+            "beam": {beam.DIVERGENCE: parameters[beam.DIVERGENCE]}
+            if beam.is_thesis(parameters)
+            else beam.shape(parameters),
+            "seed": self.seed if self.platform.jitter else 0,
+            "rotation": self.effect_modes()["rotation"] != "off",
+        }
+
+    def geometry_id(self, name: str) -> str:
+        """Hash of the geometry, 32 hexadecimal digits."""
+        return identity_digest(self.geometry_identity(name))
+
+    def identity(self) -> dict[str, Any]:
+        """Content that makes the study this one, in SI values.
+
+        Files count by content, and not by where they are. The order of objects is part of it: it
+        numbers the surfaces. A number of rays that follows from the tolerance counts as 0.
+        """
+        digests, automatic_beamlets = (
+            self._file_digests,
+            {BEAMLETS: 0} if self.is_ray_number_set_by_tolerance else {},
+        )
+        return super().identity() | {
+            "parameters": self.parameters_off_axes() | automatic_beamlets,
+            "objects": list(self.scene.objects),
+            "scene": values_by_path(self.scene, digests=digests),
+            "platform": values_by_path(self.platform, digests=digests),
+            "scanners": {
+                path: value
+                for name, scanner in self.scanners.items()
+                for path, value in values_by_path(scanner, (name,), digests).items()
+            },
+        }
+
+
+# Studies from files and from what a store holds, whichever their kind
+
+
+def load(path: str | Path) -> GridSpec | SceneSpec:
+    """Study in a YAML file: one of a flat target, or of a scene where it has a ``scene``.
+
+    Raises
+    ------
+    SpecError
+        With every mistake in it, each with its path, its line and a remedy.
+    """
+    if not isinstance(path, str | os.PathLike):
+        raise TypeError(
+            f"a study is loaded from the path of a YAML file, not from a {type(path).__name__}; "
+            "`sweep.spec.GridSpec.from_mapping(...)` makes one of plain data"
+        )
+    document = read_document(Path(path))
+    return _spec_class(document.content).from_document(document, Path(path).parent)
+
+
+def _user_values_on_axes(raw_spec: Any) -> dict[str, object]:
+    """Return the fields that a user has in a section although an axis sets them, as written.
+
+    An instrument's own file or the library may have them: an axis is there to change these.
+    """
+    if not isinstance(raw_spec, Mapping):
+        return {}
+    raw_values = {
+        path: raw_value_at(raw_spec, path, None)
+        for path in first_values_on_axes(raw_spec.get("axes"))
+    }
+    return {path: copy.deepcopy(value) for path, value in raw_values.items() if value is not None}
+
+
+def _contradiction_findings(
+    user_values: Mapping[str, object], axes: Sequence[Axis]
+) -> Iterator[Finding]:
+    """Report fields whose value, as written, is none of their axis."""
+    parameters_by_path = {
+        parameter.path: parameter for axis in axes for parameter in axis.parameters
+    }
+    for path, value in user_values.items():
+        if (parameter := parameters_by_path.get(path)) is None:
+            continue
+        try:
+            si_value = sections.parameter_rules()[path].read(value)
+        except QuantityError:  # told as a mistake of the field's own
+            continue
+        values = np.asarray(parameter.values)
+        is_number = values.dtype.kind in "fi" and not isinstance(si_value, str)
+        if (
+            np.isclose(values, si_value, rtol=1e-9, atol=0).any()
+            if is_number
+            else si_value in values
+        ):
+            continue
+        problem = f"is on the axis {parameter.coordinate} too, which does not have this value"
+        remedy = "leave it out here, or put it on the axis"
+        yield Finding(tuple(path.split(".")), problem, remedy, value)
+
+
+def from_stored(json_text: str, base: Path | str | None = None) -> GridSpec | SceneSpec:
+    """Study from the JSON that its `to_json` gave, as `Study.from_stored`."""
+    return _spec_class(parse_json(json_text)).from_stored(json_text, base)
+
+
+def _spec_class(raw_spec: Any) -> type[GridSpec] | type[SceneSpec]:
+    return SceneSpec if isinstance(raw_spec, dict) and "scene" in raw_spec else GridSpec
+
+
+def parse_field_values(text_by_path: Mapping[str, str]) -> dict[str, Any]:
+    """Values as a file has them, from text by path: ``{"axes.target.range": "[1 km, 2 km]"}``."""
+    yaml_text = "".join(f"{json.dumps(path)}: {value}\n" for path, value in text_by_path.items())
+    document = parse_document(yaml_text, Path("--set"))
+    if document.findings:
+        raise SpecError(map(document.to_mistake, document.findings))
+    return document.content
+
+
+def _smallest_value_text(rule: Rule) -> str:
+    """Return the smallest value of a field, as a user would write it."""
+    return rule.bounds.get("at_least", "0") if isinstance(rule, NumericRule) else "0"

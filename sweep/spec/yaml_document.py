@@ -1,0 +1,818 @@
+"""A spec as written: YAML with the line of every value, and every mistake in plain words.
+
+YAML becomes a `Document`, a plain mapping with the line of every value; what pydantic then finds
+wrong with it becomes findings, which the document gives their lines.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import yaml
+from pydantic import BaseModel, ValidationError
+
+import sweep.spec.fields as spec_fields
+from sweep.model.effects.phase_errors import ERROR_TABLE, NO_TABLE
+from sweep.model.threshold import PROCESSING, WAYS
+from sweep.regular_files import RefusedFileError, open_regular
+from sweep.safe_json import is_utf8_encodable
+from sweep.scenes.scene_files import SceneError, read_csv_columns
+from sweep.spec.figure_sections import GridFigure, SceneFigure
+from sweep.spec.rules import (
+    MISSING,
+    RULE_ERROR_TYPE,
+    Finding,
+    FindingsError,
+    Location,
+    Mistake,
+    NumericRule,
+    SpecError,
+    dotted_path,
+    findings_error,
+    format_raw_value,
+    suggest_similar_name,
+)
+from sweep.spec.sections import parameter_rules
+
+FILE_BYTES_MAX = 1_000_000
+NESTING_MAX = 30
+YAML_NODES_MAX = 200_000
+
+_INSTRUMENT_LOCATION: Location = ("instrument",)
+_EXAMPLE_INSTRUMENT = "settembrini_2026"
+"""Instrument of the library that remedies name."""
+_FLOOR_SECTION = "error_floor"
+_INSTRUMENT_FILE_SECTIONS = frozenset(
+    {"title", "source", "doi", "published", "assumed", "numbers", _FLOOR_SECTION, "instrument"}
+)
+"""Sections of an instrument's file; a study takes the last two."""
+_LIBRARY_FOLDER = Path(__file__).parents[1] / "instruments"
+_THRESHOLD_FIELDS = {way.removeprefix(PROCESSING) for way in WAYS}
+
+_NUMBER_DIGITS_MAX = 4000
+"""Of a number: Python reads no more, unless it is asked to."""
+_DECIMAL_PATTERN = re.compile(r"[+-]?(0|[1-9]\d*)(\.\d*)?([eE][+-]?\d{1,3})?")
+_PATH_REMEDY = "check the path, which is relative to the file that names it"
+_SYNTAX_REMEDY = "look at the brackets, quotes, colons and indentation there and above"
+_YAML_REMEDIES = {
+    "'\\t'": "indent with blanks, not with tabs",
+    "mapping values are not allowed": "put a blank after each colon, quotes around text that holds "
+    "': ', and the same number of blanks before fields of one section",
+    "found character": "put quotes around the text that holds it",
+    "undefined alias": "define it above as '&name', or put quotes around text that begins with *",
+    "another document": "keep one of them: a file holds one document, without lines '---' in it",
+    "unexpected end of stream": "close the quotes of the text that begins there",
+}
+"""Remedies by what YAML's parser says."""
+_STANDARD_TAGS = frozenset(
+    f"tag:yaml.org,2002:{kind}"
+    for kind in ("str", "int", "float", "bool", "null", "timestamp", "value", "map", "seq")
+)
+_MERGE_TAG = "tag:yaml.org,2002:merge"
+_MERGE_KEY = "<<"
+_EXTENSION_PREFIX = "x-"
+"""Beginning of the names of sections that hold anchors for others, and are no part of a spec."""
+
+
+class InstrumentErrorFloor(NamedTuple):
+    """Fields of a floor of errors that a study has from its instrument."""
+
+    instrument: str
+    """Name in the library, or path as written, of the instrument."""
+    fields: dict[str, Any]
+    """Fields that the study does not state, as the instrument's file has them."""
+
+
+@dataclass
+class Document:
+    """A spec as written: values, their places and what is already known to be wrong."""
+
+    content: dict[str, Any]
+    positions: dict[Location, tuple[str, int | None]] = field(default_factory=dict)
+    """File and line of each location; no file and no line if it was not read from one."""
+    findings: list[Finding] = field(default_factory=list)
+    """Mistakes found on reading."""
+    file: str = ""
+    """The file read; empty where there is none."""
+    n_nodes: int = 0
+    """YAML's nodes read, each as often as an alias repeats it."""
+    open_nodes: list[yaml.Node] = field(default_factory=list)
+    """Mappings being read, each within the one before."""
+    instrument_floor: InstrumentErrorFloor | None = None
+    """Floor of errors that comes with the instrument; None where the study states all of it."""
+
+    @classmethod
+    def from_plain_data(cls, content: dict[str, Any]) -> Document:
+        """Make a document of plain data, which is in no file."""
+        return cls(content, dict.fromkeys(_iter_locations(content, ()), ("", None)))
+
+    def read_node(self, node: yaml.Node, location: Location) -> Any:
+        """Value of one of YAML's nodes, whose places and mistakes are noted."""
+        self.n_nodes += 1
+        line = node.start_mark.line + 1
+        if self.n_nodes > YAML_NODES_MAX or max(len(location), len(self.open_nodes)) > NESTING_MAX:
+            path, problem = dotted_path(location)[:200], "holds too many values"
+            raise SpecError(
+                [Mistake(path, problem, "", "repeat less with aliases", line, self.file)]
+            )
+        self.positions.setdefault(location, (self.file, line))
+        if node.tag not in _STANDARD_TAGS:
+            problem = f"has the tag {node.tag}, and tags are not read"
+            self.findings.append(Finding(location, problem, "leave it out"))
+        if isinstance(node, yaml.MappingNode):
+            return self._read_mapping(node, location)
+        if isinstance(node, yaml.SequenceNode):
+            return [self.read_node(child, (*location, i)) for i, child in enumerate(node.value)]
+        return _read_scalar(node)
+
+    def _read_mapping(self, node: yaml.MappingNode, location: Location) -> dict[str, Any]:
+        """Read a mapping with text keys; of a key given twice the first counts.
+
+        A merge key, ``<<: *base``, brings the fields of other mappings that are not written here.
+        """
+        values: dict[str, Any] = {}
+        merged_nodes: list[yaml.Node] = []
+        self.open_nodes.append(node)
+        for key_node, value_node in node.value:
+            if not isinstance(key_node, yaml.ScalarNode):
+                problem = "has a key that is no word"
+                self.findings.append(Finding(location, problem, "begin it with a word"))
+                continue
+            key, line = key_node.value, key_node.start_mark.line + 1
+            key_location, is_merge = (*location, key), key_node.tag == _MERGE_TAG
+            if key in values or (is_merge and merged_nodes):
+                problem = f"is given twice, on lines {self.positions[key_location][1]} and {line}"
+                remedy = "write '<<: [*first, *second]'" if is_merge else "keep one"
+                self.findings.append(Finding(key_location, problem, remedy))
+                continue
+            self.positions[key_location] = (self.file, line)
+            if is_merge:
+                is_list = isinstance(value_node, yaml.SequenceNode)
+                merged_nodes = value_node.value if is_list else [value_node]
+            else:
+                values[key] = self.read_node(value_node, key_location)
+        fields: dict[str, Any] = {}
+        for merged_node in reversed(merged_nodes):  # of several the first counts
+            fields |= self._merged_fields(merged_node, location, values)
+        self.open_nodes.pop()
+        return fields | values
+
+    def _merged_fields(
+        self, node: yaml.Node, location: Location, written_fields: Mapping[str, Any]
+    ) -> dict[str, Any]:
+        """Fields of a mapping that a merge key names, and the places of those not written here.
+
+        What is wrong in the mapping is told where it stands, and not once more here.
+        """
+        merge_location = (*location, _MERGE_KEY)
+        if not isinstance(node, yaml.MappingNode):
+            problem = "must name a mapping by its anchor, or a list of such"
+            self.findings.append(Finding(merge_location, problem, "write e.g. '<<: *base'"))
+            return {}
+        if node in self.open_nodes:
+            self.findings.append(
+                Finding(merge_location, "merges a mapping into itself", "leave it out")
+            )
+            return {}
+        base_document = Document(
+            {}, file=self.file, n_nodes=self.n_nodes, open_nodes=self.open_nodes
+        )
+        fields: dict[str, Any] = base_document.read_node(node, location)
+        self.n_nodes, depth = base_document.n_nodes, len(location)
+        for inner_location, position in base_document.positions.items():
+            if len(inner_location) > depth and inner_location[depth] not in written_fields:
+                self.positions[inner_location] = position
+        return fields
+
+    def to_mistake(self, finding: Finding) -> Mistake:
+        """Give a finding its file and line; those of the nearest place around it that has any.
+
+        An instrument of the library is right by itself: what is wrong with its fields comes from
+        what the user has written, and is told there.
+        """
+        location = finding.location
+        while location and location not in self.positions:
+            location = location[:-1]
+        file, line = self.positions.get(location, (self.file, None))
+        path, value, rule = (
+            dotted_path(finding.location),
+            format_raw_value(finding.raw_value),
+            finding.problem,
+        )
+        if Path(file).parent == _LIBRARY_FOLDER and file != self.file:
+            library_value = _value_at(self.content, location)
+            rule += (
+                ""
+                if isinstance(library_value, dict)
+                else f" ({Path(file).stem} has {library_value})"
+            )
+            value = ""
+            file, line = self._locate_cause(finding)
+        return Mistake(path, rule, value, finding.suggestion, line, file)
+
+    def _locate_cause(self, finding: Finding) -> tuple[str, int | None]:
+        """File and line at which the user has set off a mistake in a field of the library's.
+
+        That is a field that the finding names, by its path or in words, else one of the same
+        section, else the instrument.
+        """
+        location, message = finding.location, f"{finding.problem} {finding.suggestion}"
+        section = location if isinstance(_value_at(self.content, location), dict) else location[:-1]
+        user_positions = {
+            field_location: position
+            for field_location, position in self.positions.items()
+            if position[0] == self.file
+        }
+        user_fields = [
+            field_location
+            for field_location in user_positions
+            if len(field_location) > 1 and field_location[1] != "like"
+        ]
+        user_fields.sort(
+            key=lambda field_location: {"instrument": 0, "axes": 1}.get(str(field_location[0]), 2)
+        )
+        words_by_location = {
+            field_location: str(field_location[-1]).rpartition(".")[2].replace("_", " ")
+            for field_location in user_fields
+        }
+        candidates = [
+            *(tuple(path.split(".")) for path in re.findall(r"[a-z_]\w*(?:\.\w+)+", message)),
+            *(
+                field_location
+                for field_location, words in words_by_location.items()
+                if re.search(rf"\b{re.escape(words)}\b", message)
+            ),
+            *(field_location for field_location in user_fields if field_location[:-1] == section),
+            (*_INSTRUMENT_LOCATION, "like"),
+            _INSTRUMENT_LOCATION,
+        ]
+        return next(
+            (
+                user_positions[field_location]
+                for field_location in candidates
+                if field_location in user_positions
+            ),
+            (self.file, None),
+        )
+
+    def to_mistakes(self, findings: Iterable[Finding]) -> list[Mistake]:
+        """Return findings as they stand in the file, each once; those in other files come last."""
+        mistakes = dict.fromkeys(self.to_mistake(finding) for finding in findings)
+        return sorted(
+            mistakes,
+            key=lambda mistake: (mistake.file != self.file, mistake.file, mistake.line or 0),
+        )
+
+
+def _iter_locations(value: Any, location: Location) -> Iterator[Location]:
+    """Yield the locations of a value in plain data and of all that is in it."""
+    yield location
+    if isinstance(value, dict):
+        for key, inner_value in value.items():
+            yield from _iter_locations(inner_value, (*location, key))
+    elif isinstance(value, list):
+        for i, inner_value in enumerate(value):
+            yield from _iter_locations(inner_value, (*location, i))
+
+
+def _read_scalar(node: yaml.Node) -> Any:
+    """Read a number, truth value, nothing or text; numbers in decimal notation only."""
+    tag = node.tag.rsplit(":", 1)[-1]
+    if tag == "null":
+        return None
+    if tag == "bool":
+        return node.value.lower() in ("yes", "true", "on")
+    is_short = len(node.value) <= _NUMBER_DIGITS_MAX
+    if is_short and tag in ("int", "float") and _DECIMAL_PATTERN.fullmatch(node.value):
+        return int(node.value) if node.value.lstrip("+-").isdigit() else float(node.value)
+    return node.value
+
+
+def read_document(path: Path) -> Document:
+    """Read the mapping in a YAML file; lesser mistakes in it are left in the document.
+
+    Raises
+    ------
+    SpecError
+        Where the file is no readable YAML mapping.
+    """
+    return parse_document(_read_text(path), path)
+
+
+def parse_document(text: str, path: Path) -> Document:
+    """Parse a mapping in YAML text; mistakes in it are reported as those of a file."""
+    try:
+        root = yaml.compose(text, Loader=_DepthLimitedLoader)
+    except yaml.MarkedYAMLError as error:
+        mark, context_mark = error.problem_mark or error.context_mark, error.context_mark
+        yaml_problem = f"{error.problem or error.context}".replace("\t", "\\t")
+        problem = f"is no valid YAML: {yaml_problem}"
+        if mark and context_mark and context_mark.line < mark.line:
+            problem += f" (in what begins on line {context_mark.line + 1})"
+        remedy = next(
+            (
+                remedy_text
+                for phrase, remedy_text in _YAML_REMEDIES.items()
+                if phrase in yaml_problem
+            ),
+            _SYNTAX_REMEDY,
+        )
+        raise _file_error(path, problem, remedy, mark.line + 1 if mark else None) from None
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        problem = f"is no valid YAML: {str(error).splitlines()[0]}"
+        raise _file_error(path, problem, _SYNTAX_REMEDY) from None
+    document = Document({}, file=str(path))
+    if not isinstance(root, yaml.MappingNode):
+        problem = "holds nothing" if root is None else "must hold a mapping of fields to values"
+        raise _file_error(path, problem, "write e.g. 'title: A study', and a field on each line")
+    document.content = drop_extensions(document.read_node(root, ()))
+    return document
+
+
+def drop_extensions(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Content of a file without the sections that hold anchors for others, ``x-...``."""
+    return {
+        name: value for name, value in content.items() if not name.startswith(_EXTENSION_PREFIX)
+    }
+
+
+def _read_text(path: Path) -> str:
+    """Text of a file of reasonable size."""
+    try:
+        with open(open_regular(path), "rb") as file:
+            content = file.read(FILE_BYTES_MAX + 1)
+    except FileNotFoundError:
+        raise _file_error(path, "does not exist", suggest_similar_file(path)) from None
+    except IsADirectoryError:
+        raise _file_error(path, "is a directory", "name a YAML file") from None
+    except RefusedFileError as error:
+        raise _file_error(path, error.strerror or "", "name a YAML file") from None
+    except (OSError, ValueError) as error:
+        problem = f"cannot be read: {getattr(error, 'strerror', '') or error}"
+        raise _file_error(path, problem, _PATH_REMEDY) from None
+    if len(content) > FILE_BYTES_MAX:
+        problem = f"is larger than {FILE_BYTES_MAX} bytes"
+        raise _file_error(path, problem, "give long axes as generators")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise _file_error(path, "is no UTF-8 text", "save it as UTF-8") from None
+
+
+def _file_error(
+    path: Path, problem: str, suggestion: str = "", line: int | None = None
+) -> SpecError:
+    return SpecError([Mistake("", problem, "", suggestion, line, str(path))])
+
+
+def suggest_similar_file(path: Path, *, fallback: str = _PATH_REMEDY) -> str:
+    """Suggestion of a YAML file near a missing one, by its name without the suffix."""
+    try:
+        names = {
+            sibling.stem: sibling.name
+            for sibling in path.parent.iterdir()
+            if sibling.suffix in (".yaml", ".yml")
+        }
+    except OSError:
+        return fallback
+    suggestion = suggest_similar_name(path.stem, names)
+    for stem, name in names.items():
+        suggestion = suggestion.replace(repr(stem), repr(name))
+    return suggestion or fallback
+
+
+class _DepthLimitedLoader(yaml.SafeLoader):
+    """YAML's safe loader, which refuses deep nesting before Python's stack does."""
+
+    depth = 0
+
+    def compose_scalar_node(self, anchor: Any) -> Any:
+        """Scalar of the document, whose escapes make whole characters."""
+        node = super().compose_scalar_node(anchor)  # type: ignore[no-untyped-call]
+        if not is_utf8_encodable(node.value):
+            problem = "an escape there is half of a surrogate pair, and no character"
+            raise yaml.MarkedYAMLError(problem=problem, problem_mark=node.start_mark)
+        return node
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        """One node of the document."""
+        self.depth += 1
+        if self.depth > NESTING_MAX:
+            mark = self.peek_event().start_mark  # type: ignore[no-untyped-call]
+            raise yaml.MarkedYAMLError(problem="it is nested too deeply", problem_mark=mark)
+        node = super().compose_node(parent, index)  # type: ignore[no-untyped-call]
+        self.depth -= 1
+        return node
+
+
+def resolve_instrument(document: Document, base: Path, *, takes_floor: bool = False) -> bool:
+    """Put an instrument of the library or of a file in the place of its name; False without one.
+
+    With ``takes_floor`` an instrument whose file has an ``error_floor`` brings that too, to a study
+    that may have one; fields that the study states itself take its place.
+    """
+    raw_instrument = document.content.get("instrument")
+    reference, location = raw_instrument, _INSTRUMENT_LOCATION
+    overrides: dict[str, Any] = {}
+    if isinstance(raw_instrument, dict):
+        _read_error_table(document, raw_instrument, base)
+        if "like" in raw_instrument and "file" in raw_instrument:
+            problem = "names another instrument, besides instrument.like"
+            document.findings.append(Finding(("instrument", "file"), problem, "keep one of them"))
+            return False
+        key = next((key for key in ("like", "file") if key in raw_instrument), "")
+        if not key:
+            return True
+        reference, location = raw_instrument[key], ("instrument", key)
+        overrides = {name: value for name, value in raw_instrument.items() if name != key}
+    elif not isinstance(raw_instrument, str):
+        return True
+    try:
+        instrument_document = _read_instrument(reference, location, base)
+    except FindingsError as error:
+        document.findings += error.findings
+        return False
+    instrument_fields = instrument_document.content["instrument"]
+    _read_error_table(document, instrument_fields, Path(instrument_document.file).parent)
+    document.content["instrument"] = merge_mappings(
+        _drop_threshold(instrument_fields, overrides), overrides
+    )
+    if takes_floor and _FLOOR_SECTION in instrument_document.content:
+        _merge_error_floor(document, instrument_document.content[_FLOOR_SECTION], str(reference))
+    kept_positions = {
+        value_location: position
+        for value_location, position in document.positions.items()
+        if _is_leaf(document.content, value_location)
+    }
+    instrument_positions = {
+        value_location: position
+        for value_location, position in instrument_document.positions.items()
+        if value_location[:1] in (_INSTRUMENT_LOCATION, (_FLOOR_SECTION,))
+        and value_location != _INSTRUMENT_LOCATION
+    }
+    document.positions = document.positions | instrument_positions | kept_positions
+    document.findings += instrument_document.findings
+    return True
+
+
+def _merge_error_floor(document: Document, instrument_floor: object, instrument_name: str) -> None:
+    """Put an instrument's floor of errors where a study does not state its own."""
+    study_floor = document.content.get(_FLOOR_SECTION, {})
+    if not isinstance(study_floor, Mapping):  # which is told
+        return
+    if not isinstance(instrument_floor, Mapping):
+        document.content.setdefault(
+            _FLOOR_SECTION, instrument_floor
+        )  # what is wrong with it is told as of the study's
+        return
+    document.content[_FLOOR_SECTION] = merge_mappings(instrument_floor, study_floor)
+    if added_fields := {
+        name: value for name, value in instrument_floor.items() if name not in study_floor
+    }:
+        document.instrument_floor = InstrumentErrorFloor(instrument_name, added_fields)
+
+
+def _read_error_table(document: Document, instrument: dict[str, Any], base: Path) -> None:
+    """Put the rows of a CSV file of the sweep's error in the place of its path."""
+    chirp, (*_, name) = instrument.get("chirp"), ERROR_TABLE.split(".")
+    if not isinstance(chirp, dict) or not isinstance(chirp.get(name), str):
+        return
+    if (raw_path := chirp[name]) == NO_TABLE:
+        return
+    columns, example = {"time": "s", "error": "Hz"}, "time [us], error [kHz]"
+    try:
+        table = read_csv_columns(base / os.path.expanduser(raw_path), columns, columns, example)
+    except SceneError as error:
+        problem = f"names a file that {error.problem}"
+        location = tuple(ERROR_TABLE.split("."))
+        document.findings.append(Finding(location, problem, error.remedy, raw_path))
+        chirp[name] = NO_TABLE
+        return
+    rows = zip(table["time"].tolist(), table["error"].tolist(), strict=True)
+    chirp[name] = [[f"{time!r} s", f"{error!r} Hz"] for time, error in rows]
+
+
+def _read_instrument(reference: object, location: Location, base: Path) -> Document:
+    """Document of an instrument, where it stands as in a spec."""
+    if not isinstance(reference, str):
+        if "file" in location:
+            remedy = "write it relative to this file"
+            raise findings_error(location, "must be the path of a YAML file", remedy, reference)
+        problem = "must be the name of an instrument of the library"
+        raise findings_error(
+            location, problem, f"the library has {', '.join(library_instruments())}", reference
+        )
+    file, files_by_name = base / os.path.expanduser(reference), library_instruments()
+    if "file" not in location and reference in files_by_name:
+        return read_document(files_by_name[reference])
+    is_plain_word = not re.search(r"[/\\]|\.ya?ml$", reference) and not os.path.exists(file)
+    if "like" in location or (is_plain_word and "file" not in location):
+        normalised_name = re.sub(r"\W+", "_", reference.strip().lower())
+        remedy = suggest_similar_name(
+            normalised_name, files_by_name, fallback=f"the library has {', '.join(files_by_name)}"
+        )
+        raise findings_error(location, "is no instrument of the library", remedy, reference)
+    try:
+        instrument_document = read_document(file)
+    except SpecError as error:
+        problem = f"names a file that {error.mistakes[0].problem}"
+        raise findings_error(location, problem, error.mistakes[0].suggestion, reference) from None
+    return _normalise_instrument_file(instrument_document)
+
+
+def _normalise_instrument_file(document: Document) -> Document:
+    """Document of a user's instrument, in the sections that a file of the library has.
+
+    Its file has them as well, or the instrument's fields at its root.
+    """
+    if "instrument" not in document.content:
+        floor_section = (
+            {_FLOOR_SECTION: document.content.pop(_FLOOR_SECTION)}
+            if _FLOOR_SECTION in document.content
+            else {}
+        )
+
+        def move_below_instrument(location: Location) -> Location:
+            return (
+                location
+                if location[:1] == (_FLOOR_SECTION,)
+                else (*_INSTRUMENT_LOCATION, *location)
+            )
+
+        places = {
+            move_below_instrument(location): position
+            for location, position in document.positions.items()
+        }
+        findings = [
+            replace(finding, location=move_below_instrument(finding.location))
+            for finding in document.findings
+        ]
+        return Document(
+            {"instrument": document.content, **floor_section}, places, findings, document.file
+        )
+    findings, places = list(document.findings), dict(document.positions)
+    for name in sorted(document.content.keys() - _INSTRUMENT_FILE_SECTIONS):
+        problem = "is no section of an instrument's file"
+        remedy = suggest_similar_name(
+            name, _INSTRUMENT_FILE_SECTIONS, fallback="leave it out of that file"
+        )
+        findings.append(Finding((*_INSTRUMENT_LOCATION, name), problem, remedy))
+        places[(*_INSTRUMENT_LOCATION, name)] = places[(name,)]
+    instrument_fields = document.content["instrument"]
+    if not isinstance(instrument_fields, dict):
+        problem = "must be a mapping of fields to values in an instrument's file"
+        raise findings_error(
+            _INSTRUMENT_LOCATION,
+            problem,
+            f"write them below 'instrument:' in {document.file}",
+            instrument_fields,
+        )
+    return Document(document.content, places, findings, document.file)
+
+
+def library_instruments() -> dict[str, Path]:
+    """Files of the instruments that a spec may name, by name.
+
+    Each file also names its publication, and the numbers that it must reproduce.
+
+    >>> "settembrini_2026" in library()
+    True
+    """
+    return {file.stem: file for file in sorted(_LIBRARY_FOLDER.glob("*.yaml"))}
+
+
+def _drop_threshold(instrument: Any, overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """Return an instrument without its threshold, where the overrides set one in any way."""
+    base_processing, new_processing = instrument.get("processing"), overrides.get("processing")
+    if not (
+        isinstance(base_processing, Mapping)
+        and isinstance(new_processing, Mapping)
+        and _THRESHOLD_FIELDS & new_processing.keys()
+    ):
+        return dict(instrument)
+    return instrument | {
+        "processing": {k: v for k, v in base_processing.items() if k not in _THRESHOLD_FIELDS}
+    }
+
+
+def to_plain_data(data: Any, location: Location = ()) -> Any:
+    """Copy plain data as YAML would give it: dicts with text keys, and lists."""
+    if len(location) > NESTING_MAX:
+        raise SpecError([Mistake(dotted_path(location), "is nested too deeply")])
+    if isinstance(data, int) and data.bit_length() > _NUMBER_DIGITS_MAX:
+        raise SpecError([Mistake(dotted_path(location), "is a number of too many digits")])
+    if isinstance(data, Mapping) and not all(is_utf8_encodable(str(key)) for key in data):
+        raise SpecError([Mistake(dotted_path(location), "has a key that is no text")])
+    if isinstance(data, str) and not is_utf8_encodable(data):
+        raise SpecError(
+            [Mistake(dotted_path(location), "has half of a surrogate pair, and is no text")]
+        )
+    if isinstance(data, Mapping):
+        return {
+            str(key): to_plain_data(value, (*location, str(key))) for key, value in data.items()
+        }
+    if isinstance(data, list | tuple):
+        return [to_plain_data(value, (*location, i)) for i, value in enumerate(data)]
+    return data
+
+
+def merge_mappings(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """Lay overrides over a mapping, field by field."""
+    result = dict(base)
+    for key, value in overrides.items():
+        base_value = result.get(key)
+        are_mappings = isinstance(base_value, Mapping) and isinstance(value, Mapping)
+        result[key] = merge_mappings(base_value, value) if are_mappings else value  # type: ignore[arg-type]
+    return result
+
+
+def _value_at(value: Any, location: Location) -> Any:
+    """Value at a location; empty text where there is none."""
+    try:
+        for key in location:
+            value = value[key]
+    except (KeyError, IndexError, TypeError):
+        return ""
+    return value
+
+
+def _is_leaf(value: Any, location: Location) -> bool:
+    """Return true if the location holds something other than a mapping."""
+    for key in location:
+        try:
+            value = value[key]
+        except (KeyError, IndexError, TypeError):
+            return True
+    return not isinstance(value, dict)
+
+
+# Pydantic's errors in plain words
+
+_PROBLEM_BY_ERROR_TYPE = {
+    "model_type": "must be a mapping of fields to values",
+    "model_attributes_type": "must be a mapping of fields to values",
+    "dict_type": "must be a mapping",
+    "list_type": "must be a list",
+    "tuple_type": "must be a list",
+    "invalid_key": "must be a word",
+}
+_SCENE_ONLY_REMEDY = "it is for studies with a scene, in place of a target"
+_OTHER_SPEC_REMEDIES = {
+    **dict.fromkeys(("scene", "target"), "a study has a scene or a target, not both"),
+    **dict.fromkeys(
+        ("platform", "scanners", "error_floor", "navigation", "interface"), _SCENE_ONLY_REMEDY
+    ),
+}
+"""Remedy for a section that only the other kind of study has."""
+
+_SPEC_OF_FIGURE_KIND = {
+    spec_fields.kind_of_model(model): target
+    for kind, target in ((GridFigure, "a target"), (SceneFigure, "a scene"))
+    for model in spec_fields.models_of_annotation(kind)
+}
+"""Whose studies make a kind of figure."""
+
+
+def validation_findings(error: ValidationError, annotation: Any) -> list[Finding]:
+    """Everything pydantic found wrong with a mapping read as `root`, one model or several."""
+    return [
+        _validation_finding(dict(detail), annotation) for detail in error.errors(include_url=False)
+    ]
+
+
+def _validation_finding(detail: dict[str, Any], annotation: Any) -> Finding:
+    """One error of pydantic's."""
+    error_type, raw_value = detail["type"], detail["input"]
+    resolved = spec_fields.resolve_location(detail["loc"], annotation)
+    location = resolved.location
+    if error_type == RULE_ERROR_TYPE:
+        context, path = detail["ctx"], dotted_path(location)
+        if isinstance(raw_value, list | dict) and path in parameter_rules() and path != ERROR_TABLE:
+            values = "[...]" if isinstance(raw_value, list) else "{linear: [...], number: ...}"
+            remedy = f"put several under axes: '{path}: {values}'"
+            return Finding(location, "takes one value", remedy, raw_value)
+        shown_value = MISSING if isinstance(raw_value, dict) else raw_value
+        return Finding(location, context["rule"], context["suggestion"], shown_value)
+    if error_type == "missing":
+        return Finding(location, "is missing", _missing_field_remedy(resolved))
+    if error_type == "extra_forbidden":
+        models_by_kind = {
+            spec_fields.kind_of_model(model): model
+            for model in spec_fields.models_of_annotation(annotation)
+        }
+        model = models_by_kind.get(detail["loc"][0], annotation)
+        return Finding(location, "is no field", _suggest_field(resolved, model))
+    if error_type == "union_tag_invalid":
+        tag, kind_names = (
+            detail["ctx"]["tag"],
+            [spec_fields.kind_of_model(model) for model in resolved.value_models],
+        )
+        problem = f"must be one of {', '.join(kind_names)}"
+        return Finding((*location, "kind"), problem, _suggest_kind(str(tag), kind_names), tag)
+    if error_type == "union_tag_not_found":
+        return Finding(
+            location, "lacks its kind", f"write {_kind_hint(resolved.value_models)}", raw_value
+        )
+    problem = _PROBLEM_BY_ERROR_TYPE.get(error_type, "has a value that cannot stand here")
+    remedy = (
+        _missing_field_remedy(resolved)
+        if resolved.value_models
+        else _list_remedy(resolved, error_type)
+    )
+    return Finding(location, problem, remedy, raw_value)
+
+
+def _list_remedy(resolved: spec_fields.ResolvedLocation, error_type: str) -> str:
+    """Remedy for what must be a list or a mapping of parts, and is none."""
+    if error_type in ("list_type", "tuple_type"):
+        return "put it in brackets, [...], or on lines that begin with '- '"
+    return (
+        f"write '{resolved.location[-1]}:' with a name and its fields below"
+        if error_type == "dict_type"
+        else ""
+    )
+
+
+def _kind_hint(models: spec_fields.ModelClasses) -> str:
+    """Text that a part of several kinds is written with."""
+    return f"kind: and one of {', '.join(map(spec_fields.kind_of_model, models))}"
+
+
+def _suggest_kind(tag: str, kind_names: list[str]) -> str:
+    """Suggestion for a kind that is none of those here."""
+    if tag in _SPEC_OF_FIGURE_KIND and kind_names[0] in _SPEC_OF_FIGURE_KIND:
+        return f"{tag} is for studies of {_SPEC_OF_FIGURE_KIND[tag]}"
+    return suggest_similar_name(tag, kind_names)
+
+
+def _missing_field_remedy(resolved: spec_fields.ResolvedLocation) -> str:
+    """Remedy for a missing field or section."""
+    name, section = resolved.location[-1], resolved.location[:-1]
+    if resolved.location == _INSTRUMENT_LOCATION:
+        return missing_instrument_remedy()
+    field = (
+        spec_fields.fields_by_name(resolved.section_models[0]).get(str(name))
+        if resolved.section_models
+        else None
+    )
+    rule = spec_fields.rule_of_field(field) if field is not None else None
+    example = rule.example if rule is not None else ""
+    if example:
+        may_vary = (
+            isinstance(rule, NumericRule) and dotted_path(resolved.location) in parameter_rules()
+        )
+        return f"write e.g. '{name}: {example}'" + (", or put it on an axis" if may_vary else "")
+    if isinstance(name, int) and resolved.value_models:
+        has_kinds = len(resolved.value_models) > 1
+        field_names = (
+            _kind_hint(resolved.value_models)
+            if has_kinds
+            else ", ".join(spec_fields.fields_by_name(resolved.value_models[0]))
+        )
+        return f"write a mapping with {field_names}"
+    if len(resolved.value_models) > 1:
+        return f"write '{name}:' with {_kind_hint(resolved.value_models)}"
+    if resolved.value_models:
+        remedy = (
+            f"write '{name}:' with "
+            f"{', '.join(spec_fields.fields_by_name(resolved.value_models[0]))}"
+        )
+        like_remedy = f", or take all that is missing from another: 'like: {_EXAMPLE_INSTRUMENT}'"
+        return remedy + (like_remedy if section == _INSTRUMENT_LOCATION else "")
+    return f"write '{name}: ...'"
+
+
+def missing_instrument_remedy() -> str:
+    """Remedy for a study without an instrument."""
+    return (
+        f"write e.g. 'instrument: {{like: {_EXAMPLE_INSTRUMENT}}}' (the library has "
+        f"{', '.join(library_instruments())}), "
+        "or all of its sections"
+    )
+
+
+def _suggest_field(resolved: spec_fields.ResolvedLocation, root_model: type[BaseModel]) -> str:
+    """Field that an unknown one resembles: beside it, else anywhere."""
+    name = str(resolved.location[-1])
+    sibling_names = [
+        field for model in resolved.section_models for field in spec_fields.fields_by_name(model)
+    ]
+    if name in _OTHER_SPEC_REMEDIES and resolved.section_models == (root_model,):
+        return _OTHER_SPEC_REMEDIES[name]
+    known_paths = dict.fromkeys((*parameter_rules(), *spec_fields.rules_by_path(root_model, "")))
+    if name[:1].isdigit():
+        return "a comma begins another field here: write numbers with a point, such as 2.5"
+    if name in known_paths:
+        section, _, field = name.rpartition(".")
+        return f"write '{field}: ...' in the section '{section}'"
+    matching_paths = [path for path in known_paths if path.rsplit(".", 1)[-1] == name]
+    if matching_paths:
+        return f"did you mean '{matching_paths[0]}'?"
+    if suggestion := suggest_similar_name(name, sibling_names):
+        return suggestion
+    return f"the fields here are {', '.join(sibling_names)}" if sibling_names else ""

@@ -1,0 +1,138 @@
+"""Files that users and other programs have put into the folder of a store.
+
+They are listed, and never removed: where another store takes the place of this one, they move
+into it. A store's document and its list of objects name its arrays. Their metadata and chunks, and
+the files of the journal, are sweep's; all else is foreign.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from contextlib import suppress
+from fnmatch import fnmatch
+from pathlib import Path
+
+from sweep.regular_files import read_below
+from sweep.safe_json import parse_json
+from sweep.storage.size_checks import METADATA_BYTES_MAX
+
+#: Files that programs leave in any folder; nobody misses them.
+LITTER_PATTERNS = (
+    ".DS_Store", "._*", ".snakemake_timestamp", ".nfs*", ".fuse_hidden*", ".directory",
+    "Thumbs.db", "desktop.ini",
+)  # fmt: skip
+
+_JOURNAL_DIR = ".sweep"
+_JOURNAL_FILE_NAME = re.compile(
+    r"(receipts|failures|sessions|template)\.jsonl|recipe\.json|partial|begun-\d+|"
+    r"lock(\.guard|\.[0-9a-f]{32})?|clock-\d+-[0-9a-f]{8}"
+)
+_DRAFT_NAME = re.compile(r".+\.[0-9a-f]{32}\.partial")
+
+
+def is_litter(name: str) -> bool:
+    """Tell whether a file is one that programs leave everywhere.
+
+    >>> is_litter(".DS_Store"), is_litter("pd_up/.nfs000000000123"), is_litter("notes.txt")
+    (True, True, False)
+    """
+    base_name = name.rstrip("/").rpartition("/")[2]
+    return any(fnmatch(base_name, pattern) for pattern in LITTER_PATTERNS)
+
+
+def is_draft(name: str) -> bool:
+    """Tell whether a file is one that sweep had not finished writing."""
+    return bool(_DRAFT_NAME.fullmatch(name))
+
+
+def list_foreign_files(store: Path) -> list[str]:
+    """Names of what is in the folder of a store and not sweep's; of folders with a slash behind."""
+    node_names = _node_names(store)
+    return sorted(
+        _iter_foreign_files(store, "", node_names, {*node_names, *_iter_parent_groups(node_names)})
+    )
+
+
+def _node_names(store: Path) -> set[str]:
+    """Arrays and groups that a store was made with, as far as it still says so."""
+    node_names: set[str] = set()
+    with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
+        root_metadata = parse_json(read_below(store, "zarr.json", METADATA_BYTES_MAX))
+        node_names |= set(root_metadata["consolidated_metadata"]["metadata"])
+    with suppress(OSError):
+        manifest = read_below(store, f"{_JOURNAL_DIR}/template.jsonl", METADATA_BYTES_MAX)
+        for line in manifest.splitlines():
+            with suppress(ValueError, TypeError, AttributeError):
+                object_name = str(parse_json(line).get("object", ""))
+                if object_name.endswith("/zarr.json"):
+                    node_names.add(object_name.removesuffix("/zarr.json"))
+    if not node_names:  # spectra, and what has lost both
+        node_names |= {path.parent.name for path in store.glob("*/zarr.json")}
+    return node_names
+
+
+def _iter_parent_groups(node_names: set[str]) -> Iterator[str]:
+    """Return the groups that nodes lie in."""
+    for node in node_names:
+        while node := node.rpartition("/")[0]:
+            yield node
+
+
+def _iter_foreign_files(
+    folder: Path, prefix: str, node_names: set[str], known_folders: set[str]
+) -> Iterator[str]:
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            name, is_folder = prefix + entry.name, entry.is_dir(follow_symlinks=False)
+            if name == _JOURNAL_DIR:
+                yield from _iter_foreign_journal_files(entry.path) if is_folder else ()
+            elif entry.name == "c" and prefix.rstrip("/") in node_names:
+                yield from _iter_foreign_chunk_files(entry.path, f"{name}/") if is_folder else ()
+            elif name in known_folders:  # a link in its place is damage, and no file of the user's
+                nested_foreign_files = _iter_foreign_files(
+                    Path(entry.path), f"{name}/", node_names, known_folders
+                )
+                yield from nested_foreign_files if is_folder else ()
+            elif is_folder or not (entry.name == "zarr.json" or is_draft(entry.name)):
+                yield f"{name}/" if is_folder else name
+
+
+def _iter_foreign_journal_files(folder: str) -> Iterator[str]:
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            if not (_JOURNAL_FILE_NAME.fullmatch(entry.name) or is_draft(entry.name)):
+                slash = "/" if entry.is_dir(follow_symlinks=False) else ""
+                yield f"{_JOURNAL_DIR}/{entry.name}{slash}"
+
+
+def _iter_foreign_chunk_files(folder: str, prefix: str) -> Iterator[str]:
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            is_folder = entry.is_dir(follow_symlinks=False)
+            if not entry.name.isdecimal():
+                if is_folder or not entry.name.endswith(".partial"):
+                    yield f"{prefix}{entry.name}{'/' if is_folder else ''}"
+            elif is_folder:
+                yield from _iter_foreign_chunk_files(entry.path, f"{prefix}{entry.name}/")
+
+
+def move_foreign_files(old_store: Path, new_store: Path) -> None:
+    """Move what is foreign in a folder to the one that takes its place; OSError where it can't.
+
+    A file whose name is taken there gets a number behind its name.
+    """
+    if not old_store.is_dir() or old_store.is_symlink():
+        return
+    for name in list_foreign_files(old_store):
+        if is_litter(name):
+            continue
+        target = new_store / name
+        suffix_number = 1
+        while os.path.lexists(target):
+            target = (new_store / name).with_name(f"{Path(name).name}.{suffix_number}")
+            suffix_number += 1
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with suppress(FileNotFoundError):  # another process has moved it
+            os.rename(old_store / name, target)

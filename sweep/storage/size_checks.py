@@ -1,0 +1,310 @@
+"""Files of a store's arrays, looked at before Zarr decodes them: their size, and what they declare.
+
+A few kilobytes of zstd can declare, and decode to, more than any memory holds. The metadata of an
+array, which are checked before, give the size of its chunks. So a file that is larger than it can
+be, or a frame that declares another size, or none, is refused unread.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import math
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numcodecs.zstd import Zstd
+from zarr.abc.store import OffsetByteRequest, RangeByteRequest, SuffixByteRequest
+from zarr.core.buffer import default_buffer_prototype
+from zarr.storage import LocalStore, ObjectStore
+
+from sweep.regular_files import RefusedFileError, check_size, read_below
+
+#: Bytes of the document of a group or an array at most.
+METADATA_BYTES_MAX = 64 << 20
+
+#: Bytes of a word on a text axis at most.
+STRING_BYTES_MAX = 1 << 16
+
+#: Bytes of any file of an array at most: 2 GB before compression, which may add a little.
+ARRAY_FILE_BYTES_MAX = (1 << 31) + (1 << 25)
+
+_CHECKSUM_BYTES = 4
+_SHARD_INDEX_ENTRY_BYTES = 16  # offset and length of a chunk in a shard
+_EMPTY_INDEX_ENTRY = 2**64 - 1
+_ZSTD_HEADER_BYTES_MAX = 18  # of a zstd frame
+_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+_ZSTD_CODEC = Zstd()
+
+
+def compressed_bytes_max(raw_bytes: int) -> int:
+    """Bytes that so many can come to as a chunk: zstd's own bound, and the checksum's.
+
+    >>> packed_bytes_max(1_000_000)
+    1003970
+    """
+    return raw_bytes + (raw_bytes >> 8) + 64 + _CHECKSUM_BYTES
+
+
+class ArrayFileLayout(NamedTuple):
+    """Form of the files of an array."""
+
+    values_per_chunk: int  # values of a chunk
+    bytes_per_value: int  # 0 of text
+    chunks_per_shard: int  # of a shard; 0 where a file is one chunk
+
+    @classmethod
+    def from_metadata(cls, node: Mapping[str, Any]) -> ArrayFileLayout:
+        """Return the form that the checked metadata of an array declare."""
+        file_shape = chunk_shape = node["chunk_grid"]["configuration"]["chunk_shape"]
+        is_string = node["data_type"] == "string"
+        codec, chunks_per_shard = node["codecs"][0], 0
+        if codec["name"] == "sharding_indexed":
+            chunk_shape = codec["configuration"]["chunk_shape"]
+            chunks_per_shard = math.prod(
+                -(-file_length // chunk_length)
+                for file_length, chunk_length in zip(file_shape, chunk_shape, strict=True)
+            )
+        bytes_per_value = 0 if is_string else np.dtype(node["data_type"]).itemsize
+        return cls(math.prod(chunk_shape), bytes_per_value, chunks_per_shard)
+
+    @property
+    def chunk_bytes_max(self) -> int:
+        """Bytes of a chunk before compression; of text at most."""
+        if self.bytes_per_value:
+            return self.values_per_chunk * self.bytes_per_value
+        return 4 + self.values_per_chunk * (4 + STRING_BYTES_MAX)
+
+    @property
+    def file_bytes_max(self) -> int:
+        """Bytes that a file can have."""
+        if not self.chunks_per_shard:
+            return compressed_bytes_max(self.chunk_bytes_max)
+        compressed_chunk_bytes = compressed_bytes_max(self.chunk_bytes_max)
+        return (
+            self.chunks_per_shard * (compressed_chunk_bytes + _SHARD_INDEX_ENTRY_BYTES)
+            + _CHECKSUM_BYTES
+        )
+
+    def check_file(self, content: bytes, path_in_messages: str) -> None:
+        """Refuse a file with a chunk that would not decode to its size; UnfitFileError."""
+        for chunk in self._iter_chunks(content):
+            self.check_chunk(chunk, path_in_messages)
+
+    def _iter_chunks(self, content: bytes) -> Iterator[bytes]:
+        if not self.chunks_per_shard:
+            yield content
+            return
+        index_end = len(content) - _CHECKSUM_BYTES
+        if index_end < self.chunks_per_shard * _SHARD_INDEX_ENTRY_BYTES:
+            return  # too short for an index: Zarr says so
+        index = np.frombuffer(
+            content[index_end - self.chunks_per_shard * _SHARD_INDEX_ENTRY_BYTES : index_end], "<u8"
+        ).reshape(-1, 2)
+        for offset, length in index[index[:, 0] != _EMPTY_INDEX_ENTRY].tolist():
+            bytes_needed = min(length, _ZSTD_HEADER_BYTES_MAX) if self.bytes_per_value else length
+            yield content[offset : offset + bytes_needed]
+
+    def check_chunk(self, content: bytes, path_in_messages: str) -> None:
+        """Refuse a packed chunk that would not decode to its size; UnfitFileError.
+
+        One that is no zstd frame is left to the codecs, which refuse it.
+        """
+        if not content.startswith(_ZSTD_MAGIC):
+            return
+        content_bytes = zstd_content_bytes(content)
+        if content_bytes is None:
+            raise RefusedFileError(
+                errno.EINVAL, "has a chunk that does not declare its size", path_in_messages
+            )
+        if content_bytes > self.chunk_bytes_max or (
+            self.bytes_per_value and content_bytes < self.chunk_bytes_max
+        ):
+            raise RefusedFileError(
+                errno.EINVAL,
+                f"has a chunk that declares {content_bytes:,} bytes, where "
+                f"{self.chunk_bytes_max:,} "
+                f"are {'right' if self.bytes_per_value else 'the most'}",
+                path_in_messages,
+            )
+        if not self.bytes_per_value:
+            self._check_string_count(content, path_in_messages)
+
+    def _check_string_count(self, content: bytes, path_in_messages: str) -> None:
+        """Refuse text that declares another number of words: room is made for all of them."""
+        try:
+            decoded = bytes(_ZSTD_CODEC.decode(content[:-_CHECKSUM_BYTES]))
+        except RuntimeError:
+            return  # damaged: the codecs say so
+        if int.from_bytes(decoded[:4], "little") != self.values_per_chunk:
+            raise RefusedFileError(
+                errno.EINVAL, "has another number of words than its array", path_in_messages
+            )
+
+
+def zstd_content_bytes(frame: bytes) -> int | None:
+    """Size that a zstd frame declares for what is packed in it; None where it declares none.
+
+    The header is that of RFC 8878, section 3.1.1.1.
+
+    >>> declared_bytes(bytes(Zstd().encode(b"x" * 1000)))
+    1000
+    """
+    if len(frame) < 5:
+        return None
+    descriptor = frame[4]
+    is_single_segment = bool(descriptor & 0b0010_0000)
+    size_field_bytes = (int(is_single_segment), 2, 4, 8)[descriptor >> 6]
+    size_field_start = 5 + (not is_single_segment) + (0, 1, 2, 4)[descriptor & 0b11]
+    if not size_field_bytes or len(frame) < size_field_start + size_field_bytes:
+        return None
+    content_bytes = int.from_bytes(
+        frame[size_field_start : size_field_start + size_field_bytes], "little"
+    )
+    return content_bytes + 256 if size_field_bytes == 2 else content_bytes
+
+
+class StoreFileLimits:
+    """Files of a store by its checked document: which there are, and what they may hold."""
+
+    def __init__(self, root_metadata: Mapping[str, Any]) -> None:
+        nodes = root_metadata["consolidated_metadata"]["metadata"]
+        self._layouts = {
+            array_name: ArrayFileLayout.from_metadata(node)
+            for array_name, node in nodes.items()
+            if "data_type" in node
+        }
+
+    def array_layout(self, file_name: str) -> ArrayFileLayout | None:
+        """Form of the array that a file is a chunk of; None of a document."""
+        return self._layouts.get(file_name.rpartition("/c/")[0] or file_name.removesuffix("/c"))
+
+    def file_bytes_max(self, file_name: str) -> int:
+        """Bytes that a file of the store can have, by its name."""
+        layout = self.array_layout(file_name)
+        return METADATA_BYTES_MAX if layout is None else layout.file_bytes_max
+
+    def check_content(
+        self, file_name: str, content: bytes, path_in_messages: str, *, is_single_chunk: bool
+    ) -> None:
+        """Refuse content that would not decode to its size.
+
+        ``is_single_chunk``: it is one chunk of a shard.
+        """
+        if layout := self.array_layout(file_name):
+            (layout.check_chunk if is_single_chunk else layout.check_file)(
+                content, path_in_messages
+            )
+
+
+class SingleWriterLocalStore(LocalStore):
+    """A store on disk that only this process knows yet, made on a disk without hard links too."""
+
+    async def set_if_not_exists(self, key: str, value: Any) -> None:
+        """Write a file unless there is one; Zarr's own way, by a link, is for several writers."""
+        if not await self.exists(key):
+            await self.set(key, value)
+
+
+class SizeCheckedLocalStore(LocalStore):
+    """A store on disk, to be read: what is no plain file, or can't be right, raises."""
+
+    def __init__(self, root: Path, limits: StoreFileLimits) -> None:
+        super().__init__(root, read_only=True)
+        self._limits = limits
+
+    def with_read_only(self, read_only: bool = False) -> SizeCheckedLocalStore:
+        """Return itself, which is for reading."""
+        if not read_only:
+            raise ValueError("the store is opened to be read")
+        return self
+
+    def read(self, key: str, byte_range: Any) -> bytes | None:
+        """Return the bytes of a file, or of a part of one; None where there is none."""
+        bytes_max = self._limits.file_bytes_max(key)
+        try:
+            content = read_below(self.root, key, bytes_max, _to_slice(byte_range))
+            if byte_range is None or isinstance(byte_range, RangeByteRequest):
+                path_in_messages = f"{self.root}/{key}"
+                self._limits.check_content(
+                    key, content, path_in_messages, is_single_chunk=byte_range is not None
+                )
+        except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
+            return None
+        except RefusedFileError as error:
+            problem_and_remedy = (
+                f"{error.strerror}: `sweep verify {self.root}` names what is damaged"
+            )
+            raise RefusedFileError(error.errno, problem_and_remedy, error.filename) from None
+        return content
+
+    async def get(self, key: str, prototype: Any = None, byte_range: Any = None) -> Any:
+        """Return the bytes of a file, checked."""
+        content = await asyncio.to_thread(self.read, key, byte_range)
+        return _to_zarr_buffer(content, prototype)
+
+    def get_sync(self, key: str, *, prototype: Any = None, byte_range: Any = None) -> Any:
+        """As :meth:`get`, at once."""
+        return _to_zarr_buffer(self.read(key, byte_range), prototype)
+
+    async def get_partial_values(self, prototype: Any, key_ranges: Any) -> list[Any]:
+        """Return parts of files, checked."""
+        return [await self.get(key, prototype, byte_range) for key, byte_range in key_ranges]
+
+
+def _to_zarr_buffer(content: bytes | None, prototype: Any) -> Any:
+    if content is None:
+        return None
+    return (prototype or default_buffer_prototype()).buffer.from_bytes(content)
+
+
+def _to_slice(byte_range: Any) -> slice:
+    """Part of a file that Zarr asks for."""
+    match byte_range:
+        case RangeByteRequest():
+            return slice(byte_range.start, byte_range.end)
+        case OffsetByteRequest():
+            return slice(byte_range.offset, None)
+        case SuffixByteRequest():
+            return slice(-byte_range.suffix, None)
+        case _:
+            return slice(None)
+
+
+class SizeCheckedObjectStore(ObjectStore[Any]):
+    """A store in an object store, to be read: objects that can't be right raise."""
+
+    def __init__(self, client: Any, key_prefix: str, limits: StoreFileLimits) -> None:
+        super().__init__(client, read_only=True)
+        self._key_prefix, self._limits = key_prefix, limits
+
+    def with_read_only(self, read_only: bool = False) -> SizeCheckedObjectStore:
+        """Return itself, which is for reading."""
+        if not read_only:
+            raise ValueError("the store is opened to be read")
+        return self
+
+    async def get(self, key: str, prototype: Any, byte_range: Any = None) -> Any:
+        """Return the bytes of an object, checked."""
+        import obstore
+
+        file_name = key.removeprefix(f"{self._key_prefix}/")
+        bytes_max = self._limits.file_bytes_max(file_name)
+        if isinstance(byte_range, RangeByteRequest):
+            check_size(byte_range.end - byte_range.start, bytes_max, key)
+        if byte_range is not None:
+            buffer = await super().get(key, prototype, byte_range)
+        else:
+            try:
+                response = await obstore.get_async(self.store, key)
+            except FileNotFoundError:
+                return None
+            check_size(response.meta["size"], bytes_max, key)
+            buffer = prototype.buffer.from_bytes(await response.bytes_async())
+        if buffer is not None and (byte_range is None or isinstance(byte_range, RangeByteRequest)):
+            self._limits.check_content(
+                file_name, buffer.to_bytes(), key, is_single_chunk=byte_range is not None
+            )
+        return buffer

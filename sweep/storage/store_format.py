@@ -1,0 +1,825 @@
+"""Stores, and the logs of their journals, read only as this program writes them.
+
+Zarr decodes whatever the metadata of arrays declare, objects to unpickle and codecs of plug-ins
+too. The document of a store's root has the metadata of all its arrays: it is checked first, and
+arrays are opened by it alone.
+
+A log has lines of JSON with their own digests at the end. It is a file that is appended to; in an
+object store it is a row of numbered objects, each written whole, with the lines of some seconds.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import math
+import os
+import re
+import stat
+import time
+import uuid
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from zarr.storage import StorePath
+
+from sweep.messages import (
+    SPEC_PLACEHOLDER,
+    STORE_PLACEHOLDER,
+    PrintableError,
+    escape_to_one_line,
+    suggestion,
+)
+from sweep.regular_files import RefusedFileError, file_type, open_regular, stream_below
+from sweep.safe_json import parse_json
+from sweep.storage.locations import (
+    CONCURRENT_REQUESTS_MAX,
+    JOURNAL_DIR,
+    Location,
+    ObjectPath,
+    ObjectStoreError,
+    atomic_write,
+    map_concurrently,
+    read_object,
+    recover_interrupted_replace,
+    store_identity,
+)
+from sweep.storage.size_checks import (
+    ARRAY_FILE_BYTES_MAX,
+    METADATA_BYTES_MAX,
+    SizeCheckedLocalStore,
+    SizeCheckedObjectStore,
+    StoreFileLimits,
+)
+
+#: What a store is made of before there are results, and the digest of each object, in the journal.
+MANIFEST_FILE = "template.jsonl"
+
+#: Version of the layout of stores.
+LAYOUT_VERSION = 5
+
+#: How chunks of every array are compressed.
+ZSTD_LEVEL = 1
+
+#: For xarray's functions: so they read the document that was checked, and no other.
+OPEN_ZARR_KWARGS: dict[str, Any] = {"consolidated": True, "zarr_format": 3}
+
+#: Bytes of a file of an array at most, before compression, and chunks of an array.
+UNCOMPRESSED_FILE_BYTES_MAX = ARRAY_CHUNKS_MAX = 2**31
+
+_ATTRIBUTES_BY_STORE_KIND = {
+    "grid": ("title", "spec", "coordinates"),
+    "scene": ("title", "spec", "scanners", "surfaces"),
+    "eyepoints": ("geometry", "shots_a_cycle"),
+    "accuracy": ("title", "spec", "coordinates"),
+}
+"""Attributes of each kind of store, besides those of all."""
+
+_COMMON_ATTRIBUTES = ("study_id", "model_version", "software")
+
+_STUDY_ID = re.compile(r"[0-9a-f]{32}")
+
+_NON_STRING_ATTRIBUTE_TYPES = {"shots_a_cycle": int, "scanners": list, "surfaces": list}
+
+_ARRAY_ATTRIBUTE_TYPES = {
+    "units": str, "long_name": str, "comment": str, "standard_name": str, "path": str,
+    "flag_meanings": str, "flag_masks": list, "flag_values": list, "tolerance": float,
+    "confidence": float,
+}  # fmt: skip
+"""Attributes of arrays. xarray acts on others, such as `scale_factor`."""
+
+_FILL_VALUES_BY_TYPE: dict[str, tuple[Any, ...]] = {
+    "float64": (0.0, "NaN"), "int64": (0, -1), "int32": (0, -1), "int16": (0, -1), "int8": (0, -1),
+    "uint32": (0,), "uint8": (0,), "bool": (False,), "string": ("",),
+}  # fmt: skip
+"""Types of arrays, and what stands where nothing is written."""
+
+MAP_GROUP = "scene_map"
+"""Group of the map of a flight's ground."""
+
+_VALID_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,199}")
+
+_CHECKSUM_CODEC = {"name": "crc32c"}
+_COMPRESSION_CODECS = [
+    {"name": "zstd", "configuration": {"level": ZSTD_LEVEL, "checksum": False}},
+    _CHECKSUM_CODEC,
+]
+_STRING_CODEC = {"name": "vlen-utf8", "configuration": {}}
+_SINGLE_BYTE_CODEC = {"name": "bytes"}
+_LITTLE_ENDIAN_CODEC = {"name": "bytes", "configuration": {"endian": "little"}}
+_SHARD_INDEX_CONFIGURATION = {
+    "index_codecs": [_LITTLE_ENDIAN_CODEC, _CHECKSUM_CODEC],
+    "index_location": "end",
+}
+
+
+class StoreError(PrintableError):
+    """A store that can't be used as asked."""
+
+
+class NotAStoreError(StoreError, ValueError):
+    """A path at which there is no store of a study, or none that this program can read."""
+
+
+def read_attributes(path: Location) -> dict[str, Any]:
+    """Attributes of a store; raises as :func:`read_root_metadata`."""
+    attributes: dict[str, Any] = read_root_metadata(path)["attributes"]
+    return attributes
+
+
+def read_root_metadata(path: Location) -> dict[str, Any]:
+    """Read the document of a store's root, checked; NotAStoreError for what is not as ours."""
+    root_metadata = _read_root_document(path)
+    attributes = check_attributes(path, root_metadata["attributes"])
+    try:
+        consolidated = root_metadata["consolidated_metadata"]
+        nodes = consolidated["metadata"]
+        declared_format = (
+            root_metadata["zarr_format"],
+            root_metadata["node_type"],
+            consolidated["kind"],
+        )
+        if declared_format != (3, "group", "inline"):
+            raise ValueError("its root is another")
+        for name, node in nodes.items():
+            _check_node(name, node)
+        _check_dimensions(nodes)
+        flags_arrays = [f"{name}/flags" for name in attributes.get("scanners", ())]
+        required_arrays = ["effects"] if attributes["kind"] == "grid" else flags_arrays
+        if missing_arrays := [name for name in required_arrays if name not in nodes]:
+            raise ValueError(f"it lacks {missing_arrays[0]}")
+    except (ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
+        reason = error if type(error) is ValueError else "its metadata are incomplete"
+        raise NotAStoreError(
+            f"{path} is not as sweep writes stores: {reason}{repair_hint(path)}"
+        ) from None
+    _check_journal_files(path)
+    return root_metadata
+
+
+def check_attributes(path: Location, attributes: Any) -> dict[str, Any]:
+    """Attributes of a store, where this version of the program writes such; or NotAStoreError."""
+    checked_attributes = _require_sweep_attributes(path, attributes)
+    if (layout := checked_attributes.get("layout")) != LAYOUT_VERSION:
+        raise NotAStoreError(
+            f"{path} is laid out as version {layout!r:.20}; this sweep writes {LAYOUT_VERSION}"
+        )
+    required = (
+        *_COMMON_ATTRIBUTES,
+        *_ATTRIBUTES_BY_STORE_KIND.get(str(checked_attributes.get("kind")), ("no known kind",)),
+    )
+    attributes_as_text = checked_attributes | {
+        "software": format_versions(checked_attributes.get("software"))
+    }
+    if any(
+        type(attributes_as_text.get(name)) is not _NON_STRING_ATTRIBUTE_TYPES.get(name, str)
+        for name in required
+    ):
+        raise NotAStoreError(f"{path} is a Zarr store, but not one that sweep made")
+    if not _STUDY_ID.fullmatch(checked_attributes["study_id"]):
+        why = f"its study_id is {checked_attributes['study_id'][:40]!r}, and no digest"
+        raise NotAStoreError(f"{path} is not as sweep writes stores: {why}{repair_hint(path)}")
+    return checked_attributes
+
+
+def format_versions(software: Any) -> Any:
+    """Return versions by name as text, ``numba 0.60, numpy 2.1``; anything but a mapping as it is.
+
+    Attributes that are text, numbers or lists of these go into any file format. Stores of earlier
+    versions have mappings.
+    """
+    if not isinstance(software, dict):
+        return software
+    return ", ".join(f"{name} {version}" for name, version in software.items())
+
+
+def parse_software_versions(attributes: Mapping[Any, Any]) -> dict[str, str]:
+    """Return the versions of the software that a store was begun with, by name."""
+    text = str(format_versions(attributes["software"]))
+    return dict(part.rsplit(" ", 1) for part in text.split(", ") if " " in part)
+
+
+def refuse_foreign_store(path: Location) -> None:
+    """Refuse what no version of this program has made."""
+    _require_sweep_attributes(path, _read_root_document(path)["attributes"])
+
+
+def _require_sweep_attributes(path: Location, attributes: Any) -> dict[str, Any]:
+    if not isinstance(attributes, dict) or "study_id" not in attributes:
+        raise NotAStoreError(
+            f"{path} is a Zarr store, but not one that sweep made{_nearby_stores_hint(path)}"
+        )
+    return attributes
+
+
+def _read_root_document(path: Location) -> dict[str, Any]:
+    """Read the document of a store's root, a group."""
+    recover_interrupted_replace(path)
+    detail = ""
+    try:
+        root_metadata = _read_json(path, "zarr.json")
+        if "attributes" in root_metadata:
+            return dict(root_metadata)
+    except ObjectStoreError:
+        raise
+    except RefusedFileError as error:
+        detail = f" ({error.strerror})"
+    except (OSError, ValueError, KeyError, TypeError):
+        pass
+    if not path.exists():
+        raise NotAStoreError(f"there is no store at {path}{_nearby_stores_hint(path)}")
+    if hint := repair_hint(path):
+        raise NotAStoreError(f"{path / 'zarr.json'} is damaged{detail}{hint}")
+    if detail:
+        raise NotAStoreError(f"{path / 'zarr.json'} is damaged{detail}")
+    if isinstance(path, Path) and path.is_file():
+        run_suggestion = suggestion("run", SPEC_PLACEHOLDER, store=STORE_PLACEHOLDER)
+        description = (
+            f"a file, and no Zarr store of sweep's: {run_suggestion} computes a spec into one"
+        )
+        raise NotAStoreError(f"{path} is {description}{_nearby_stores_hint(path)}")
+    run_suggestion = suggestion("run", SPEC_PLACEHOLDER, store=STORE_PLACEHOLDER)
+    description = "is not a Zarr store of sweep's"
+    if names := _first_names_text(path):
+        raise NotAStoreError(
+            f"{path} {description}, and has files in it ({names}): name another place, as "
+            f"{run_suggestion} computes "
+            f"a spec into a new or an empty folder{_nearby_stores_hint(path)}"
+        )
+    raise NotAStoreError(
+        f"{path} {description}: {run_suggestion} computes a spec into "
+        f"one{_nearby_stores_hint(path)}"
+    )
+
+
+_NAMES_SHOWN_MAX = 3
+
+
+def _first_names_text(path: Location) -> str:
+    """Names of the first files and folders in a folder; '' for none."""
+    if not isinstance(path, Path) or not path.is_dir():
+        return ""
+    with suppress(OSError), os.scandir(path) as entries:
+        names = sorted(entry.name for entry in islice(entries, _NAMES_SHOWN_MAX + 1))
+        names_text = ", ".join(escape_to_one_line(name) for name in names[:_NAMES_SHOWN_MAX])
+        return f"{names_text}, ..." if len(names) > _NAMES_SHOWN_MAX else names_text
+    return ""
+
+
+def _read_json(path: Location, name: str) -> Any:
+    """Parse a document; once more from an object store, whose answer may have been cut."""
+    try:
+        return parse_json(read_object(path, name, METADATA_BYTES_MAX))
+    except ValueError:
+        if isinstance(path, Path):
+            raise
+        return parse_json(read_object(path, name, METADATA_BYTES_MAX))
+
+
+def has_digest(
+    path: Location,
+    object_names: list[str],
+    expected_digest: str,
+    bytes_max: Callable[[str], int] = lambda name: ARRAY_FILE_BYTES_MAX,
+) -> bool:
+    """Tell whether stored objects have a digest; read once more from an object store if not.
+
+    Errors, and ``bytes_max``, are as of :func:`stored_objects_digest`.
+    """
+    matches = stored_objects_digest(path, object_names, bytes_max) == expected_digest
+    return matches or (
+        isinstance(path, ObjectPath)
+        and stored_objects_digest(path, object_names, bytes_max) == expected_digest
+    )
+
+
+def read_manifest_attributes(path: Location) -> dict[str, Any]:
+    """Attributes of a store by the list of what it was made of; empty where that is damaged."""
+    attributes: dict[str, Any] = next(iter_records(path / JOURNAL_DIR / MANIFEST_FILE), {}).get(
+        "attributes", {}
+    )
+    return attributes
+
+
+def read_study_id(path: Location) -> str:
+    """Id of the study in a store of any version, damaged or not; empty where there is none."""
+    try:
+        return str(
+            _require_sweep_attributes(path, _read_root_document(path)["attributes"])["study_id"]
+        )
+    except NotAStoreError:
+        return str(read_manifest_attributes(path).get("study_id", ""))
+
+
+def repair_hint(path: Location) -> str:
+    """Remark on how to put back what a store was made of, where it says what that was."""
+    if not (path / JOURNAL_DIR / MANIFEST_FILE).exists():
+        return ""
+    if read_manifest_attributes(path):
+        return f": {suggestion('verify', path, repair=True)} puts it back"
+    command = suggestion("verify", path, repair=True, spec=SPEC_PLACEHOLDER)
+    return f": {command}, with the study's spec, puts it back"
+
+
+def _nearby_stores_hint(path: Location) -> str:
+    """Remark on the stores in a directory or beside a path; empty where there are none."""
+    directory = path if path.is_dir() else path.parent
+    metadata_files = directory.glob("*.zarr/zarr.json") if directory.is_dir() else ()
+    names = sorted(str(metadata_file.parent) for metadata_file in metadata_files)
+    listed_names = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
+    return f"; stores near it: {listed_names}" if names else ""
+
+
+def _check_node(node_name: str, node: dict[str, Any]) -> None:
+    """Refuse a group or an array that is declared otherwise than this program declares them."""
+    if not all(map(_VALID_NAME.fullmatch, node_name.split("/"))):
+        raise ValueError(f"an array has the name {node_name!r:.60}")
+    if node["zarr_format"] != 3:
+        raise ValueError(f"{node_name} is of the Zarr format {node['zarr_format']!r:.20}")
+    if node["node_type"] == "group":
+        attributes = node["attributes"]
+        if node_name != MAP_GROUP:
+            if not re.fullmatch("[0-9a-f]{32}", attributes["geometry_id"]):  # part of a path
+                raise ValueError(f"the group {node_name} has no eyepoints")
+            attributes["coordinates"].split()
+        expected = {"node_type": "group", "zarr_format": 3, "attributes": attributes}
+    else:
+        expected = _expected_array_metadata(node_name, node)
+    if differing_keys := sorted(
+        key for key in node | expected if node.get(key) != expected.get(key)
+    ):
+        raise ValueError(f"the {differing_keys[0]} of {node_name} is another")
+
+
+def _expected_array_metadata(node_name: str, node: dict[str, Any]) -> dict[str, Any]:
+    """Metadata of an array as this program writes them, with what may differ, once checked."""
+    data_type, attributes, fill_value = node["data_type"], node["attributes"], node["fill_value"]
+    if not isinstance(data_type, str) or fill_value not in _FILL_VALUES_BY_TYPE.get(data_type, ()):
+        raise ValueError(
+            f"{node_name} has values of the type {data_type!r:.40}, {fill_value!r:.40} where "
+            "missing"
+        )
+    for name, value in attributes.items():
+        if type(value) is not _ARRAY_ATTRIBUTE_TYPES.get(name):
+            raise ValueError(f"{node_name} has the attribute {name!r:.40}")
+    file_shape = node["chunk_grid"]["configuration"]["chunk_shape"]
+    value_bytes = np.dtype("u1" if data_type == "string" else data_type).itemsize
+    codecs: list[Any] = [
+        _LITTLE_ENDIAN_CODEC if value_bytes > 1 else _SINGLE_BYTE_CODEC,
+        *_COMPRESSION_CODECS,
+    ]
+    if data_type == "string":
+        codecs[0] = _STRING_CODEC
+    chunk_shape = file_shape
+    if node["codecs"][0]["name"] == "sharding_indexed":
+        chunk_shape = node["codecs"][0]["configuration"]["chunk_shape"]
+        sharding = {"chunk_shape": chunk_shape, "codecs": codecs, **_SHARD_INDEX_CONFIGURATION}
+        codecs = [{"name": "sharding_indexed", "configuration": sharding}]
+    dims = node.get("dimension_names", [])
+    _check_shape(node_name, node["shape"], file_shape, chunk_shape, dims, value_bytes)
+    return {
+        "shape": node["shape"],
+        "data_type": data_type,
+        "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": file_shape}},
+        "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
+        "fill_value": fill_value,
+        "codecs": codecs,
+        "attributes": attributes,
+        "zarr_format": 3,
+        "node_type": "array",
+        "storage_transformers": [],
+        **({"dimension_names": dims} if dims else {}),
+    }
+
+
+def _check_shape(
+    node_name: str,
+    shape: list[int],
+    file_shape: list[int],
+    chunk_shape: list[int],
+    dims: list[str],
+    value_bytes: int,
+) -> None:
+    """Refuse an array that is cut in no way into files, and these into chunks, of bearable size."""
+    chunk_lengths = [*file_shape, *chunk_shape]
+    if (
+        not len(shape) == len(file_shape) == len(chunk_shape) == len(dims)
+        or any(type(length) is not int for length in (*shape, *chunk_lengths))
+        or any(length < 0 for length in shape)
+        or any(length < 1 for length in chunk_lengths)
+        or not all(map(_VALID_NAME.fullmatch, dims))
+        or math.prod(file_shape) * value_bytes > UNCOMPRESSED_FILE_BYTES_MAX
+        or math.prod(
+            -(-array_length // chunk_length)
+            for array_length, chunk_length in zip(shape, chunk_shape, strict=True)
+        )
+        > ARRAY_CHUNKS_MAX
+    ):
+        raise ValueError(f"the shape, chunks and dimensions of {node_name} don't go together")
+
+
+def _check_dimensions(nodes: Mapping[str, Any]) -> None:
+    """Refuse arrays of a group that don't agree on the length of a dimension."""
+    lengths: dict[tuple[str, str], int] = {}
+    for node_name, node in nodes.items():
+        group = node_name.rpartition("/")[0]
+        if group and nodes[group]["node_type"] != "group":
+            raise ValueError(f"{node_name} lies in an array")
+        for dim, length in zip(node.get("dimension_names", []), node.get("shape", []), strict=True):
+            if lengths.setdefault((group, dim), length) != length:
+                raise ValueError(f"its arrays don't agree on the length of {dim}")
+
+
+def _check_journal_files(path: Location) -> None:
+    """Refuse a journal with links, which lead out, or pipes, which never end."""
+    for name, problem in irregular_journal_files(path).items():
+        raise NotAStoreError(f"{path}/{name} {problem}: remove it")
+
+
+def irregular_journal_files(path: Location) -> dict[str, str]:
+    """Links, pipes and devices in the journal of a store, and which of these they are, by name."""
+    if not isinstance(path, Path) or not (path / JOURNAL_DIR).is_dir():
+        return {}
+    modes = {JOURNAL_DIR: (path / JOURNAL_DIR).lstat().st_mode}
+    with os.scandir(path / JOURNAL_DIR) as entries:
+        for entry in entries:
+            with suppress(FileNotFoundError):  # a lock that is given up meanwhile
+                mode = entry.stat(follow_symlinks=False).st_mode
+                modes[f"{JOURNAL_DIR}/{entry.name}"] = mode
+    return {
+        name: f"is {file_type(mode)}, no plain file"
+        for name, mode in modes.items()
+        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode))
+    }
+
+
+class StoreReplacedError(PrintableError, ValueError):
+    """A store that was extended or replaced since it was opened."""
+
+
+class StudyBoundLocalStore(SizeCheckedLocalStore):
+    """A store on disk whose every read fails once another study's store is in its place."""
+
+    def __init__(self, root: Path, limits: StoreFileLimits, study_id: str) -> None:
+        super().__init__(root, limits)
+        self._study_id = study_id
+        self._last_identity: tuple[int, ...] | None = None
+
+    def read(self, key: str, byte_range: Any) -> bytes | None:
+        """Return the bytes of a file; the identity of the store is checked afterwards."""
+        try:
+            return super().read(key, byte_range)
+        finally:  # another study's file may also be of another size
+            self._check_same_study()
+
+    def _check_same_study(self) -> None:
+        identity = store_identity(self.root)
+        if identity is None or identity != self._last_identity:  # repaired, or another's
+            if read_study_id(self.root) != self._study_id:
+                raise StoreReplacedError(
+                    f"{self.root} was extended, replaced or removed since it was opened: "
+                    "open it again"
+                )
+            self._last_identity = identity
+
+
+def open_size_checked_store(location: Location, study_id: str = "") -> Any:
+    """Open a store for Zarr or xarray, to read it lazily; raises as :func:`read_root_metadata`.
+
+    Reading fails once it is no longer the store of the study ``study_id``, where one is given.
+    """
+    limits = StoreFileLimits(read_root_metadata(location))
+    if isinstance(location, ObjectPath):
+        return StorePath(
+            SizeCheckedObjectStore(location.client, location.key, limits), location.key
+        )
+    return (
+        StudyBoundLocalStore(location, limits, study_id)
+        if study_id
+        else SizeCheckedLocalStore(location, limits)
+    )
+
+
+RECEIPTS_FILE = "receipts.jsonl"
+
+#: Bytes of a line of a log at most; the recipe of eyepoints has their spec in one.
+LOG_LINE_BYTES_MAX = 64 << 20
+
+#: Seconds for which lines are gathered before they are put as one object.
+LOG_OBJECT_INTERVAL = 1.0
+
+#: Objects of a log beyond which they are put into few, and bytes of one of those.
+LOG_OBJECTS_MAX = 64
+MERGED_LOG_OBJECT_BYTES = 16 << 20
+
+#: Errors of opening what is no log.
+_NO_LOG_ERRNOS = {errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.EINVAL}
+
+_DIGEST_FIELD = b',"sum":"'
+_LINE_END = b'"}\n'
+
+_RECEIPT_HEAD = re.compile(
+    rb'\{"block":(\d{1,18}),"(?:points":(\d{1,18})(?:,"bytes":(\d{1,18}))?|withdrawn")'
+)
+_RECEIPT_TIME = re.compile(rb'"time":(\d{1,10}(?:\.\d{1,20})?)$')
+_RECEIPT_WORKER = re.compile(rb'"host":"([^"]*)","pid":(\d+)')
+
+
+def encode_record(record: dict[str, Any]) -> bytes:
+    """Write a record, not empty, as a line of JSON that ends with a digest of the others."""
+    return append_line_digest(json.dumps(record, separators=(",", ":")).encode()[:-1])
+
+
+def append_line_digest(line_body: bytes) -> bytes:
+    """Return a line of the fields of a record, written without the last brace."""
+    return line_body + _DIGEST_FIELD + _line_digest(line_body) + _LINE_END
+
+
+def decode_record(line: bytes) -> dict[str, Any] | None:
+    """Return the record of a line, or None if any byte of it has changed."""
+    line_body = verified_body(line)
+    if line_body is None:
+        return None
+    try:
+        record = parse_json(line_body + b"}", allow_non_utf8=True)
+    except ValueError:  # a stranger's, with a digest of its own
+        return None
+    return record if isinstance(record, dict) else None
+
+
+def verified_body(line: bytes) -> bytes | None:
+    """Return the unread fields of a line, less the last brace; None as of :func:`decode_record`."""
+    line_body, digest_field, line_end = line.rpartition(_DIGEST_FIELD)
+    return line_body if digest_field and line_end == _line_digest(line_body) + _LINE_END else None
+
+
+def _line_digest(body: bytes) -> bytes:
+    return hashlib.blake2b(body, digest_size=8).hexdigest().encode()
+
+
+def iter_lines_and_records(path: Location) -> Iterator[tuple[bytes, dict[str, Any] | None]]:
+    """Lines of a log, and their records: None where damaged or cut short."""
+    for line in iter_raw_lines(path):
+        yield line, decode_record(line)
+
+
+def iter_records(path: Location) -> Iterator[dict[str, Any]]:
+    """Read the records of a log, in order; damaged or truncated lines are skipped."""
+    return (record for _, record in iter_lines_and_records(path) if record is not None)
+
+
+def stored_objects_digest(
+    path: Location,
+    object_names: Iterable[str],
+    bytes_max: Callable[[str], int] = lambda name: ARRAY_FILE_BYTES_MAX,
+) -> str:
+    """blake2b-128 of names and bytes of stored objects, in hex.
+
+    OSError where one can't be read; UnfitFileError where it is no plain file, or larger than
+    ``bytes_max`` of its name.
+    """
+    if isinstance(path, ObjectPath):
+        object_names = list(object_names)
+        contents = map_concurrently(
+            path, lambda name: (path / name).read_bytes(bytes_max(name)), object_names
+        )
+        return contents_digest(zip(object_names, contents, strict=True))
+    hasher = hashlib.blake2b(digest_size=16)
+    for name in object_names:
+        with stream_below(path, name, bytes_max(name)) as (size, pieces):
+            hasher.update(f"{name}\0{size}\0".encode())
+            for piece in pieces:
+                hasher.update(piece)
+    return hasher.hexdigest()
+
+
+def contents_digest(contents: Iterable[tuple[str, bytes]]) -> str:
+    """As :func:`stored_objects_digest`, of names and bytes at hand."""
+    hasher = hashlib.blake2b(digest_size=16)
+    for name, content in contents:
+        hasher.update(f"{name}\0{len(content)}\0".encode())
+        hasher.update(content)
+    return hasher.hexdigest()
+
+
+class FileLog:
+    """A file that is appended to, and not kept open; on the disk at once where it is `durable`."""
+
+    def __init__(self, path: Path, *, durable: bool = False) -> None:
+        self._path, self._durable = path, durable
+
+    def append(self, lines: bytes) -> None:
+        """Append whole lines, all or none; OSError where they can't be written."""
+        log = os.open(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
+        try:
+            size = os.fstat(log).st_size
+            if os.write(log, lines) < len(lines):  # the disk is full
+                os.ftruncate(log, size)
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self._path))
+            if self._durable:
+                os.fsync(log)
+        finally:
+            os.close(log)
+
+    def flush(self, *, force: bool = False) -> bool:
+        """Tell whether all is written: what is appended is."""
+        return True
+
+    def remove_damaged_lines(self, is_sound: Callable[[bytes], bool]) -> None:
+        """Drop the lines that are not sound."""
+        if self._path.is_dir() or not all(map(is_sound, iter_raw_lines(self._path))):
+            lines = iter_raw_lines(self._path)
+            atomic_write(self._path, b"".join(line for line in lines if is_sound(line)))
+
+
+class ObjectLog:
+    """A row of objects under a key, numbered in the order of writing."""
+
+    def __init__(self, path: ObjectPath) -> None:
+        self._path = path
+        self._last_number = max(
+            (_log_object_number(name) for name in list_log_objects(path)), default=0
+        )
+        self._pending_lines: list[bytes] = []
+        self._last_put_time = 0.0
+
+    def append(self, lines: bytes) -> None:
+        """Append whole lines; they are there after the next `flush` that writes."""
+        self._pending_lines.append(lines)
+
+    def flush(self, *, force: bool = False) -> bool:
+        """Put what was appended as an object, now or `WAVE` s after the last; True if none left."""
+        if not self._pending_lines:
+            return True
+        if time.monotonic() - self._last_put_time < LOG_OBJECT_INTERVAL and not force:
+            return False
+        log_object = self._path / _new_log_object_name(self._last_number + 1)
+        log_object.write_bytes(b"".join(self._pending_lines))
+        self._last_number += 1
+        self._pending_lines.clear()
+        self._last_put_time = time.monotonic()
+        return True
+
+    def remove_damaged_lines(self, is_sound: Callable[[bytes], bool]) -> None:
+        """Drop the lines that are not sound; where objects are many, put their lines in few."""
+        object_names = list_log_objects(self._path)
+        is_merging = len(object_names) > LOG_OBJECTS_MAX
+        names_in_group: list[str] = []
+        lines: list[bytes] = []
+        group_bytes = 0
+        for object_name, content in _iter_log_objects(self._path, object_names):
+            names_in_group.append(object_name)
+            lines += content.splitlines(keepends=True)
+            group_bytes += len(content)
+            if (
+                not is_merging
+                or group_bytes > MERGED_LOG_OBJECT_BYTES
+                or object_name == object_names[-1]
+            ):
+                self._rewrite_objects(names_in_group, lines, is_sound)
+                names_in_group, lines, group_bytes = [], [], 0
+
+    def _rewrite_objects(
+        self, object_names: list[str], lines: list[bytes], is_sound: Callable[[bytes], bool]
+    ) -> None:
+        """Put sound lines of objects in the last one's place; cut short, they are there twice."""
+        sound_lines = [line for line in lines if is_sound(line)]
+        if len(object_names) == 1 and len(sound_lines) == len(lines):
+            return
+        (self._path / _new_log_object_name(_log_object_number(object_names[-1]))).write_bytes(
+            b"".join(sound_lines)
+        )
+        map_concurrently(
+            self._path, lambda object_name: (self._path / object_name).unlink(), object_names
+        )
+
+
+def open_log(path: Location, *, durable: bool = False) -> FileLog | ObjectLog:
+    """Open a log to append to; the caller ensures that nobody else does."""
+    if isinstance(path, ObjectPath):
+        return ObjectLog(path)
+    path.parent.mkdir(exist_ok=True)
+    return FileLog(path, durable=durable)
+
+
+def list_log_objects(path: ObjectPath) -> list[str]:
+    """Names of the objects of a log, in order."""
+    return sorted(
+        object_name
+        for object_name, _ in path.iter_objects_below()
+        if _log_object_number(object_name) > 0
+    )
+
+
+def _new_log_object_name(number: int) -> str:
+    """Name of an object; nobody else's, should two write against all precautions."""
+    return f"{number:08d}-{uuid.uuid4().hex[:8]}"
+
+
+def _log_object_number(object_name: str) -> int:
+    number = object_name.partition("-")[0]
+    return int(number) if number.isdigit() else 0
+
+
+def _iter_log_objects(path: ObjectPath, object_names: list[str]) -> Iterator[tuple[str, bytes]]:
+    """Objects of a log with their names, some of them in memory at a time."""
+    for batch_start in range(0, len(object_names), CONCURRENT_REQUESTS_MAX):
+        batch = object_names[batch_start : batch_start + CONCURRENT_REQUESTS_MAX]
+        yield from zip(
+            batch,
+            map_concurrently(path, lambda object_name: _read_log_object(path / object_name), batch),
+            strict=True,
+        )
+
+
+def _read_log_object(log_object: ObjectPath) -> bytes:
+    """Read an object of a log; once more where its last line is cut, as an answer may have been."""
+    content = log_object.read_bytes()
+    return content if content.endswith(b"\n") else log_object.read_bytes()
+
+
+def iter_raw_lines(path: Location) -> Iterator[bytes]:
+    """Lines of a log in order, with their ends; of a small file too, in an object store."""
+    if isinstance(path, ObjectPath):
+        object_names = list_log_objects(path)
+        if not object_names and path.size() > 0:
+            yield from path.read_bytes().splitlines(keepends=True)
+        for _, content in _iter_log_objects(path, object_names):
+            yield from content.splitlines(keepends=True)
+    else:
+        try:
+            descriptor = open_regular(path, follow_links=False)
+        except OSError as error:
+            if error.errno in _NO_LOG_ERRNOS:
+                return
+            raise
+        with open(descriptor, "rb") as log:
+            yield from _iter_file_lines(log)
+
+
+def _iter_file_lines(log: BinaryIO) -> Iterator[bytes]:
+    """Lines of a log; one that is longer than any of ours in parts, without a file's holes."""
+    while line := log.readline(LOG_LINE_BYTES_MAX):
+        yield line
+        if len(line) == LOG_LINE_BYTES_MAX:
+            try:
+                log.seek(os.lseek(log.fileno(), log.tell(), os.SEEK_DATA))
+            except OSError:  # nothing but a hole is left
+                return
+
+
+@dataclass
+class ReceiptTotals:
+    """Sums of a log of receipts: which blocks are done, when, how fast."""
+
+    points_by_block: (
+        np.ndarray
+    )  # (blocks,) int64: points of every block that is committed, 0 of the others
+    bytes_by_block: (
+        np.ndarray
+    )  # (blocks,) int64: bytes of these as they are stored, where the receipt says
+    first_time: float = np.inf
+    last_time: float = -np.inf  # times of the first and last receipt [s since the epoch]
+    recent_points: int = 0  # points committed since the time asked for
+    workers: set[bytes] = field(default_factory=set)  # hosts and processes that computed them
+
+    @property
+    def n_committed_blocks(self) -> int:
+        """Number of blocks that are committed."""
+        return int(np.count_nonzero(self.points_by_block))
+
+
+def read_receipt_totals(store: Location, n_blocks: int, *, since: float = np.inf) -> ReceiptTotals:
+    """Sum the log of a store, points and workers `since` a time; damaged lines do not count."""
+    totals = ReceiptTotals(np.zeros(n_blocks, np.int64), np.zeros(n_blocks, np.int64))
+    for line in iter_raw_lines(store / JOURNAL_DIR / RECEIPTS_FILE):
+        line_body = verified_body(line)
+        head = line_body and _RECEIPT_HEAD.match(line_body)
+        if not line_body or not head or (block := int(head[1])) >= n_blocks:
+            continue
+        totals.points_by_block[block], totals.bytes_by_block[block] = (
+            int(head[2] or 0),
+            int(head[3] or 0),
+        )
+        if head[2] and (time_match := _RECEIPT_TIME.search(line_body, len(line_body) - 40)):
+            _add_receipt_time(totals, line_body, int(head[2]), float(time_match[1]), since)
+    return totals
+
+
+def _add_receipt_time(
+    totals: ReceiptTotals, line_body: bytes, points: int, receipt_time: float, since: float
+) -> None:
+    totals.first_time, totals.last_time = (
+        min(totals.first_time, receipt_time),
+        max(totals.last_time, receipt_time),
+    )
+    if receipt_time >= since:
+        totals.recent_points += points
+        if worker := _RECEIPT_WORKER.search(line_body):
+            totals.workers.add(worker[0])

@@ -1,0 +1,289 @@
+"""Arrays of stores, read with each chunk held against its checksum and the log of the journal.
+
+Zarr reads fill values where a chunk is missing, and raises errors of its codecs where one is
+damaged. Here both are a `DamagedChunkError`, which names the block, the chunk and the remedy.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import atexit
+import math
+import re
+from contextlib import suppress
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import google_crc32c
+import numpy as np
+import zarr
+from zarr.core.buffer import default_buffer_prototype
+from zarr.storage import StorePath, WrapperStore
+
+from sweep.storage import store_format
+from sweep.storage.locations import JOURNAL_DIR, PACKED_ATTRIBUTE, Location, to_readable_error
+from sweep.storage.store_format import (
+    MANIFEST_FILE,
+    iter_records,
+    read_receipt_totals,
+    read_root_metadata,
+)
+
+#: Name of a chunk: its array, and its position in the grid of chunks.
+CHUNK_NAME = re.compile(r"(.+)/c((?:/\d+)*)")
+
+#: Dimensions of flights by which their blocks are cut, last.
+CYCLE_DIM, SHOT_DIM = "cycle", "shot"
+
+#: Time that reads which nobody waits for have to end, as the program does [s].
+PENDING_READS_TIMEOUT = 5.0
+
+_CHECKSUM_BYTES = 4
+_SHARD_INDEX_ENTRY_BYTES = 16  # offset and length of a chunk in a shard
+_EMPTY_INDEX_ENTRY = 2**64 - 1
+
+
+class DamagedChunkError(ValueError):
+    """A chunk of a store that is missing, or not as it was written."""
+
+
+def chunk_damage(content: bytes) -> str:
+    """Damage of a chunk in words, by the checksum that Zarr's codec put at its end."""
+    if not content:
+        return "is empty"
+    checksum = google_crc32c.value(content[:-_CHECKSUM_BYTES]).to_bytes(_CHECKSUM_BYTES, "little")
+    return "" if content[-_CHECKSUM_BYTES:] == checksum else "fails its checksum"
+
+
+def shard_damage(content: bytes, n_chunks: int) -> str:
+    """Damage of a file of several chunks in words, by the checksums of these and of their index."""
+    index_bytes = n_chunks * _SHARD_INDEX_ENTRY_BYTES + _CHECKSUM_BYTES
+    if damage := chunk_damage(content[-index_bytes:]):
+        return damage
+    index = np.frombuffer(content[-index_bytes:-_CHECKSUM_BYTES], "<u8").reshape(-1, 2)
+    for offset, length in index[index[:, 0] != _EMPTY_INDEX_ENTRY].tolist():
+        if chunk_damage(content[offset : offset + length]):
+            return "fails a checksum"
+    return ""
+
+
+class ChunkBlockMap:
+    """Blocks that write the chunks of a store, by the document of its root.
+
+    The chunks of the outputs of a group make a grid, of which each block has one position. An array
+    that lacks a dimension of it is written by the blocks at its start.
+    """
+
+    def __init__(self, location: Location) -> None:
+        root_metadata = read_root_metadata(location)
+        attributes = root_metadata["attributes"]
+        self.kind, self.is_packed = attributes["kind"], PACKED_ATTRIBUTE in attributes
+        nodes = root_metadata["consolidated_metadata"]["metadata"]
+        self._arrays = {name: node for name, node in nodes.items() if "data_type" in node}
+        records = iter_records(location / JOURNAL_DIR / MANIFEST_FILE)
+        self.template_objects = frozenset(record.get("object", "") for record in records)
+        groups_by_kind = {"grid": [""], "eyepoints": [""], "scene": attributes.get("scanners", [])}
+        self.n_blocks = 0
+        self._block_grids: dict[str, tuple[int, dict[str, int]]] = {}
+        for group in [] if self.is_packed else groups_by_kind.get(self.kind, []):
+            chunks_by_dim = self._block_grid_shape(group)
+            self._block_grids[group] = self.n_blocks, chunks_by_dim
+            self.n_blocks += math.prod(chunks_by_dim.values())
+
+    def _block_grid_shape(self, group: str) -> dict[str, int]:
+        """Chunks along each dimension that is cut, of the outputs of a group, in their order."""
+        chunks_by_dim: dict[str, int] = {}
+        for name, node in self._arrays.items():
+            if name.rpartition("/")[0] != group or self._is_in_template(name, node):
+                continue
+            array_chunks_by_dim = {dim: n for dim, n in _chunk_counts(node).items() if n > 1}
+            chunks_by_dim = (
+                array_chunks_by_dim
+                if len(array_chunks_by_dim) > len(chunks_by_dim)
+                else chunks_by_dim
+            )
+        return dict(sorted(chunks_by_dim.items(), key=lambda item: item[0] == CYCLE_DIM))
+
+    def _is_in_template(self, name: str, node: dict[str, Any]) -> bool:
+        return "/".join([name, "c", *("0" for _ in node["shape"])]) in self.template_objects
+
+    def block_of_chunk(self, chunk_name: str) -> int:
+        """Block that writes a chunk; -1 where it is none's."""
+        name_match = CHUNK_NAME.fullmatch(chunk_name)
+        node = self._arrays.get(name_match[1]) if name_match else None
+        block_grid = self._block_grids.get(name_match[1].rpartition("/")[0]) if name_match else None
+        if (
+            not name_match
+            or node is None
+            or block_grid is None
+            or chunk_name in self.template_objects
+        ):
+            return -1
+        first_block, chunks_by_dim = block_grid
+        position = dict(zip(_block_dims(node), map(int, name_match[2].split("/")[1:]), strict=True))
+        index = 0
+        for dim, count in chunks_by_dim.items():
+            index = index * count + position.get(dim, 0)
+        return first_block + index
+
+    def chunks_per_shard(self, chunk_name: str) -> int:
+        """Chunks that the file of a shard has room for; 0 where a file is one chunk."""
+        name_match = CHUNK_NAME.fullmatch(chunk_name)
+        node = self._arrays.get(name_match[1]) if name_match else None
+        if node is None or node["codecs"][0]["name"] != "sharding_indexed":
+            return 0
+        file_shape = node["chunk_grid"]["configuration"]["chunk_shape"]
+        chunk_shape = node["codecs"][0]["configuration"]["chunk_shape"]
+        return math.prod(
+            -(-file_length // chunk_length)
+            for file_length, chunk_length in zip(file_shape, chunk_shape, strict=True)
+        )
+
+
+def _chunk_counts(node: dict[str, Any]) -> dict[str, int]:
+    """Chunks of an array along each dimension."""
+    chunk_shape = node["chunk_grid"]["configuration"]["chunk_shape"]
+    lengths_by_dim = zip(_block_dims(node), node["shape"], chunk_shape, strict=True)
+    return {dim: -(-length // chunk_length) for dim, length, chunk_length in lengths_by_dim}
+
+
+def _block_dims(node: dict[str, Any]) -> list[str]:
+    """Dimensions of an array; that of the shots of cycles, which is cut as they are, is theirs."""
+    return [CYCLE_DIM if dim == SHOT_DIM else dim for dim in node.get("dimension_names", ())]
+
+
+class VerifiedStore(WrapperStore[Any]):
+    """A store for reading, each of whose chunks is checked before it is decoded."""
+
+    def __init__(self, store: Any, location: Location, prefix: str = "") -> None:
+        super().__init__(store)
+        self._location, self._prefix = location, prefix
+
+    def _with_store(self, store: Any) -> VerifiedStore:
+        return type(self)(store, self._location, self._prefix)
+
+    def with_read_only(self, read_only: bool = False) -> VerifiedStore:
+        """Return itself, which is for reading."""
+        if not read_only:
+            raise ValueError("the store is opened to be read")
+        return self
+
+    @cached_property
+    def _block_map(self) -> ChunkBlockMap:
+        return ChunkBlockMap(self._location)
+
+    async def get(self, key: str, prototype: Any = None, byte_range: Any = None) -> Any:
+        """Return the bytes of a file, or of a part of it; DamagedChunkError for a damaged chunk."""
+        prototype = prototype or default_buffer_prototype()
+        try:
+            return await self._get_verified(key, prototype, byte_range)
+        except Exception:
+            _loops_with_failed_reads.add(asyncio.get_running_loop())
+            raise
+
+    async def _get_verified(self, key: str, prototype: Any, byte_range: Any) -> Any:
+        content = await self._fetch(key, prototype, byte_range)
+        name = key.removeprefix(self._prefix).lstrip("/")
+        if not CHUNK_NAME.fullmatch(name) or not (
+            damage := self._find_damage(name, content, byte_range)
+        ):
+            return content
+        # Once more: the body of an answer may be cut, and another process may just have written it.
+        complete_content = await self._store.get(key, prototype)
+        if damage := self._find_damage(name, complete_content, None):
+            raise DamagedChunkError(self._damage_message(name, damage))
+        return await self._store.get(key, prototype, byte_range)
+
+    async def _fetch(self, key: str, prototype: Any, byte_range: Any) -> Any:
+        """Return the bytes of a file, asked for twice where the body of the first answer is cut."""
+        try:
+            return await self._store.get(key, prototype, byte_range)
+        except Exception as error:
+            if isinstance(self._location, Path) or to_readable_error(error) is error:
+                raise
+            return await self._store.get(key, prototype, byte_range)
+
+    async def get_partial_values(self, prototype: Any, key_ranges: Any) -> list[Any]:
+        """Return parts of files, checked."""
+        return [await self.get(key, prototype, byte_range) for key, byte_range in key_ranges]
+
+    def _find_damage(self, name: str, content: Any, byte_range: Any) -> str:
+        """Damage of a chunk in words; of one that is not computed yet none."""
+        if content is None:
+            return "is missing" if self._should_exist(name) else ""
+        if byte_range is None and (n_chunks := self._block_map.chunks_per_shard(name)):
+            return shard_damage(content.to_bytes(), n_chunks)
+        return chunk_damage(content.to_bytes())  # of a chunk of a shard, or of its index
+
+    def _should_exist(self, name: str) -> bool:
+        """Tell whether a chunk has to be there, by the log of what is committed."""
+        block_map = self._block_map
+        if block_map.is_packed or name in block_map.template_objects:
+            return True
+        if (block := block_map.block_of_chunk(name)) < 0 or block not in self._committed_blocks:
+            return False
+        self.__dict__.pop("_committed_blocks")  # a receipt may have been withdrawn since
+        return block in self._committed_blocks
+
+    @cached_property
+    def _committed_blocks(self) -> frozenset[int]:
+        """Blocks that were committed when the first missing chunk was asked for."""
+        points = read_receipt_totals(self._location, self._block_map.n_blocks).points_by_block
+        return frozenset(np.flatnonzero(points).tolist())
+
+    def _damage_message(self, name: str, damage: str) -> str:
+        block_map, location = self._block_map, self._location
+        block = block_map.block_of_chunk(name)
+        chunk_text = f"{location}: block {block}: {name}" if block >= 0 else f"{location}: {name}"
+        if block_map.is_packed:
+            remedy = f"`sweep verify {location}` names all that is damaged; copy the store anew"
+        elif name in block_map.template_objects:
+            remedy = f"`sweep verify {location} --repair` puts it back"
+        elif block_map.kind == "eyepoints":
+            remedy = "`sweep verify` and `sweep resume` of the study that uses them mend it"
+        else:
+            remedy = (
+                f"`sweep verify {location}` marks what is damaged, "
+                f"and `sweep resume {location}` computes it again"
+            )
+        return f"{chunk_text} {damage}: {remedy}"
+
+
+_loops_with_failed_reads: set[asyncio.AbstractEventLoop] = set()
+"""Loops of Zarr's in which a read has failed, and others may be left that nobody waits for."""
+
+
+@atexit.register
+def _cancel_pending_reads() -> None:
+    """Cancel the reads that are left, of which asyncio would print a traceback each."""
+
+    async def cancel_tasks() -> None:
+        tasks = asyncio.all_tasks() - {asyncio.current_task()}
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    for loop in _loops_with_failed_reads:
+        with suppress(Exception):
+            asyncio.run_coroutine_threadsafe(cancel_tasks(), loop).result(PENDING_READS_TIMEOUT)
+
+
+def open_verified_store(location: Location, study_id: str) -> Any:
+    """Open the store of a study for Zarr and xarray, to read it lazily."""
+    return _wrap_in_verified_store(
+        store_format.open_size_checked_store(location, study_id), location
+    )
+
+
+def open_array_group(location: Location) -> zarr.Group:
+    """Open the arrays of a store to be read; raises as :func:`.store_format.read_root_metadata`."""
+    store = _wrap_in_verified_store(store_format.open_size_checked_store(location), location)
+    return zarr.open_group(store, mode="r", zarr_format=3, use_consolidated=True)
+
+
+def _wrap_in_verified_store(store: Any, location: Location) -> Any:
+    """Wrap a store of Zarr's, or a place in one."""
+    if isinstance(location, Path):
+        return VerifiedStore(store, location)
+    return StorePath(VerifiedStore(store.store, location, location.key), location.key)

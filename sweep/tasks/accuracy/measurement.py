@@ -1,0 +1,590 @@
+"""The measurement of what accuracy costs: rungs tried round after round, from a spec to a store."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+import time
+import timeit
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from time import process_time
+from typing import Any
+
+import numpy as np
+
+from sweep.messages import option_name, option_text
+from sweep.spec import GridSpec, SceneSpec
+from sweep.storage import store_format
+from sweep.storage.locations import Location, is_free, resolve_links
+from sweep.tasks.accuracy.settings import (
+    ADAPTIVE_KIND,
+    ALL_EFFECTS_KIND,
+    REFERENCE_KIND,
+    THESIS_KIND,
+    AccuracySetting,
+    SettingLadder,
+    add_fixed_effect_settings,
+    build_ladder,
+)
+from sweep.tasks.accuracy.study_sample import (
+    FlightSample,
+    GridSample,
+    SampleResults,
+    StudySample,
+    Trial,
+    halton_sample,
+    merge_trials,
+)
+from sweep.tasks.engine import study_store
+from sweep.tasks.engine.blocks import ArrayLayout, BlockStudy, cf_attributes
+from sweep.tasks.engine.interrupts import InterruptHandler
+from sweep.tasks.engine.progress import (
+    Progress,
+    StoreError,
+    TaskError,
+    make_progress,
+    show_activity,
+)
+from sweep.tasks.studies.study_loading import ACCURACY_KIND, make_study
+
+SAMPLE_POINTS, TIME_LIMIT_SECONDS = 200, 60.0
+"""Points of a sample; time that trying may take [s]."""
+
+ROUNDS_MAX = 27
+"""Rounds at the most, which a study that takes next to nothing has: chance tells most there."""
+
+TRIAL_TIME_FRACTION = 0.003
+"""Share of the time limit that a trial takes: its calls then cost little beside its points."""
+
+STRETCH_TIME_FACTOR = 2
+"""Of these, in which stretches are cut: calls cost the dearest settings nothing to speak of."""
+
+FIRST_STRETCH_DIVISOR = 8
+"""Factor by which the stretches are shorter in which settings are known to be dear."""
+
+FIRST_ROUND_TIME_FRACTION, TIME_DOMAIN_TIME_FRACTION = 0.6, 0.8
+"""Shares of the time limit by which the first round, and then the truth, ends."""
+
+TIME_DOMAIN_POINTS_MIN, TIME_DOMAIN_POINTS_MAX = 3, 500
+"""Points in the time domain, however long they take, and at the most."""
+
+TIME_DOMAIN_BEAMLETS = 109
+"""Beamlets in the time domain where accuracy decides on their number: each is a record."""
+
+SINGLE_TRIAL_SECONDS = 1.0
+"""Seconds from which on a trial is made once: it is timed well enough by that."""
+
+FIXED_EFFECTS_TOLERANCES = (1e-1, 1e-3, 1e-6)
+"""Tolerances whose effects are tried at every point alike."""
+
+STORING_TRIALS = 3
+"""Of each part of storing; the first may import and open what the others find."""
+
+
+def measure_accuracy(
+    spec: GridSpec | SceneSpec,
+    *,
+    store_path: Location,
+    n_points: int = SAMPLE_POINTS,
+    time_limit: float = TIME_LIMIT_SECONDS,
+    overwrite: bool = False,
+    progress: bool | Progress = True,
+) -> bool:
+    """Try a ladder of settings on a sample of a study's points, and store what they came to.
+
+    The store is there whole, or not at all. Trying takes about a ``time_limit`` [s];
+    ``progress`` is as of :func:`sweep.tasks.driver.run`. False where it was interrupted before
+    any point was through: there is no store then.
+
+    StoreError where a store is in the way or can't be written, TaskError where the study draws
+    whole spectra, SceneError where a file of a scene is missing, changed or unfit.
+    """
+    if spec.draws.draws_whole_spectra:
+        raise TaskError(
+            "this study draws whole spectra, which have no settings to try: "
+            "leave out draws.method, detector and estimator"
+        )
+    store_path = resolve_links(store_path)
+    _refuse_occupied_path(store_path, overwrite)
+    listener = make_progress(progress)
+    with InterruptHandler(listener) as interrupts:
+        with show_activity("choosing points", listener):
+            sample = (
+                FlightSample(spec, n_points)
+                if isinstance(spec, SceneSpec)
+                else GridSample(spec, n_points)
+            )
+        try:
+            measured_template = Measurement(
+                sample, time_limit=time_limit, progress=listener, interrupts=interrupts
+            ).run()
+        except NothingMeasured:
+            return False
+    measured_template.storing_seconds = measure_storing_seconds(make_study(spec, store_path))
+    _refuse_occupied_path(store_path, overwrite)  # it may hold something else by now
+    study_store.create_store(store_path, measured_template, replace_existing=overwrite)
+    return True
+
+
+def _refuse_occupied_path(store_path: Location, overwrite: bool) -> None:
+    if is_free(store_path):
+        return
+    if store_format.read_attributes(store_path)["kind"] != ACCURACY_KIND:
+        raise StoreError(
+            f"{store_path} holds a study's results: name another {option_name('store')}"
+        )
+    if not overwrite:
+        raise StoreError(f"{store_path} is there already: {option_text('overwrite')} measures anew")
+    study_store.refuse_to_replace(store_path)
+    study_store.refuse_foreign_files(store_path)
+
+
+def measure_storing_seconds(study: BlockStudy) -> float:
+    """Processor time that making a study's store takes [s], and writing its blocks, of zeros."""
+    block = study.n_blocks // 2
+    results = {
+        name: np.zeros(
+            [region_slice.stop - region_slice.start for region_slice in region],
+            study.layout_by_name[name].dtype,
+        )
+        for name, region in study.chunk_regions(block).items()
+    }
+    time_trials = partial(timeit.repeat, timer=process_time, repeat=STORING_TRIALS, number=1)
+    with tempfile.TemporaryDirectory() as folder:
+        store_path = Path(folder) / "study.zarr"
+
+        def create_store() -> None:
+            if store_path.exists():
+                study_store.remove_store(store_path)
+            study_store.create_store(store_path, study)
+
+        creation_seconds = min(time_trials(create_store))
+        writer = study_store.BlockWriter(store_path, study)
+        return creation_seconds + study.n_blocks * min(
+            time_trials(partial(writer.write, block, results))
+        )
+
+
+class NothingMeasured(Exception):
+    """Broken off before any point was through."""
+
+
+class Measurement:
+    """Rungs tried on a sample in turn, so that what drifts falls on all of them alike.
+
+    Each round takes them in an order of its own: a short trial takes longer after a long one.
+    All may take a time limit [s], about.
+    """
+
+    def __init__(
+        self,
+        sample: StudySample,
+        *,
+        time_limit: float,
+        progress: Progress,
+        interrupts: InterruptHandler,
+    ) -> None:
+        self._sample, self._time_limit = sample, time_limit
+        self._progress, self._interrupts = progress, interrupts
+        self._setting_ladder = add_fixed_effects(build_ladder(sample.spec), sample)
+        self._settings = self._setting_ladder.settings
+        self._n_timed_points = np.ones(len(self._settings), np.int64)
+        self._is_tried_once = np.zeros(len(self._settings), bool)
+        self._order_generator = np.random.default_rng(0)
+
+    def run(self) -> AccuracyTemplate:
+        """All rounds that the time allows; Nothing where no point was through before the end."""
+        n_settings = len(self._settings)
+        self._progress.say(
+            f"trying {n_settings} settings on {self._sample.size:,} {self._sample.points_noun}"
+        )
+        with show_activity("looking how long settings take", self._progress):
+            parts = self._sample.split(self._points_per_part())
+            n_rounds = self._plan_rounds(parts)
+        self._progress.begin(points=n_settings * len(parts) * n_rounds, done=0, unit="trials")
+        try:
+            return self._run_rounds(parts, n_rounds)
+        finally:
+            self._progress.end()
+
+    def _run_rounds(self, parts: list[np.ndarray], n_rounds: int) -> AccuracyTemplate:
+        first_round, stop_reason = (
+            self._run_round(parts, time_fraction=FIRST_ROUND_TIME_FRACTION),
+            "",
+        )
+        if not first_round:
+            raise NothingMeasured
+        if len(first_round) < len(parts):
+            stop_reason = "interrupted" if self._interrupts.is_stopping else "time limit"
+        parts = parts[: len(first_round)]
+        sample_rows = np.concatenate(parts)
+        time_domain_differences, n_beamlets = self._compare_with_time_domain(sample_rows)
+        finished_rounds = [first_round]
+        while len(finished_rounds) < n_rounds and len(finished_rounds[-1]) == len(parts):
+            finished_rounds.append(
+                self._run_round(parts, time_fraction=1.0, first_round=first_round)
+            )
+        complete_rounds = [
+            trials_of_round
+            for trials_of_round in finished_rounds
+            if len(trials_of_round) == len(parts)
+        ]
+        trials = [
+            [merge_trials(trials_of_round) for trials_of_round in zip(*parts, strict=True)]
+            for parts in complete_rounds
+        ]
+        return AccuracyTemplate(
+            self._sample,
+            self._setting_ladder,
+            sample_rows,
+            trials,
+            self._n_timed_points,
+            time_domain_differences,
+            n_beamlets,
+            stop_reason,
+        )
+
+    def _points_per_part(self) -> int:
+        """Points of a part: a few parts, and more where a point takes its time."""
+        setting_numbers, first_part = range(len(self._settings)), self._sample.split(1)[0]
+        for setting_number in setting_numbers:  # compiles what it compiles, which is not counted
+            self._time_trial(setting_number, first_part)
+        self._start = time.monotonic()
+        seconds_per_round = sum(
+            self._time_trial(setting_number, first_part) for setting_number in setting_numbers
+        )
+        points_that_fit = (
+            (FIRST_ROUND_TIME_FRACTION * self._time_limit - self._elapsed_seconds)
+            * len(first_part)
+            / seconds_per_round
+        )
+        # Whole parts are kept where it is broken off. On one more all are tried before.
+        parts_min = max(2, len(self._sample.split(self._sample.size)))
+        return max(1, min(self._sample.size // parts_min, int(points_that_fit / (parts_min + 1))))
+
+    def _plan_rounds(self, parts: list[np.ndarray]) -> int:
+        """Return the rounds that fit in; set the points of a stretch that times each rung well."""
+        n_points, trial_seconds = 1, TRIAL_TIME_FRACTION * self._time_limit
+        while (
+            self._time_trial(0, parts[0]) < trial_seconds / 2
+            and n_points < self._sample.timed_points_max
+        ):
+            n_points = min(2 * n_points, self._sample.timed_points_max)
+            self._n_timed_points[0] = n_points
+        n_points_first = max(1, n_points // FIRST_STRETCH_DIVISOR)
+        self._n_timed_points[:] = n_points_first
+        first_seconds = np.array(
+            [
+                self._time_trial(setting_number, parts[0])
+                for setting_number in range(len(self._settings))
+            ]
+        )
+        points_that_fit = STRETCH_TIME_FACTOR * trial_seconds * n_points_first / first_seconds
+        self._n_timed_points[:] = np.exp2(np.floor(np.log2(points_that_fit))).clip(1, n_points)
+        seconds_per_setting = first_seconds * self._n_timed_points / n_points_first
+        self._is_tried_once = seconds_per_setting > SINGLE_TRIAL_SECONDS
+        seconds_left = 0.75 * (self._time_limit - self._elapsed_seconds) / len(parts)
+        seconds_after_truth = (1 - TIME_DOMAIN_TIME_FRACTION) * self._time_limit / len(parts)
+        repeated_seconds = max(float(seconds_per_setting[~self._is_tried_once].sum()), 1e-9)
+        extra_rounds = (
+            max(seconds_left - float(seconds_per_setting.sum()), seconds_after_truth)
+            / repeated_seconds
+        )
+        return 1 + max(0, min(ROUNDS_MAX - 1, int(extra_rounds)))
+
+    @property
+    def _elapsed_seconds(self) -> float:
+        return time.monotonic() - self._start
+
+    def _time_trial(self, setting_number: int, part: np.ndarray) -> float:
+        start = time.monotonic()
+        if self._interrupts.is_stopping:
+            raise NothingMeasured
+        self._try_setting(setting_number, part)
+        self._sample.drop_caches()
+        return time.monotonic() - start
+
+    def _try_setting(self, setting_number: int, part: np.ndarray) -> Trial:
+        return self._sample.try_setting(
+            self._settings[setting_number], part, int(self._n_timed_points[setting_number])
+        )
+
+    def _run_round(
+        self,
+        parts: list[np.ndarray],
+        *,
+        time_fraction: float,
+        first_round: list[list[Trial]] | None = None,
+    ) -> list[list[Trial]]:
+        """Every rung on every part that there is time for; long ones only in the first round."""
+        trials_by_part: list[list[Trial]] = []
+        for part in parts:
+            if trials_by_part and self._elapsed_seconds > time_fraction * self._time_limit:
+                break
+            trials = {}
+            for setting_number in self._order_generator.permutation(len(self._settings)).tolist():
+                if self._interrupts.is_stopping:
+                    return trials_by_part
+                if first_round is not None and self._is_tried_once[setting_number]:
+                    trials[setting_number] = first_round[len(trials_by_part)][setting_number]
+                else:
+                    trials[setting_number] = self._try_setting(setting_number, part)
+                self._progress.advance(points=1, failed=0)
+            self._sample.drop_caches()
+            trials_by_part.append(
+                [trials[setting_number] for setting_number in range(len(self._settings))]
+            )
+        return trials_by_part
+
+    def _compare_with_time_domain(
+        self, sample_rows: np.ndarray
+    ) -> tuple[dict[int, np.ndarray], int]:
+        """Hold the reference at some points against the time domain, as time allows.
+
+        Their differences, as of :func:`result_differences`, and the beamlets of both.
+        """
+        reference_setting, beamlets_field = self._setting_ladder.reference, "footprint.beamlets"
+        differences: dict[int, np.ndarray] = {}
+        n_beamlets = TIME_DOMAIN_BEAMLETS if beamlets_field in reference_setting.overrides else 0
+        if n_beamlets:
+            overrides = {**reference_setting.overrides, beamlets_field: n_beamlets}
+            reference_setting = replace(
+                reference_setting, name="in time", overrides=overrides, rays_error_max=0.0
+            )
+        for sample_row in sample_rows[
+            halton_sample(sample_rows.shape, TIME_DOMAIN_POINTS_MAX)
+        ].tolist():
+            is_late = self._elapsed_seconds > TIME_DOMAIN_TIME_FRACTION * self._time_limit
+            if self._interrupts.is_stopping or (
+                is_late and len(differences) >= TIME_DOMAIN_POINTS_MIN
+            ):
+                break
+            time_domain, simulated = self._sample.compare_with_time_domain(
+                reference_setting, sample_row
+            )
+            if np.isfinite(time_domain.pd).any():
+                differences[sample_row] = np.concatenate(result_differences(time_domain, simulated))
+        self._sample.drop_caches()
+        return differences, n_beamlets
+
+
+def add_fixed_effects(
+    setting_ladder: SettingLadder, sample: StudySample, tolerances: Iterable[float] = ()
+) -> SettingLadder:
+    """Return the ladder, with the effects of each tolerance fixed at every point."""
+    if not any(setting.kind == ALL_EFFECTS_KIND for setting in setting_ladder.settings):
+        return setting_ladder  # of draws
+    setting_by_tolerance = {
+        tolerance_of_setting(setting): setting
+        for setting in setting_ladder.settings
+        if setting.kind == ADAPTIVE_KIND
+    }
+    effects_by_tolerance = {
+        tolerance: sample.simulated_effects(setting_by_tolerance[tolerance])
+        for tolerance in FIXED_EFFECTS_TOLERANCES
+        if tolerance in setting_by_tolerance
+    }
+    sample.drop_caches()
+    return add_fixed_effect_settings(setting_ladder, sample.spec, effects_by_tolerance, tolerances)
+
+
+ERROR_ARRAYS = {
+    "pd_error": "largest error of a probability of detection, of segments and shot",
+    "log10_pfa_error": "error of log10 of a probability of false alarm",
+    "magnitude_error": "error of the magnitude of the peak bins, over it or sigma if larger",
+    "leakage_error": "error of a probability of leakage, of the two chirps",
+    "standard_error": "standard error that the setting itself tells, where it draws",
+}
+"""Arrays by setting and point, and what they are.
+
+The first four are in the order of :func:`result_differences`.
+"""
+
+N_PROMISED_ERRORS = 3
+"""The first of these, which a tolerance promises to bound."""
+
+
+def result_differences(results: SampleResults, reference: SampleResults) -> tuple[np.ndarray, ...]:
+    """Largest differences from others, (n,) each: of pd, log10 pfa, magnitudes, leakage.
+
+    Magnitudes in relation to the other, or to sigma where it is below that.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        log10_pfa_difference = np.abs(results.log10_pfa - reference.log10_pfa)
+        magnitude_scale = np.maximum(reference.magnitude, reference.noise_sigma[:, None])
+        magnitude_difference = np.abs(results.magnitude - reference.magnitude) / magnitude_scale
+    log10_pfa_difference = np.where(
+        results.log10_pfa == reference.log10_pfa, 0.0, log10_pfa_difference
+    )
+    pd_difference = _probability_differences(results.pd, reference.pd)
+    leakage_difference = _probability_differences(results.leakage, reference.leakage)
+    return tuple(
+        np.fmax.reduce(values, axis=1)
+        for values in (
+            pd_difference,
+            log10_pfa_difference,
+            magnitude_difference,
+            leakage_difference,
+        )
+    )
+
+
+def _probability_differences(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Differences of probabilities: what sees nothing detects nothing, and leaks nothing."""
+    is_known = np.isfinite(first) | np.isfinite(second)
+    return np.where(is_known, np.abs(np.nan_to_num(first) - np.nan_to_num(second)), np.nan)
+
+
+@dataclass
+class AccuracyTemplate:
+    """Content of the store: errors by rung and point, seconds by rung and round."""
+
+    sample: StudySample
+    setting_ladder: SettingLadder
+    sample_rows: np.ndarray  # places in the sample of the points that every rung was tried on
+    rounds: list[list[Trial]]  # of all these points, by rung
+    n_timed_points: np.ndarray  # (rungs,): points of a stretch that is timed
+    time_domain_differences: dict[int, np.ndarray]
+    """By place in the sample: differences of the reference from the time domain."""
+    time_domain_beamlets: int  # of both, where their number is not the reference's; else 0
+    stop_reason: str  # why the sample is not whole; empty where it is
+    storing_seconds: float = math.nan  # time that storing takes [s]
+
+    @property
+    def id(self) -> str:
+        """The spec of the study."""
+        return self.sample.spec.id
+
+    def store_attributes(self) -> dict[str, Any]:
+        """Return the spec, the reference of the errors, and the machine."""
+        spec, settings_and_trials = (
+            self.sample.spec,
+            zip(self.setting_ladder.settings, self.rounds[0], strict=True),
+        )
+        thesis_beamlets = [
+            trial.results.n_beamlets
+            for setting, trial in settings_and_trials
+            if setting.kind == THESIS_KIND
+        ]
+        attributes: dict[str, Any] = {
+            "kind": ACCURACY_KIND,
+            "title": spec.title,
+            "question": "What does accuracy cost in time?",
+            "spec": spec.to_json(),
+            "reference": self.setting_ladder.reference_text,
+            "unit": self.sample.points_noun,
+            "points": len(self.sample_rows),
+            "study_points": self.sample.n_study_points,
+            "storing_seconds": self.storing_seconds,
+            "notes": "\n".join(self.setting_ladder.notes),
+            # 0 where the thesis's way was not tried, or nothing is seen
+            "thesis_beamlets": int(
+                np.nan_to_num(np.fmax.reduce(thesis_beamlets, axis=None, initial=0))
+            ),
+            "stopped": self.stop_reason,
+            "coordinates": " ".join(["kind", *self.sample.point_coordinates()]),
+            "truth_points": len(self.time_domain_differences),
+        }
+        if not self.time_domain_differences:
+            return attributes
+        pd, _, _, magnitude = np.fmax.reduce(list(self.time_domain_differences.values()))
+        return attributes | {
+            "truth_beamlets": self.time_domain_beamlets,
+            "truth_pd_difference": float(pd),
+            "truth_magnitude_difference": float(magnitude),
+        }
+
+    def group_attributes(self) -> dict[str, dict[str, Any]]:
+        """None."""
+        return {}
+
+    def array_layouts(self) -> list[ArrayLayout]:
+        """Coordinates, errors, seconds."""
+        settings, results = (
+            self.setting_ladder.settings,
+            [trial.results for trial in self.rounds[0]],
+        )
+        errors = [
+            *zip(
+                *(
+                    result_differences(results_of_setting, results[-1])
+                    for results_of_setting in results
+                ),
+                strict=True,
+            )
+        ]
+        errors.append(tuple(results_of_setting.standard_error for results_of_setting in results))
+        seconds = np.transpose(
+            [
+                [trial.seconds_per_point for trial in results_of_setting]
+                for results_of_setting in self.rounds
+            ]
+        )
+        planning = np.transpose(
+            [
+                [trial.planning_seconds_per_point for trial in results_of_setting]
+                for results_of_setting in self.rounds
+            ]
+        )
+        time_domain_pd = [
+            self.time_domain_differences[row][0] if row in self.time_domain_differences else np.nan
+            for row in self.sample_rows.tolist()
+        ]
+
+        def make_layout(
+            name: str, dims: tuple[str, ...], values: Any, long_name: str, units: str = "1"
+        ) -> ArrayLayout:
+            return ArrayLayout.from_values(
+                name, dims, np.asarray(values), cf_attributes(units, long_name)
+            )
+
+        return [
+            ArrayLayout.from_values(
+                "rung", ("rung",), np.array([setting.name for setting in settings], object), {}
+            ),
+            ArrayLayout.from_values(
+                "kind", ("rung",), np.array([setting.kind for setting in settings], object), {}
+            ),
+            make_layout(
+                "tolerance",
+                ("rung",),
+                [tolerance_of_setting(setting) for setting in settings],
+                "tolerance of an adaptive setting",
+            ),
+            make_layout(
+                "times", ("rung",), self.n_timed_points, "points of each stretch that is timed"
+            ),
+            make_layout(
+                "seconds",
+                ("rung", "round"),
+                seconds,
+                "time a point on one core, planning included",
+                "s",
+            ),
+            make_layout("planning", ("rung", "round"), planning, "planning's share of it", "s"),
+            *(
+                make_layout(name, ("rung", "point"), values, about)
+                for (name, about), values in zip(ERROR_ARRAYS.items(), errors, strict=True)
+            ),
+            make_layout(
+                "truth_pd_difference",
+                ("point",),
+                time_domain_pd,
+                "difference of a probability of detection from the time domain's",
+            ),
+            *(
+                ArrayLayout.from_values(
+                    name, ("point",), np.asarray(values)[self.sample_rows], attributes
+                )
+                for name, (values, attributes) in self.sample.point_coordinates().items()
+            ),
+        ]
+
+
+def tolerance_of_setting(setting: AccuracySetting) -> float:
+    """Tolerance of an adaptive setting; nan of others."""
+    value = setting.overrides.get("accuracy.tolerance", np.nan)
+    return float(value) if setting.kind != REFERENCE_KIND else np.nan

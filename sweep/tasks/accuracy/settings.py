@@ -1,0 +1,387 @@
+"""Rungs: settings of a study that are tried against each other, as overrides of its spec."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from sweep.model.effects.catalogue import EFFECTS, NAMES
+from sweep.model.effects.segment_motion import SEGMENT_MOTION
+from sweep.model.ground import powers_add
+from sweep.spec import GridSpec, SceneSpec
+from sweep.spec.fields import OFF
+from sweep.tasks.studies.study_loading import AnySpec, apply_changes
+
+(
+    AS_WRITTEN_KIND,
+    ADAPTIVE_KIND,
+    ALL_EFFECTS_KIND,
+    FIXED_EFFECTS_KIND,
+    BEAMLETS_KIND,
+    LINE_PATTERN_KIND,
+) = ("as written", "adaptive", "all on", "fixed effects", "beamlets", "in a line")
+CLOSED_FORM_KIND, THESIS_KIND, IMPROVED_THESIS_KIND, REFERENCE_KIND = (
+    "closed form",
+    "thesis",
+    "thesis improved",
+    "reference",
+)
+MEAN_OF_DRAWS_KIND, COUNTED_DRAWS_KIND, DRAWS_IN_NOISE_KIND = (
+    "means of draws",
+    "draws counted",
+    "draws in noise",
+)
+"""Kinds of rungs."""
+
+TRIED_TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
+
+TRIED_BEAMLETS = (1, 7, 19, 37, 61, 109, 223, 1015, 4009)
+"""Beamlets that a study might fix: full shells of a hexagonal lattice."""
+
+TRIED_LINE_BEAMLETS = (3, 9, 33, 163, 1234)
+"""Beamlets in a line along the slope that a study over a plane might fix."""
+
+FIXED_EFFECTS_LINE_BEAMLETS = 163
+"""Of these where effects are fixed too: enough for the widest footprints."""
+
+THESIS_BEAMLETS = 109
+"""Beamlets of [T 3.3.1]."""
+
+REFERENCE_RAYS, REFERENCE_RAYS_TOLERANCE = 8017, 3e-7
+"""Rays of each shot of a flight's reference, and what they may leave: else shots have more."""
+
+FIXED_RAYS_MAX = 223
+"""Rays that are tried as a fixed number, at the most: more cost as much as all else together."""
+
+FIXED_RAYS_MIN, RAYS_TIMES_TOLERANCE = 19, 0.1
+"""Where effects are fixed too: rays at the least, and rays times tolerance, which leaves one shot
+in a thousand over open ground that is off by more."""
+
+REFERENCE_TOLERANCE = 1e-9
+"""Tolerance of the reference: of lines, of leakage and, over a plane, of the number of beamlets."""
+
+TRIED_DRAWS = (10, 100, 1000)
+
+REFERENCE_DRAWS_FACTOR = 10
+"""Draws of the reference over those of the longest rung."""
+
+TRIED_DRAW_TOLERANCES = (1e-1, 3e-2, 1e-2)
+"""Tolerances until which points are drawn."""
+
+_TOLERANCE_FIELD, _DRAWS_FIELD, _DRAWS_LIMIT_FIELD = (
+    "accuracy.tolerance",
+    "draws.number",
+    "draws.limit",
+)
+_BEAMLETS_FIELD, _PATTERN_FIELD, _LINE_PATTERN = "footprint.beamlets", "footprint.pattern", "line"
+_REFERENCE_TOLERANCE_OVERRIDES = dict.fromkeys(
+    ("accuracy.line_error", "accuracy.leakage_error", "accuracy.leakage_floor"), REFERENCE_TOLERANCE
+)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class AccuracySetting:
+    """A setting of a study: values of fields of its spec by dotted path, as one would write them.
+
+    ``thesis_grid_options`` has the options of
+    :func:`sweep.tasks.accuracy.study_sample.find_peaks_on_grid`, where that
+    finds the peaks; ``rays_error_max`` is what a flight's rays may leave before there are more, 0
+    where the spec says that.
+    """
+
+    name: str
+    kind: str
+    overrides: Mapping[str, Any] = field(default_factory=dict)
+    thesis_grid_options: Mapping[str, Any] = field(default_factory=dict)
+    rays_error_max: float = 0.0
+
+    @property
+    def has_line_effects_only(self) -> bool:
+        """True where nothing is simulated that the thesis's way lacks: effects in a record."""
+        return self.kind in (CLOSED_FORM_KIND, THESIS_KIND, IMPROVED_THESIS_KIND)
+
+    @property
+    def plans_effects(self) -> bool:
+        """True where effects are planned, and the time that this takes counts."""
+        return not self.has_line_effects_only and self.kind not in (
+            FIXED_EFFECTS_KIND,
+            ALL_EFFECTS_KIND,
+            REFERENCE_KIND,
+        )
+
+    @property
+    def counts_detections(self) -> bool:
+        """True where pd is a share of detected draws, not the mean of their probabilities."""
+        return self.kind in (COUNTED_DRAWS_KIND, DRAWS_IN_NOISE_KIND)
+
+    def apply_to(self, spec: AnySpec) -> AnySpec:
+        """Return the spec with the overrides put onto it; SpecError where it is no study then."""
+        return apply_changes(spec, self.overrides) if self.overrides else spec
+
+
+@dataclass(frozen=True)
+class SettingLadder:
+    """Rungs, the reference last, and what there is to say of them."""
+
+    settings: tuple[AccuracySetting, ...]
+    reference_text: str  # what the reference is
+    notes: tuple[str, ...] = ()
+
+    @property
+    def reference(self) -> AccuracySetting:
+        """The rung that the errors of all others are taken against."""
+        return self.settings[-1]
+
+
+def build_ladder(spec: AnySpec) -> SettingLadder:
+    """Return the rungs of a study, without those whose effects are fixed."""
+    if isinstance(spec, GridSpec) and spec.draws.has_draws:
+        return _build_draws_ladder(spec)
+    notes: list[str] = []
+    settings = [AccuracySetting(name="as written", kind=AS_WRITTEN_KIND)]
+    why_beamlets_are_fixed = _why_beamlets_are_fixed(spec)
+    adaptive_beamlets: dict[str, Any] = {} if why_beamlets_are_fixed else {_BEAMLETS_FIELD: "auto"}
+    if _is_on_axis(spec, _TOLERANCE_FIELD):
+        notes.append("accuracy.tolerance is on an axis: left as it is")
+    else:
+        settings += [
+            AccuracySetting(
+                name=f"auto at {tolerance:g}",
+                kind=ADAPTIVE_KIND,
+                overrides=adaptive_beamlets | {_TOLERANCE_FIELD: tolerance},
+            )
+            for tolerance in TRIED_TOLERANCES
+        ]
+    all_effects = _all_effects_overrides(spec)
+    settings.append(
+        AccuracySetting(name="all effects on", kind=ALL_EFFECTS_KIND, overrides=all_effects)
+    )
+    reference_overrides, reference_text, rays_error_max = (
+        all_effects | _REFERENCE_TOLERANCE_OVERRIDES,
+        "all effects on",
+        0.0,
+    )
+    if why_beamlets_are_fixed:
+        notes.append(f"the number of beamlets is left alone: {why_beamlets_are_fixed}")
+    elif isinstance(spec, SceneSpec):
+        reference_overrides, rays_error_max = (
+            reference_overrides | {_BEAMLETS_FIELD: REFERENCE_RAYS},
+            REFERENCE_RAYS_TOLERANCE,
+        )
+        reference_text += f", {REFERENCE_RAYS} beamlets or more"
+    else:
+        reference_overrides |= adaptive_beamlets | {_TOLERANCE_FIELD: REFERENCE_TOLERANCE}
+        reference_text += f", beamlets as at {REFERENCE_TOLERANCE:g}"
+    settings += () if why_beamlets_are_fixed else _beamlet_settings(isinstance(spec, SceneSpec))
+    settings += _thesis_settings(
+        {} if why_beamlets_are_fixed else {_BEAMLETS_FIELD: THESIS_BEAMLETS},
+        powers_add(spec.parameters()),
+    )
+    settings.append(
+        AccuracySetting(
+            name="reference",
+            kind=REFERENCE_KIND,
+            overrides=reference_overrides,
+            rays_error_max=rays_error_max,
+        )
+    )
+    return SettingLadder(tuple(settings), reference_text, tuple(notes))
+
+
+def add_fixed_effect_settings(
+    settings_ladder: SettingLadder,
+    spec: AnySpec,
+    effects_by_tolerance: Mapping[float, frozenset[str]],
+    tolerances: Iterable[float] = (),
+) -> SettingLadder:
+    """Add rungs that simulate everywhere the effects that a tolerance needs anywhere.
+
+    ``tolerances``: for lines and leakage, tried with each set; by default those of the sets.
+    """
+    tolerance_by_effects: dict[frozenset[str], float] = {}
+    for tolerance, effect_names in effects_by_tolerance.items():
+        tolerance_by_effects.setdefault(effect_names, tolerance)
+    fixed_settings = [
+        AccuracySetting(
+            name=f"{len(effect_names)} effects as at {effects_tolerance:g}, to {tolerance:g}",
+            kind=FIXED_EFFECTS_KIND,
+            overrides={
+                f"effects.{effect_name}": "on" if effect_name in effect_names else "off"
+                for effect_name in NAMES
+            }
+            | _beamlets_overrides(spec, tolerance)
+            | {_TOLERANCE_FIELD: tolerance},
+        )
+        for effect_names, effects_tolerance in tolerance_by_effects.items()
+        for tolerance in tolerances or effects_by_tolerance
+    ]
+    all_effects_index = next(
+        index
+        for index, setting in enumerate(settings_ladder.settings)
+        if setting.kind == ALL_EFFECTS_KIND
+    )
+    return replace(
+        settings_ladder,
+        settings=(
+            *settings_ladder.settings[:all_effects_index],
+            *fixed_settings,
+            *settings_ladder.settings[all_effects_index:],
+        ),
+    )
+
+
+def _beamlets_overrides(spec: AnySpec, tolerance: float) -> dict[str, Any]:
+    """Beamlets that a study whose effects are fixed might have, if their number is not given."""
+    if _why_beamlets_are_fixed(spec):
+        return {}
+    if not isinstance(spec, SceneSpec):
+        return {_BEAMLETS_FIELD: FIXED_EFFECTS_LINE_BEAMLETS, _PATTERN_FIELD: _LINE_PATTERN}
+    rays_min = max(FIXED_RAYS_MIN, RAYS_TIMES_TOLERANCE / tolerance)
+    return {
+        _BEAMLETS_FIELD: min(
+            next(
+                (n_beamlets for n_beamlets in TRIED_BEAMLETS if n_beamlets >= rays_min),
+                FIXED_RAYS_MAX,
+            ),
+            FIXED_RAYS_MAX,
+        )
+    }
+
+
+def _beamlet_settings(is_flight: bool) -> Iterator[AccuracySetting]:
+    """Return fixed numbers of beamlets: in a lattice, and in a line over a plane."""
+    for n_beamlets in TRIED_BEAMLETS:
+        if not is_flight or n_beamlets <= FIXED_RAYS_MAX:
+            yield AccuracySetting(
+                name=f"{n_beamlets} beamlets",
+                kind=BEAMLETS_KIND,
+                overrides={_BEAMLETS_FIELD: n_beamlets},
+            )
+    for n_beamlets in () if is_flight else TRIED_LINE_BEAMLETS:
+        overrides = {_BEAMLETS_FIELD: n_beamlets, _PATTERN_FIELD: _LINE_PATTERN}
+        yield AccuracySetting(
+            name=f"{n_beamlets} in a line", kind=LINE_PATTERN_KIND, overrides=overrides
+        )
+
+
+def _thesis_settings(overrides: Mapping[str, Any], adds_powers: bool) -> Iterator[AccuracySetting]:
+    """Yield the same beamlets and effects in closed form, and by the thesis's way, improved too."""
+    yield AccuracySetting(name="closed form, as thesis", kind=CLOSED_FORM_KIND, overrides=overrides)
+    variants: list[tuple[str, str, int, dict[str, Any]]] = [
+        *((THESIS_KIND, "", log2_cells, {}) for log2_cells in (11, 12)),
+        *(
+            (IMPROVED_THESIS_KIND, ", real", log2_cells, {"real": True})
+            for log2_cells in (11, 12)
+            if adds_powers
+        ),
+        *(
+            (IMPROVED_THESIS_KIND, ", folded", log2_cells, {"folded": True, "real": adds_powers})
+            for log2_cells in (11, 12)
+        ),
+        (
+            IMPROVED_THESIS_KIND,
+            ", folded, degree 9",
+            12,
+            {"folded": True, "real": adds_powers, "degree": 9},
+        ),
+    ]
+    for kind, variant_text, log2_cells, options in variants:
+        grid_options = {"size": 1 << log2_cells} | options
+        yield AccuracySetting(
+            name=f"thesis 2^{log2_cells}{variant_text}",
+            kind=kind,
+            overrides=overrides,
+            thesis_grid_options=grid_options,
+        )
+
+
+def _build_draws_ladder(spec: GridSpec) -> SettingLadder:
+    """Numbers of draws and what is read off them, against a long run with other draws."""
+    reference_draws = REFERENCE_DRAWS_FACTOR * TRIED_DRAWS[-1]
+    notes = ["errors are differences from a long run with other draws, so they are random too"]
+    as_written_overrides: dict[str, Any] = {}
+    for field_path, n_written in (
+        (_DRAWS_FIELD, spec.draws.number),
+        (_DRAWS_LIMIT_FIELD, spec.draws.limit),
+    ):
+        if n_written > reference_draws:
+            as_written_overrides = {field_path: reference_draws}
+            notes.append(f"with {reference_draws} of the {n_written} draws that are written")
+    settings = [
+        AccuracySetting(name="as written", kind=AS_WRITTEN_KIND, overrides=as_written_overrides)
+    ]
+    for tolerance in TRIED_DRAW_TOLERANCES:
+        adaptive_overrides = {
+            _DRAWS_FIELD: 0,
+            _DRAWS_LIMIT_FIELD: reference_draws,
+            _TOLERANCE_FIELD: tolerance,
+        }
+        settings.append(
+            AccuracySetting(
+                name=f"auto at {tolerance:g}", kind=ADAPTIVE_KIND, overrides=adaptive_overrides
+            )
+        )
+    for n_draws in TRIED_DRAWS:
+        draws_overrides = {_DRAWS_FIELD: n_draws, _DRAWS_LIMIT_FIELD: 0}
+        noise_overrides = draws_overrides | {"draws.method": "noise"}
+        settings += [
+            AccuracySetting(
+                name=f"{n_draws} draws, mean", kind=MEAN_OF_DRAWS_KIND, overrides=draws_overrides
+            ),
+            AccuracySetting(
+                name=f"{n_draws} draws, counts", kind=COUNTED_DRAWS_KIND, overrides=draws_overrides
+            ),
+            AccuracySetting(
+                name=f"{n_draws} draws, noise", kind=DRAWS_IN_NOISE_KIND, overrides=noise_overrides
+            ),
+        ]
+    reference_overrides = {
+        _DRAWS_FIELD: reference_draws,
+        "seed": int(spec.seed) ^ 1,
+        _DRAWS_LIMIT_FIELD: 0,
+    }
+    settings.append(
+        AccuracySetting(
+            name="reference",
+            kind=REFERENCE_KIND,
+            overrides=_all_effects_overrides(spec) | reference_overrides,
+        )
+    )
+    return SettingLadder(
+        tuple(settings), f"{reference_draws} other draws, all effects on", tuple(notes)
+    )
+
+
+def _all_effects_overrides(spec: AnySpec) -> dict[str, Any]:
+    """All effects on; segments that all begin at one range are a law, which stays as written.
+
+    Random ones where probabilities are means over draws: of a flight they are not.
+    """
+    segment_motion, has_draws = (
+        SEGMENT_MOTION.name,
+        isinstance(spec, GridSpec) and spec.draws.has_draws,
+    )
+    overrides = {
+        f"effects.{effect.name}": "on" for effect in EFFECTS if has_draws or not effect.is_random
+    }
+    if spec.effect_modes()[segment_motion] == OFF:
+        del overrides[f"effects.{segment_motion}"]
+    return overrides
+
+
+def _is_on_axis(spec: AnySpec, path: str) -> bool:
+    return any(member.path == path for axis in spec.axes for member in axis.parameters)
+
+
+def _why_beamlets_are_fixed(spec: AnySpec) -> str:
+    """Why the number of beamlets is the scene's and not accuracy's; empty where it is."""
+    if spec.parameters()["footprint.phases"] == "coherent":
+        return "with coherent phases it is part of the scene, as the thesis has it"
+    if spec.instrument.receiver.architecture == "direct":
+        return "in direct detection beamlets add as amplitudes, and are part of the scene"
+    if any(
+        _is_on_axis(spec, path) for path in (_BEAMLETS_FIELD, _PATTERN_FIELD, "footprint.phases")
+    ):
+        return "it is on an axis"
+    return ""

@@ -1,0 +1,838 @@
+"""A sample of points that rungs are tried on, by the machinery of a run, or the thesis's way.
+
+Of a grid these are points spread over all axes, of a flight whole tiles of shots, as effects are
+planned in them.
+
+[T 3.3.1] convolves the spectra with the window's transform "with much higher sampling rate in the
+frequency domain than the FFT bin spacing", by an FFT "typically of size 2^11 or 2^12". The grid has
+16 cells a bin around the beam's centre, and each beamlet's line goes into the nearest cell. One FFT
+follows, a product with the transform of the window's own, and the way back. The improvements
+`real`, `folded` and `degree` are those of docs/accuracy.md. Changes of lines within a record (range
+walk, line width) are skipped, and leakage beyond the grid.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from functools import cache, cached_property, lru_cache, partial
+from itertools import product, zip_longest
+from pathlib import Path
+from time import thread_time
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy import fft
+from scipy.stats import qmc
+
+from sweep.kernel_cache import njit
+from sweep.model import shot, truth
+from sweep.model import window as windows
+from sweep.model.accuracy import Accuracy
+from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.detection import detect_rows
+from sweep.model.effects.catalogue import EFFECTS, NAMES, flags_of, names_of
+from sweep.model.eyepoints import Eyepoints, seen_ground
+from sweep.model.lines import BLOCK, IM, PLACE, RE, add_images, fold_lines, place_lines
+from sweep.model.preparation import Shots
+from sweep.model.ray_error import ray_error
+from sweep.model.waveform import SEGMENTS
+from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
+from sweep.spec import Axis, GridSpec, SceneSpec
+from sweep.tasks.accuracy.settings import AS_WRITTEN_KIND, AccuracySetting, AnySpec
+from sweep.tasks.engine.blocks import SHOTS_PER_TILE, ParameterBlockGrid, Results
+from sweep.tasks.studies.eyepoint_study import build_world
+from sweep.tasks.studies.flight_study import FlightBlock, FlightStudy
+from sweep.tasks.studies.grid_study import GridStudy, SelectedEffects, evaluate_points
+
+PeakFinder = Callable[[Shots], np.ndarray]
+"""A way to the largest bins of each segment's spectrum, as :func:`sweep.model.shot.find`."""
+
+PointCoordinates = dict[str, tuple[np.ndarray, dict[str, Any]]]
+"""Values of points and their attributes, by name."""
+
+
+def _flags_of_effects(effect_names: Collection[str]) -> np.uint32:
+    """Return the flags of some effects."""
+    return np.uint32(sum(1 << NAMES.index(effect_name) for effect_name in effect_names))
+
+
+LINE_EFFECT_FLAGS = _flags_of_effects(
+    [effect.name for effect in EFFECTS if effect.stage not in ("record", "detection", "draws")]
+)
+"""Flags of the effects that the thesis's way can have."""
+
+TIME_DOMAIN_EFFECT_FLAGS = ~_flags_of_effects(
+    ["acceleration", "chirp_nonlinearity", "circulator_leak", "line_width", "leakage"]
+    + [effect.name for effect in EFFECTS if effect.is_random]
+)
+"""Flags of the effects that the time-domain records know of."""
+
+TIMED_STRETCHES_PER_PART, TIMED_POINTS_MAX = 12, 8192
+"""Places of a part of a grid's sample at which stretches of a block are timed, and their length at
+the most."""
+
+SAMPLED_AXIS_POINTS = 2
+"""Places along the axes at which each scanner of a flight is looked at."""
+
+RESERVED_COORDINATE_NAMES = ("number", "kind", "tolerance")
+"""Names of parameters that the store has for itself: on an axis they go by their whole path."""
+
+AS_WRITTEN_SETTING = AccuracySetting(name="as written", kind=AS_WRITTEN_KIND)
+
+
+class SampleResults(NamedTuple):
+    """Results of a rung at n points; nan for those that it lacks."""
+
+    pd: np.ndarray  # (n, 4): probability of detection: up, Doppler, down, shot
+    log10_pfa: np.ndarray  # (n, k): log10 of probabilities of false alarm
+    leakage: np.ndarray  # (n, 2): probability of leakage in the chirps, up and down
+    magnitude: np.ndarray  # (n, k): |X| of the peak bins, in a unit of all rungs
+    standard_error: np.ndarray  # (n,): of the worst of pd, where it is a mean over draws
+    noise_sigma: np.ndarray  # (n,): noise of a bin, per quadrature, in the magnitudes' unit
+    n_beamlets: np.ndarray
+    """(n,): of each point; of a flight all rays that are cast, whatever is made of them."""
+
+
+def extract_results(outputs: Results, n_draws: int = 0) -> SampleResults:
+    """Results in the outputs of points; ``n_draws``: in so many draws, 0 for means of them."""
+    segments_and_shot = (*SEGMENTS, "shot")
+
+    def stack_outputs(form: str, names: Iterable[str] = SEGMENTS) -> np.ndarray:
+        return np.stack([outputs[form.format(name)] for name in names], axis=1)
+
+    if n_draws:
+        n_detected = [outputs[f"n_detected_{name}"].sum(axis=1) for name in segments_and_shot]
+        pd = np.stack(n_detected, axis=1) / n_draws
+        standard_error = np.sqrt(np.maximum(pd * (1 - pd), 0.0) / n_draws)
+        return unknown_results(len(pd))._replace(pd=pd, standard_error=standard_error.max(axis=1))
+    pd, variance = stack_outputs("pd_{}", segments_and_shot), outputs["noise_variance"]
+    standard_errors = [
+        outputs[f"pd_{name}_error"] for name in segments_and_shot if f"pd_{name}_error" in outputs
+    ]
+    return SampleResults(
+        pd,
+        stack_outputs("log10_pfa_{}", ("segment", "shot")),
+        stack_outputs("p_leakage_{}", ("up", "down")),
+        np.sqrt(stack_outputs("snr_{}") * np.reshape(variance, (-1, 1))),
+        np.fmax.reduce(standard_errors) if standard_errors else np.full(len(pd), np.nan),
+        np.sqrt(variance / 2),
+        outputs["beamlets"],
+    )
+
+
+def unknown_results(n_points: int) -> SampleResults:
+    """Results of points of which nothing is known."""
+    shapes = (
+        (n_points, 4),
+        (n_points, 2),
+        (n_points, 2),
+        (n_points, 3),
+        n_points,
+        n_points,
+        n_points,
+    )
+    return SampleResults(*(np.full(shape, np.nan) for shape in shapes))
+
+
+class Trial(NamedTuple):
+    """A rung tried on some points."""
+
+    results: SampleResults
+    seconds_per_point: float
+    """Processor time of a point, planning included: what others use of the machine is no part."""
+    planning_seconds_per_point: float  # a point
+
+
+def merge_trials(trials: Sequence[Trial]) -> Trial:
+    """Trials of a rung on several parts of a sample as one."""
+    weights = np.array([trial.results.noise_sigma.size for trial in trials], float)
+    weights /= weights.sum()
+    return Trial(
+        SampleResults(*map(np.concatenate, zip(*(trial.results for trial in trials), strict=True))),
+        float(weights @ [trial.seconds_per_point for trial in trials]),
+        float(weights @ [trial.planning_seconds_per_point for trial in trials]),
+    )
+
+
+class StudySample(ABC):
+    """A sample of a study's points."""
+
+    points_noun = "points"
+    spec: AnySpec
+    study_with: Callable[[AccuracySetting], Any]  # the study with a rung's settings
+    point_indices: np.ndarray  # (size,): of the sample's points, by which they are computed
+    n_study_points: (
+        int  # points of the study, each computed once: draws of a flight are none of their own
+    )
+    timed_points_max: int  # points of the longest stretch that may be timed
+
+    @property
+    def size(self) -> int:
+        """Points of the sample."""
+        return self.point_indices.size
+
+    @abstractmethod
+    def split(self, points_per_part: int) -> list[np.ndarray]:
+        """Return the sample in parts of about so many points."""
+
+    @abstractmethod
+    def try_setting(self, setting: AccuracySetting, part: np.ndarray, n_timed_points: int) -> Trial:
+        """Compute a rung on a part of the sample, timed on so many points or on the part."""
+
+    @abstractmethod
+    def point_coordinates(self) -> PointCoordinates:
+        """Return what tells the points of the sample apart."""
+
+    def simulated_effects(self, setting: AccuracySetting) -> frozenset[str]:
+        """Effects that a rung simulates anywhere in the sample."""
+        parts = (self.point_indices[part] for part in self.split(self.size))
+        effect_flags = [
+            np.bitwise_or.reduce(self._plan_flags(setting, indices)[0]) for indices in parts
+        ]
+        return frozenset(names_of(int(np.bitwise_or.reduce(effect_flags))))
+
+    def compare_with_time_domain(
+        self, setting: AccuracySetting, sample_row: int
+    ) -> tuple[SampleResults, SampleResults]:
+        """Compute a point in the time domain, and with the rung's effects that the truth has."""
+        point_index = self.point_indices[[sample_row]]
+        effect_flags = self._plan_flags(setting, point_index)[0] & TIME_DOMAIN_EFFECT_FLAGS
+        # Records walk by themselves, whatever effects are named.
+        time_domain, simulated = (
+            self._collect_results(
+                setting, 1, self._iter_outputs(setting, point_index, effect_flags, find_peaks)
+            )
+            for find_peaks in (truth.find, shot.find)
+        )
+        return time_domain, simulated
+
+    def drop_caches(self) -> None:  # noqa: B027
+        """Drop what trials of one part share; its time counts for each of them."""
+
+    @abstractmethod
+    def _plan_flags(
+        self, setting: AccuracySetting, point_indices: np.ndarray
+    ) -> tuple[np.ndarray, float]:
+        """Return flags of points (n,), and the time that planning takes one, its share."""
+
+    @abstractmethod
+    def _iter_outputs(
+        self,
+        setting: AccuracySetting,
+        point_indices: np.ndarray,
+        effect_flags: np.ndarray,
+        find_peaks: PeakFinder | None,
+    ) -> Iterator[tuple[np.ndarray, Results]]:
+        """Positions of some points, and their outputs; ``find_peaks`` replaces the search."""
+
+    @cached_property
+    def _line_effect_flags(self) -> np.uint32:
+        """Flags of the study's effects that the thesis's way can have."""
+        return _flags_of_effects(self.simulated_effects(AS_WRITTEN_SETTING)) & LINE_EFFECT_FLAGS
+
+    def _run_setting(self, setting: AccuracySetting, point_indices: np.ndarray) -> Trial:
+        """Plan and compute points."""
+        effect_flags, planning_seconds = self._plan_flags(setting, point_indices)
+        find_peaks = (
+            partial(find_peaks_on_grid, **setting.thesis_grid_options)
+            if setting.thesis_grid_options
+            else None
+        )
+        start = thread_time()
+        outputs = list(self._iter_outputs(setting, point_indices, effect_flags, find_peaks))
+        seconds = thread_time() - start
+        results = self._collect_results(setting, point_indices.size, outputs)
+        return Trial(results, seconds / point_indices.size + planning_seconds, planning_seconds)
+
+    def _collect_results(
+        self,
+        setting: AccuracySetting,
+        n_points: int,
+        outputs_by_rows: Iterable[tuple[np.ndarray, Results]],
+    ) -> SampleResults:
+        """Results of points in their places."""
+        n_counted_draws = (
+            int(self.study_with(setting).spec.draws.number) if setting.counts_detections else 0
+        )
+        results = unknown_results(n_points)
+        for rows, outputs in outputs_by_rows:
+            for values, values_of_rows in zip(
+                results, extract_results(outputs, n_counted_draws), strict=True
+            ):
+                values[rows] = values_of_rows
+        return results
+
+
+def halton_sample(shape: tuple[int, ...], n_points: int) -> np.ndarray:
+    """Numbers of points of a grid, in C order, spread evenly along every axis by Halton's sequence.
+
+    Any first part of them is spread as well, so that a part of the sample stands for all.
+    """
+    n_grid_points = math.prod(shape)
+    if not shape or n_grid_points <= 1:
+        return np.zeros(min(n_grid_points, n_points), np.int64)
+    # The sequence's first point is the grid's corner.
+    halton_points = qmc.Halton(len(shape), scramble=False).random(128 * n_points + 1)[1:]
+    axis_indices = np.floor(halton_points * shape).astype(np.int64)
+    grid_indices = dict.fromkeys(np.ravel_multi_index(tuple(axis_indices.T), shape).tolist())
+    grid_indices |= dict.fromkeys(
+        range(min(n_grid_points, 2 * n_points))
+    )  # some of small grids are never met
+    return np.fromiter(grid_indices, np.int64)[:n_points]
+
+
+def axis_coordinates(
+    axes: tuple[Axis, ...], axis_indices: tuple[np.ndarray, ...]
+) -> PointCoordinates:
+    """Coordinates of points, by their places along each axis."""
+    coordinates: PointCoordinates = {}
+    for axis, indices in zip(axes, axis_indices, strict=True):
+        for member in axis.parameters:
+            name = (
+                member.path.replace(".", "_")
+                if member.coordinate in RESERVED_COORDINATE_NAMES
+                else member.coordinate
+            )
+            attributes = {"units": member.units, "path": member.path}
+            coordinates[name] = np.asarray(member.display_values)[indices], attributes
+    return coordinates
+
+
+class GridSample(StudySample):
+    """A sample of the points of a grid, spread evenly, or of these numbers.
+
+    Points are timed with those that the block computes next, which share intermediate results.
+    """
+
+    def __init__(
+        self, spec: GridSpec, n_points: int, point_indices: np.ndarray | None = None
+    ) -> None:
+        self.spec = spec
+        self.study_with = cache(lambda setting: GridStudy(setting.apply_to(spec)))
+        self._grid: ParameterBlockGrid = self.study_with(AS_WRITTEN_SETTING).grid
+        self.point_indices = (
+            halton_sample(self._grid.shape, n_points) if point_indices is None else point_indices
+        )
+        self.n_study_points = self._grid.n_points
+        self._block_points = math.prod(self._grid.block_shape)
+        self.timed_points_max = min(TIMED_POINTS_MAX, self._block_points)
+
+    def split(self, points_per_part: int) -> list[np.ndarray]:
+        """Parts of the sample, each spread as evenly as all of it."""
+        return np.array_split(np.arange(self.size), max(1, round(self.size / points_per_part)))
+
+    def try_setting(self, setting: AccuracySetting, part: np.ndarray, n_timed_points: int) -> Trial:
+        """Compute the part by itself; its time is that of more points of the same blocks."""
+        point_indices = self.point_indices[part]
+        trial = self._run_setting(setting, point_indices)
+        if n_timed_points == 1:
+            return trial
+        timed_points = point_indices[:: -(-part.size // TIMED_STRETCHES_PER_PART)].tolist()
+        stretches = np.concatenate(
+            [
+                self._points_computed_next(setting, timed_point, n_timed_points)
+                for timed_point in timed_points
+            ]
+        )
+        # As many points together as a block has: what a call costs is shared by these alone.
+        blocks = np.array_split(stretches, -(-stretches.size // self._block_points))
+        return merge_trials([self._run_setting(setting, block) for block in blocks])._replace(
+            results=trial.results
+        )
+
+    def point_coordinates(self) -> PointCoordinates:
+        """Return the number of each point in C order, and its place along each axis."""
+        axis_indices = (
+            np.unravel_index(self.point_indices, self._grid.shape) if self._grid.shape else ()
+        )
+        index_coordinate = self.point_indices, {"long_name": "number of the point of the study"}
+        return {"number": index_coordinate} | axis_coordinates(self.spec.axes, axis_indices)
+
+    def _plan_flags(
+        self, setting: AccuracySetting, point_indices: np.ndarray
+    ) -> tuple[np.ndarray, float]:
+        if setting.has_line_effects_only:
+            return np.full(point_indices.size, self._line_effect_flags), 0.0
+        effect_planner = self.study_with(setting).effect_planner
+        tiles, tile_of_point = np.unique(
+            effect_planner.tiles.locate(point_indices)[0], return_inverse=True
+        )
+        effect_flags = np.empty(tiles.size, np.uint32)
+        start = thread_time()
+        for members, effect_plan in effect_planner.iter_plans(tiles):
+            effect_flags[members] = flags_of(effect_plan.kept)
+        seconds = thread_time() - start if setting.plans_effects else 0.0
+        return effect_flags[tile_of_point], seconds / sum(
+            map(effect_planner.tiles.block_size, tiles.tolist())
+        )
+
+    def _iter_outputs(
+        self,
+        setting: AccuracySetting,
+        point_indices: np.ndarray,
+        effect_flags: np.ndarray,
+        find_peaks: PeakFinder | None,
+    ) -> Iterator[tuple[np.ndarray, Results]]:
+        study = self.study_with(setting)
+        for rows, effect_names in SelectedEffects(
+            effect_flags, np.zeros(effect_flags.size)
+        ).iter_equal_groups():
+            parameters = study.grid.parameters_at(point_indices[rows])
+            if find_peaks is None:
+                yield rows, evaluate_points(study.spec, parameters, rows.size, effect_names)
+            else:
+                yield rows, shot.evaluate(parameters, effect_names, look=find_peaks)
+
+    def _points_computed_next(
+        self, setting: AccuracySetting, point_index: int, n_points: int
+    ) -> np.ndarray:
+        """Return a point and those that its block computes after it, round the block's end."""
+        grid = self.study_with(setting).grid
+        (block,), (local_index,) = (
+            array.tolist() for array in grid.locate_points(np.array([point_index]))
+        )
+        geometry_order = grid.geometry_order(block)
+        order_positions = np.flatnonzero(geometry_order == local_index) + np.arange(n_points)
+        return grid.grid_indices(block, geometry_order.take(order_positions, mode="wrap"))
+
+
+class FlightSample(StudySample):
+    """A sample of the shots of a flight: whole tiles, as effects are planned in them.
+
+    The time counts rays, plans, spectra and probabilities; draws, points and navigation cost
+    the same whatever the accuracy. Shots are computed by their places in the sample.
+    """
+
+    points_noun = "shots"
+
+    def __init__(self, spec: SceneSpec, n_points: int) -> None:
+        self.spec = spec
+        self.study_with = cache(self._make_study)
+        self._cast_eyepoints: dict[tuple[str, bytes], tuple[Eyepoints, float]] = {}
+        # What costs the same for any number of shots, as planning mostly does, a block shares.
+        self.timed_points_max = max(int(spec.storage.block_shots), SHOTS_PER_TILE)
+        self._flight_blocks, shots_by_part = zip(*self._sample_shots(n_points), strict=True)
+        self._shot_numbers = np.concatenate(shots_by_part)
+        self._part_of_row = np.repeat(
+            np.arange(len(shots_by_part)), [part_shots.size for part_shots in shots_by_part]
+        )
+        self.point_indices = np.arange(self._shot_numbers.size)
+        self.n_study_points = sum(
+            part_shots.n_points // part_shots.n_draws
+            for part_shots in self.study_with(AS_WRITTEN_SETTING).grids
+        )
+
+    def split(self, points_per_part: int) -> list[np.ndarray]:
+        """Whole tiles of one scanner at a place along the axes, from all of these in turn."""
+        tiles_per_part, parts_by_block = max(1, round(points_per_part / SHOTS_PER_TILE)), []
+        for rows in (
+            np.flatnonzero(self._part_of_row == block_number)
+            for block_number in range(len(self._flight_blocks))
+        ):
+            tile_of_row = self._shot_numbers[rows] // SHOTS_PER_TILE
+            tiles = np.unique(tile_of_row)
+            tile_groups = np.array_split(tiles, -(-tiles.size // tiles_per_part))
+            parts_by_block.append(
+                [rows[np.isin(tile_of_row, tile_group)] for tile_group in tile_groups]
+            )
+        return [
+            part
+            for parts_in_turn in zip_longest(*parts_by_block)
+            for part in parts_in_turn
+            if part is not None
+        ]
+
+    def try_setting(self, setting: AccuracySetting, part: np.ndarray, n_timed_points: int) -> Trial:
+        """Compute the part and neighbouring tiles of so many shots, timed with their rays."""
+        point_indices = self.extend_to_whole_tiles(part, n_timed_points)
+        trial = self._run_setting(setting, point_indices)
+        rows_of_part = np.searchsorted(point_indices, part)
+        _, casting_seconds = self._cast_shots(setting, *self.flight_block_and_shots(point_indices))
+        results = SampleResults(*(values[rows_of_part] for values in trial.results))
+        return Trial(
+            results,
+            trial.seconds_per_point + casting_seconds / point_indices.size,
+            trial.planning_seconds_per_point,
+        )
+
+    def point_coordinates(self) -> PointCoordinates:
+        """Scanner and number of each shot, and its place along the axes."""
+        axis_indices = np.reshape(
+            [flight_block.axis_indices for flight_block in self._flight_blocks],
+            (len(self._flight_blocks), -1),
+        )
+        scanners = np.array([flight_block.scanner for flight_block in self._flight_blocks], object)
+        return {
+            "scanner": (scanners[self._part_of_row], {"long_name": "scanner"}),
+            "shot": (self._shot_numbers, {"long_name": "number of the shot"}),
+        } | axis_coordinates(self.spec.axes, tuple(axis_indices[self._part_of_row].T))
+
+    def drop_caches(self) -> None:
+        """Drop the rays that rungs of the same geometry share."""
+        self._cast_eyepoints.clear()
+
+    def extend_to_whole_tiles(self, point_indices: np.ndarray, n_shots: int) -> np.ndarray:
+        """Whole tiles of some of the sample, and so many shots with those that follow."""
+        rows_of_block = np.flatnonzero(self._part_of_row == self._part_of_row[point_indices[0]])
+        return rows_of_block[
+            rows_of_whole_tiles(
+                self._shot_numbers[rows_of_block] // SHOTS_PER_TILE,
+                point_indices - rows_of_block[0],
+                n_shots,
+            )
+        ]
+
+    def flight_block_and_shots(self, point_indices: np.ndarray) -> tuple[FlightBlock, np.ndarray]:
+        """Scanner and place along the axes of some of the sample, and their numbers there."""
+        return self._flight_blocks[self._part_of_row[point_indices[0]]], self._shot_numbers[
+            point_indices
+        ]
+
+    def _plan_flags(
+        self, setting: AccuracySetting, point_indices: np.ndarray
+    ) -> tuple[np.ndarray, float]:
+        tile_rows = self.extend_to_whole_tiles(point_indices, 1)
+        flight_block, shot_numbers = self.flight_block_and_shots(tile_rows)
+        eyepoints, _ = self._cast_shots(setting, flight_block, shot_numbers)
+        start = thread_time()
+        if setting.has_line_effects_only:
+            effect_flags = np.where(eyepoints.seen, self._line_effect_flags, 0)
+        else:
+            effect_flags = (
+                self.study_with(setting).select(flight_block, eyepoints, shot_numbers).flags
+            )
+        seconds = thread_time() - start if setting.plans_effects else 0.0
+        return effect_flags[np.searchsorted(tile_rows, point_indices)], seconds / tile_rows.size
+
+    def _iter_outputs(
+        self,
+        setting: AccuracySetting,
+        point_indices: np.ndarray,
+        effect_flags: np.ndarray,
+        find_peaks: PeakFinder | None,
+    ) -> Iterator[tuple[np.ndarray, Results]]:
+        study, (flight_block, shot_numbers) = (
+            self.study_with(setting),
+            self.flight_block_and_shots(point_indices),
+        )
+        eyepoints, _ = self._cast_shots(setting, flight_block, shot_numbers)
+        selected_effects, hitting_rows = (
+            SelectedEffects(effect_flags, np.zeros(effect_flags.size)),
+            np.flatnonzero(eyepoints.seen),
+        )
+        simulate_group = partial(_shot_statistics, study, flight_block, find_peaks or shot.find)
+        yield from study.iter_clouds(
+            flight_block.scanner,
+            eyepoints,
+            selected_effects,
+            shot_numbers,
+            hitting_rows,
+            simulate_group,
+        )
+
+    def _sample_shots(self, n_points: int) -> Iterator[tuple[FlightBlock, np.ndarray]]:
+        """Scanners at places along the axes, and shots of each, spread over the flight."""
+        study = self.study_with(AS_WRITTEN_SETTING)
+        for scanner, scanner_grid in study.scanner_grids.items():
+            axis_points = halton_sample(scanner_grid.axes_shape, SAMPLED_AXIS_POINTS)
+            tiles_wanted = math.ceil(
+                n_points / SHOTS_PER_TILE / len(study.scanner_grids) / len(axis_points)
+            )
+            shot_numbers = study.get_eyepoint_study(scanner).sample_cycles(
+                max(self.timed_points_max // SHOTS_PER_TILE, tiles_wanted)
+            )
+            for axis_point in axis_points:
+                axis_indices = (
+                    np.unravel_index(axis_point, scanner_grid.axes_shape)
+                    if scanner_grid.axes_shape
+                    else ()
+                )
+                yield scanner_grid.first_flight_block(tuple(map(int, axis_indices))), shot_numbers
+
+    def _make_study(self, setting: AccuracySetting) -> FlightStudy:
+        spec: Any = setting.apply_to(self.spec)
+        # in a world that all share, as building one can take seconds
+        study = FlightStudy(spec, Path("nowhere.zarr"), build_world(self.spec))
+        if setting.rays_error_max:
+            study.ray_accuracy = Accuracy(setting.rays_error_max, least_rays_tolerance=0.0)
+        return study
+
+    def _cast_shots(
+        self, setting: AccuracySetting, flight_block: FlightBlock, shot_numbers: np.ndarray
+    ) -> tuple[Eyepoints, float]:
+        """Eyepoints of shots, cast once for rungs of a geometry, and the time that it took [s]."""
+        eyepoint_study = self.study_with(setting).caster(flight_block.scanner)
+        cache_key = eyepoint_study.id, shot_numbers.tobytes()
+        if cache_key not in self._cast_eyepoints:
+            start = thread_time()
+            eyepoints = eyepoints_from_arrays(
+                eyepoint_study.cast_shots(shot_numbers), eyepoint_study.beamlet_weights
+            )
+            self._cast_eyepoints[cache_key] = eyepoints, thread_time() - start
+        return self._cast_eyepoints[cache_key]
+
+
+def rows_of_whole_tiles(tile_of_row: np.ndarray, rows: np.ndarray, n_shots: int) -> np.ndarray:
+    """Rows of the whole tiles of so many shots: those of some and what follows, round the end.
+
+    ``tile_of_row`` (n,) has the number of each row's tile, rising.
+    """
+    tiles, counts = np.unique(tile_of_row, return_counts=True)
+    own_tiles = np.unique(tile_of_row[rows])
+    tile_order = np.roll(np.arange(tiles.size), -int(np.searchsorted(tiles, own_tiles[0])))
+    n_tiles = int(np.searchsorted(np.cumsum(counts[tile_order]), n_shots)) + 1
+    return np.flatnonzero(np.isin(tile_of_row, [*own_tiles, *tiles[tile_order[:n_tiles]]]))
+
+
+def _shot_statistics(
+    study: FlightStudy,
+    flight_block: FlightBlock,
+    find_peaks: PeakFinder,
+    effect_names: tuple[str, ...],
+    eyepoints: Eyepoints,
+    shot_numbers: np.ndarray,
+    effect_flags: np.ndarray,
+) -> Results:
+    """Statistics of shots by a way to look at their spectra; nan of those that see nothing."""
+    hitting_shots, n_rays = eyepoints.seen.nonzero()[0], eyepoints.weight.size
+    shot_parameters, ground = seen_ground(
+        eyepoints.some(hitting_shots), study.parameters_at(flight_block), study.surfaces
+    )
+    shots = shot.prepare_cast(shot_parameters, ground, effect_names, effect_flags[hitting_shots])
+    peaks = find_peaks(shots)
+    outputs = shot.statistics(shots, peaks) | {"beamlets": np.full(shots.size, n_rays)}
+    if study.ray_accuracy is not None:
+        peak_bins = peaks[:, 3].T * (shots.fft_size / shots.sample_rate[:, None])
+        outputs["beamlets_error"] = ray_error(shots, ground.beamlets, peak_bins, peaks[:, 2].T)
+    all_outputs = {name: np.full(shot_numbers.size, np.nan) for name in outputs}
+    for name, values in outputs.items():
+        all_outputs[name][hitting_shots] = values
+    return all_outputs
+
+
+CELLS_PER_BIN = 16
+"""Cells of the grid in a bin of the FFT."""
+
+GRID_CELLS_MIN = 1 << 12
+"""Cells of the grid, where the footprint's lines leave enough room beside them."""
+
+CLEARANCE_BINS = 16
+"""Bins beside the lines that must be free of what comes round the grid's ends."""
+
+_SPECTRA_PER_TRANSFORM = 32
+"""Spectra that are transformed together: as many as the processor's cache holds."""
+
+
+def find_peaks_on_grid(
+    shots: Shots,
+    *,
+    degree: int = 0,
+    size: int = GRID_CELLS_MIN,
+    real: bool = False,
+    folded: bool = False,
+) -> np.ndarray:
+    """Largest bins of each segment's spectrum, (3, 6, n) as of :func:`sweep.model.shot.find`.
+
+    A line is shared out by a polynomial of a ``degree`` of 0, to the nearest cell, or 9, among
+    ten. A grid has ``size`` cells at the least, a power of two, and more where a point's lines
+    spread farther. ``real`` transforms powers as real numbers; ``folded`` goes back to the bins
+    alone. There is no leakage.
+    """
+    peaks = np.full((3, 6, shots.size), np.nan)
+    point_table, n_cells_of_point, grid_options = (
+        shots.point_table(),
+        cells_per_point(shots, size),
+        (degree, real, folded),
+    )
+    first_bin_and_width = shots.fft_size // 2, 1.0 / shots.fft_size
+    segments = np.flatnonzero(shots.segments).tolist()
+    for cells, segment in product(np.unique(n_cells_of_point).tolist(), segments):
+        members = np.flatnonzero(n_cells_of_point == cells)
+        for points in np.split(
+            members, range(_SPECTRA_PER_TRANSFORM, members.size, _SPECTRA_PER_TRANSFORM)
+        ):
+            first_bin, magnitude = grid_magnitudes(
+                shots, point_table, points, segment, cells, grid_options
+            )
+            peak_rows = np.empty((6, points.size))
+            bin_levels = shots.bin_levels[:, points]
+            speckle = shots.speckle_table.at(segment, points)
+            detect_rows(
+                magnitude,
+                first_bin,
+                first_bin_and_width,
+                shots.echo_rule,
+                bin_levels,
+                speckle,
+                peak_rows,
+            )
+            peak_rows[3] *= point_table[6, points]
+            peaks[segment][:, points] = peak_rows
+    return peaks
+
+
+def cells_per_point(shots: Shots, cells_min: int = GRID_CELLS_MIN) -> np.ndarray:
+    """Cells of each point's grid, (n,) int64: the lines in its middle, and room on both sides."""
+    beat_per_ratio = 2 * np.abs(shots.chirp_rate) * shots.range / SPEED_OF_LIGHT
+    carrier_max = np.max([np.max(segment_carriers) for segment_carriers in shots.carriers])
+    offset_max = np.abs(shots.offset).max(axis=1)[shots.row]
+    doppler_max = np.abs(shots.doppler).max(axis=1)[shots.row]
+    line_spread = beat_per_ratio * (offset_max + doppler_max) + carrier_max * doppler_max
+    line_spread_bins = line_spread * shots.fft_size / shots.sample_rate
+    cells_needed = np.ceil(np.log2(4 * CELLS_PER_BIN * (line_spread_bins + CLEARANCE_BINS)))
+    return np.maximum(cells_min, 2 ** cells_needed.astype(np.int64))
+
+
+def grid_magnitudes(
+    shots: Shots,
+    point_table: np.ndarray,
+    points: np.ndarray,
+    segment: int,
+    n_cells: int,
+    grid_options: tuple[int, bool, bool],
+) -> tuple[np.ndarray, np.ndarray]:
+    """First bin (m,) and |X| (m, cells / CELLS) of some points' spectra around their lines.
+
+    ``grid_options``: `degree`, `real` and `folded` of :func:`find_peaks_on_grid`.
+    """
+    degree, real, folded = grid_options
+    adds_powers, record_length = shots.incoherent, shots.window.length
+    real = real and adds_powers
+    grid = np.zeros((points.size, n_cells), float if real else complex)
+    centre_bin, polynomial_nodes = np.empty(points.size, np.int64), np.arange(degree + 1.0)
+    _deposit_lines(
+        np.ascontiguousarray(point_table[:, points]),
+        shots.row[points],
+        shots.footprint,
+        segment,
+        np.array([shots.fft_size, record_length, 0, 0, adds_powers, 0]),
+        shots.image,
+        np.array(
+            [
+                1 / np.prod(np.delete(node - polynomial_nodes, node_number))
+                for node_number, node in enumerate(polynomial_nodes)
+            ]
+        ),
+        centre_bin,
+        grid.view(float).reshape(points.size, n_cells, -1),
+    )
+    window_transform = _window_transform(
+        shots.window.name, record_length, shots.fft_size, n_cells, adds_powers, real
+    )
+    convolved = _convolve_with_window(grid, window_transform, real, folded)
+    # Rounding takes a sum of squares that is all but nothing below it.
+    magnitude = np.sqrt(np.maximum(convolved.real, 0.0)) if adds_powers else np.abs(convolved)
+    return centre_bin - n_cells // (2 * CELLS_PER_BIN), magnitude
+
+
+def _convolve_with_window(
+    grid: np.ndarray, window_transform: np.ndarray, real: bool, folded: bool
+) -> np.ndarray:
+    """Return the convolution of powers or amplitudes, (rows, cells), at every sixteenth cell."""
+    n_bins = grid.shape[1] // CELLS_PER_BIN
+    forward_transform, inverse_transform = (fft.rfft, fft.irfft) if real else (fft.fft, fft.ifft)
+    transform = forward_transform(grid, axis=1, overwrite_x=True)
+    transform *= window_transform
+    if not folded:
+        return np.asarray(
+            inverse_transform(transform, grid.shape[1], axis=1, overwrite_x=True)[
+                :, ::CELLS_PER_BIN
+            ]
+        )
+    if real:  # the upper half is the lower one's conjugate
+        upper_half = transform[:, :-1].reshape(-1, CELLS_PER_BIN // 2, n_bins)[
+            :, :, : n_bins // 2 + 1
+        ]
+        lower_half = transform[:, 1:].reshape(-1, CELLS_PER_BIN // 2, n_bins)[
+            :, :, : n_bins // 2 - 2 : -1
+        ]
+        transform = upper_half.sum(axis=1) + lower_half.sum(axis=1).conj()
+    else:
+        transform = transform.reshape(-1, CELLS_PER_BIN, n_bins).sum(axis=1)
+    return (
+        np.asarray(inverse_transform(transform, n_bins, axis=1, overwrite_x=True)) / CELLS_PER_BIN
+    )
+
+
+@lru_cache(maxsize=32)
+def _window_transform(
+    window_name: str, length: int, fft_size: int, n_cells: int, adds_powers: bool, real: bool
+) -> np.ndarray:
+    """Transform of the window's own, of mid-record, on a grid of cells; no closed form is used."""
+    cell_offsets = np.concatenate([np.arange(n_cells // 2), np.arange(-n_cells // 2, 0)])
+    transform = fft.fft(windows.samples(window_name, length), CELLS_PER_BIN * fft_size)[
+        cell_offsets
+    ]
+    transform *= np.exp(1j * np.pi * cell_offsets * (length / fft_size / CELLS_PER_BIN))
+    if adds_powers:
+        transform = np.abs(transform) ** 2
+    return np.asarray(fft.rfft(transform) if real else fft.fft(transform))
+
+
+@njit(cache=True, error_model="numpy")
+def _deposit_lines(
+    point_table, footprint_row, footprint, segment, sizes, image, node_weights, centre_bin, grid
+):
+    """Lines of m points, each shared out among as many cells of its grid, (m, cells, 2 or 1).
+
+    They are seen at 0 .. N/2, and their images about DC or Nyquist, whichever is nearer.
+    """
+    n_beamlets, n_cells = footprint.shape[2], grid.shape[1]
+    n_lines = 2 * n_beamlets if image else n_beamlets
+    line_scratch, cell_weights = np.empty((BLOCK + 1, n_lines)), np.empty(node_weights.size)
+    lowest_cell, highest_cell = (
+        (-0.5, n_cells - 1.0) if node_weights.size == 1 else (5.0, n_cells - 6.0)
+    )
+    for point in range(footprint_row.size):
+        signed_centre_bin = place_lines(
+            point_table[:, point].copy(),
+            segment,
+            footprint,
+            footprint_row[point],
+            sizes,
+            line_scratch,
+        )
+        centre_bin[point] = abs(signed_centre_bin)
+        if signed_centre_bin < 0:
+            for beamlet in range(n_beamlets):
+                line_scratch[PLACE, beamlet], line_scratch[IM, beamlet] = (
+                    -line_scratch[PLACE, beamlet],
+                    -line_scratch[IM, beamlet],
+                )
+        if image:
+            add_images(line_scratch, n_beamlets, centre_bin[point], 1.0, sizes[4] != 0)
+            fold_lines(line_scratch[:, n_beamlets:], n_beamlets, sizes)
+        for beamlet in range(n_beamlets):
+            for line in range(beamlet, n_lines, n_beamlets):
+                cell_position = n_cells // 2 + CELLS_PER_BIN * line_scratch[PLACE, line]
+                if lowest_cell < cell_position < highest_cell:
+                    _deposit_line(
+                        grid[point],
+                        cell_position,
+                        line_scratch[RE, line],
+                        line_scratch[IM, line],
+                        node_weights,
+                        cell_weights,
+                    )
+
+
+@njit(cache=True, error_model="numpy")
+def _deposit_line(cells, cell_position, re, im, node_weights, cell_weights):
+    """Add a line to the nearest cell, or to ten cells by Lagrange's polynomial."""
+    first_cell = (
+        int(np.rint(cell_position)) if node_weights.size == 1 else int(np.floor(cell_position)) - 4
+    )
+    offset, weight_sum = cell_position - first_cell, 0.0
+    for node in range(node_weights.size):
+        if offset == node or node_weights.size == 1:
+            cell_weights[:] = 0.0
+            cell_weights[node] = weight_sum = 1.0
+            break
+        cell_weights[node] = node_weights[node] / (offset - node)
+        weight_sum += cell_weights[node]
+    for node in range(node_weights.size):
+        cells[first_cell + node, 0] += re * cell_weights[node] / weight_sum
+        if cells.shape[1] > 1:
+            cells[first_cell + node, 1] += im * cell_weights[node] / weight_sum

@@ -1,0 +1,214 @@
+"""Clusters to compute blocks: one that is there, or workers that are started and ended here."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import traceback
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from sweep.extras import install_hint
+from sweep.spec.cluster_config import (
+    AnyClusterConfig,
+    BatchClusterConfig,
+    ExistingSchedulerConfig,
+    KubernetesClusterConfig,
+    LocalClusterConfig,
+    SSHClusterConfig,
+    WorkerBounds,
+)
+from sweep.tasks.engine.deploy import kubernetes, local_ssh
+from sweep.tasks.engine.progress import ClusterError
+
+if TYPE_CHECKING:
+    from distributed import Client, Security
+
+#: Time in which a scheduler has to answer [s].
+CONNECT_TIMEOUT = 15.0
+
+
+class ClusterConnection(NamedTuple):
+    """A cluster in use."""
+
+    client: Client
+    expected_slots: int  # worker threads that it may come to have; 0 where that is unknown
+    restart_workers: Callable[[], object] = lambda: None  # starts workers in the place of lost ones
+
+
+def cpu_count() -> int:
+    """Cores that this process may use."""
+    from dask.system import CPU_COUNT
+
+    return int(CPU_COUNT)
+
+
+@contextmanager
+def connect_cluster(
+    cluster: AnyClusterConfig, *, max_workers: int, processes: bool, say: Callable[[str], None]
+) -> Iterator[ClusterConnection]:
+    """Connect a client to a cluster; one that is started here ends with it.
+
+    No more workers are started than there can be tasks at once (`most`). ClusterError where no
+    scheduler answers or no worker starts.
+    """
+    from distributed import Client
+
+    if isinstance(cluster, ExistingSchedulerConfig):
+        with _connect_client(cluster.address, cluster) as client:
+            say(f"scheduler {cluster.address}: dashboard {client.dashboard_link}")
+            yield ClusterConnection(client, 0)
+        return
+    bounds = _worker_bounds(cluster, max_workers)
+    if isinstance(cluster, KubernetesClusterConfig):
+        with (
+            kubernetes.deploy_cluster(cluster, bounds) as address,
+            _connect_client(address, cluster) as client,
+        ):
+            say(f"{_workers_text(cluster, bounds)}: scheduler {address}")
+            yield ClusterConnection(client, bounds.most * cluster.worker.threads)
+        return
+    with (
+        local_ssh.spawn_environment(),
+        _start_workers(cluster, bounds, processes) as dask_cluster,
+        Client(dask_cluster, set_as_default=False) as client,
+    ):
+        _keep_workers_in_bounds(dask_cluster, cluster, bounds)
+        shows_dashboard = local_ssh.shows_dashboard(cluster.scheduler)
+        dashboard_text = (
+            f": dashboard {local_ssh.dashboard_link(dask_cluster)}" if shows_dashboard else ""
+        )
+        say(f"{_workers_text(cluster, bounds)}{dashboard_text}")
+        expected_slots = bounds.most * cluster.worker.threads
+        if isinstance(cluster, LocalClusterConfig):
+            yield ClusterConnection(
+                client, expected_slots, lambda: dask_cluster.scale(bounds.least)
+            )
+        else:  # what is lost comes again by itself, or not at all
+            yield ClusterConnection(client, expected_slots)
+
+
+def _worker_bounds(cluster: Any, max_workers: int) -> WorkerBounds:
+    """Bounds of the number of workers, none of which shall have nothing to do."""
+    requested = cluster.workers or WorkerBounds(cpu_count(), cpu_count())
+    return WorkerBounds(*(min(n_workers, max(1, max_workers)) for n_workers in requested))
+
+
+def _connect_client(address: str, cluster: AnyClusterConfig) -> Client:
+    """Make a client that is not Dask's default: one that fails to connect would stay it."""
+    from distributed import Client
+
+    security = local_ssh.make_security(cluster)
+    # A client that fails to connect takes half a minute more to be closed.
+    with ThreadPoolExecutor(
+        1
+    ) as executor:  # this thread may have a loop that runs, as a notebook's
+        try:
+            executor.submit(asyncio.run, _check_scheduler(address, security)).result()
+        except (OSError, ValueError, ImportError) as error:
+            raise ClusterError(f"no Dask scheduler answers at {address}: {error}") from error
+        except Exception as error:  # whatever decoding of another protocol raises
+            raise ClusterError(
+                f"what answers at {address} is no Dask scheduler ({type(error).__name__})"
+            ) from error
+    try:
+        return Client(address, timeout=CONNECT_TIMEOUT, security=security, set_as_default=False)
+    except (OSError, ValueError) as error:
+        # Collected here, as one that goes while another is made waits for ever for that one's lock.
+        traceback.clear_frames(error.__traceback__)
+        gc.collect()
+        raise ClusterError(f"no Dask scheduler answers at {address}: {error}") from error
+
+
+async def _check_scheduler(address: str, security: Security | None) -> None:
+    """Ask a scheduler who it is; raises where none answers in time."""
+    from distributed import Security, rpc
+
+    connection_args = (security or Security()).get_connection_args("client")
+    async with asyncio.timeout(CONNECT_TIMEOUT + 1.0):  # the other one has words
+        async with rpc(
+            address, timeout=CONNECT_TIMEOUT, connection_args=connection_args
+        ) as scheduler:
+            await scheduler.identity()
+
+
+def _start_workers(
+    cluster: LocalClusterConfig | BatchClusterConfig | SSHClusterConfig,
+    bounds: WorkerBounds,
+    processes: bool,
+) -> Any:
+    import dask
+
+    try:
+        shows_dashboard = local_ssh.shows_dashboard(cluster.scheduler)
+        page_settings = {} if shows_dashboard else local_ssh.NO_PAGES_CONFIG
+        with dask.config.set({**local_ssh.DASK_CONFIG, **page_settings}):
+            if isinstance(cluster, LocalClusterConfig):
+                return local_ssh.start_local_cluster(cluster, bounds, processes=processes)
+            if isinstance(cluster, BatchClusterConfig):
+                from sweep.tasks.engine.deploy import jobqueue
+
+                return jobqueue.start_jobs(cluster, bounds)
+            return local_ssh.start_ssh_cluster(cluster, bounds)
+    except (OSError, RuntimeError, ImportError) as error:
+        raise ClusterError(
+            f"no workers could be started: {install_hint(error) or error}"
+        ) from error
+
+
+def _keep_workers_in_bounds(
+    dask_cluster: Any, cluster: AnyClusterConfig, bounds: WorkerBounds
+) -> None:
+    """Keep the number of workers within bounds; that of jobs, which end, even if it is fixed."""
+    if isinstance(cluster, BatchClusterConfig):
+        from sweep.tasks.engine.deploy import jobqueue
+
+        jobqueue.keep_workers_in_bounds(dask_cluster, cluster, bounds)
+    elif bounds.least < bounds.most:
+        workers_min, workers_max = bounds
+        dask_cluster.adapt(
+            minimum=workers_min,
+            maximum=workers_max,
+            target_duration=local_ssh.ADAPTIVE_TARGET_DURATION,
+        )
+
+
+def _workers_text(cluster: AnyClusterConfig, bounds: WorkerBounds) -> str:
+    count_text = (
+        f"{bounds.least} to {bounds.most}" if bounds.least < bounds.most else f"{bounds.most}"
+    )
+    workers_text = f"{count_text} worker{'s' if bounds.most > 1 else ''}"
+    if isinstance(cluster, BatchClusterConfig):
+        workers_per_job = cluster.job.workers
+        per_job_text = f" of {workers_per_job}" if workers_per_job > 1 else ""
+        return f"{workers_text} in {cluster.kind.upper()} jobs{per_job_text}"
+    if isinstance(cluster, SSHClusterConfig):
+        return f"{workers_text} on {', '.join(cluster.hosts)}"
+    if isinstance(cluster, KubernetesClusterConfig):
+        return f"{workers_text} in pods of {cluster.namespace}"
+    return f"{workers_text} on this machine"
+
+
+@contextmanager
+def write_performance_report(
+    client: Client, report_path: Path, say: Callable[[str], None]
+) -> Iterator[None]:
+    """Write Dask's report of what a cluster does meanwhile; that it can't is no reason to fail."""
+    from distributed import performance_report
+
+    report = performance_report(filename=str(report_path))
+    with client.as_current():
+        report.__enter__()
+    try:
+        yield
+    finally:
+        try:
+            report_path.parent.mkdir(parents=True, exist_ok=True)
+            with client.as_current():
+                report.__exit__(None, None, None)
+            say(f"performance report: {report_path}")
+        except Exception as error:  # the scheduler may be gone, and with it what it knew
+            say(f"no performance report: {error}")

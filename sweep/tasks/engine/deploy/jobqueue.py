@@ -1,0 +1,182 @@
+"""Workers in jobs of SLURM or PBS, by dask-jobqueue.
+
+The scheduler is part of the driver; jobs come and go. A worker leaves before its job's time is up,
+each at a moment of its own, after handing back what it was at; another job takes its place.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import shlex
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from distributed.core import Status
+
+from sweep.spec.cluster_config import BatchClusterConfig, SlurmClusterConfig, WorkerBounds
+from sweep.tasks.engine.deploy import local_ssh
+
+
+@contextmanager
+def _signal_handlers_kept() -> Iterator[None]:
+    """Have this thread set no handlers of signals.
+
+    dask_jobqueue sets one as it is imported, by which Ctrl-C ends the program at once. In any
+    thread but the main one that is an error.
+    """
+    set_handler, protected_thread = signal.signal, threading.get_ident()
+
+    def set_by_others(signal_number: Any, handler: Any) -> Any:
+        if threading.get_ident() == protected_thread:
+            return signal.getsignal(signal_number)
+        return set_handler(signal_number, handler)
+
+    signal.signal = set_by_others  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        signal.signal = set_handler
+
+
+with _signal_handlers_kept():
+    from dask_jobqueue import PBSCluster, SLURMCluster
+    from dask_jobqueue.pbs import PBSJob
+    from dask_jobqueue.slurm import SLURMJob
+
+#: Seconds until a running cluster submits again what was not taken.
+RESUBMIT_PAUSE = 15.0
+
+
+class _JobWithStatus:
+    """A job that says so where it was not taken."""
+
+    status: Status
+
+    async def start(self) -> None:
+        """Submit the job."""
+        try:
+            await super().start()  # type: ignore[misc]
+        except BaseException:
+            self.status = Status.failed
+            raise
+
+
+class _ResubmittingCluster:
+    """A cluster that lets go of jobs which were not taken, so that others are submitted later."""
+
+    worker_spec: dict[str, Any]
+    workers: dict[str, Any]
+
+    async def _correct_state_internal(self) -> None:
+        try:
+            await super()._correct_state_internal()  # type: ignore[misc]
+        except BaseException:
+            for name, job in list(self.workers.items()):
+                if job.status == Status.failed:
+                    del self.workers[name]
+                    self.worker_spec.pop(name, None)
+            if self.workers:
+                await asyncio.sleep(RESUBMIT_PAUSE)
+            raise
+
+
+class _SlurmJob(_JobWithStatus, SLURMJob):  # type: ignore[misc]
+    pass
+
+
+class _PBSJob(_JobWithStatus, PBSJob):  # type: ignore[misc]
+    pass
+
+
+class _SlurmCluster(_ResubmittingCluster, SLURMCluster):  # type: ignore[misc]
+    job_cls = _SlurmJob
+
+
+class _PBSCluster(_ResubmittingCluster, PBSCluster):  # type: ignore[misc]
+    job_cls = _PBSJob
+
+
+def start_jobs(cluster: BatchClusterConfig, bounds: WorkerBounds) -> Any:
+    """Return the cluster, its least number of workers submitted; RuntimeError if refused."""
+    cluster_class = _SlurmCluster if isinstance(cluster, SlurmClusterConfig) else _PBSCluster
+    dask_cluster = cluster_class(**jobqueue_options(cluster))
+    try:
+        dask_cluster.sync(_submit_jobs, dask_cluster, count_jobs(cluster, bounds.least))
+    except BaseException:
+        dask_cluster.close()
+        raise
+    return dask_cluster
+
+
+def keep_workers_in_bounds(
+    dask_cluster: Any, cluster: BatchClusterConfig, bounds: WorkerBounds
+) -> None:
+    """Submit jobs in the place of those that end, and more or fewer with the work, in bounds."""
+    jobs_min, jobs_max = (count_jobs(cluster, n_workers) for n_workers in bounds)
+    dask_cluster.adapt(
+        minimum_jobs=jobs_min,
+        maximum_jobs=jobs_max,
+        target_duration=local_ssh.ADAPTIVE_TARGET_DURATION,
+    )
+
+
+async def _submit_jobs(dask_cluster: Any, n_jobs: int) -> None:
+    """Submit jobs, and wait for the batch system to take them."""
+    while len(dask_cluster.worker_spec) < n_jobs:
+        dask_cluster.worker_spec.update(dask_cluster.new_worker_spec())
+    await dask_cluster
+
+
+def count_jobs(cluster: BatchClusterConfig, n_workers: int) -> int:
+    """Jobs that hold so many workers."""
+    return -(-n_workers // cluster.job.workers)
+
+
+def jobqueue_options(cluster: BatchClusterConfig) -> dict[str, Any]:
+    """Arguments of dask-jobqueue's clusters."""
+    worker, job = cluster.worker, cluster.job
+    lifetime, stagger = worker_lifetime(job.walltime)
+    required: dict[str, Any] = {
+        "n_workers": 0,
+        "cores": job.workers * worker.threads,
+        "processes": job.workers,
+        "memory": f"{int(job.workers * worker.memory)}B",
+        "walltime": walltime_text(job.walltime),
+        "job_name": "sweep",
+        "log_directory": job.logs or None,
+        "job_extra_directives": list(job.directives),
+        "job_script_prologue": [
+            *job.prologue,
+            *(
+                f"export {name}={shlex.quote(value)}"
+                for name, value in local_ssh.worker_environment(cluster.environment).items()
+            ),
+        ],
+        "worker_extra_args": [
+            *("--preload", local_ssh.PRELOAD_MODULE, "--no-dashboard"),
+            *("--lifetime", f"{lifetime:.0f}s", "--lifetime-stagger", f"{stagger:.0f}s"),
+        ],
+        "security": local_ssh.make_security(cluster),
+        "scheduler_options": local_ssh.scheduler_options(cluster.scheduler),
+    }
+    optional = {"queue": job.queue, "account": job.account, "python": cluster.python}
+    return required | {name: value for name, value in optional.items() if value}
+
+
+def worker_lifetime(walltime: float) -> tuple[float, float]:
+    """Mean time [s] after which a worker leaves its job, and how far that is spread each way.
+
+    The last leaves with 5 % of the walltime in hand: a minute at least, a quarter of very short
+    ones.
+    """
+    reserve = max(0.05 * walltime, min(60.0, walltime / 4))
+    return walltime - 1.5 * reserve, reserve / 2
+
+
+def walltime_text(seconds: float) -> str:
+    """Hours, minutes and seconds as batch systems write them."""
+    whole_seconds = int(seconds)
+    return f"{whole_seconds // 3600:02d}:{whole_seconds // 60 % 60:02d}:{whole_seconds % 60:02d}"

@@ -1,0 +1,322 @@
+"""Workers on this machine and on machines reached by SSH; settings that all clusters share."""
+
+from __future__ import annotations
+
+import os
+import socket
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from sweep.spec.cluster_config import (
+    LOOPBACK_ADDRESS,
+    NO_DASHBOARD,
+    ClusterConfig,
+    LocalClusterConfig,
+    SchedulerConfig,
+    SSHClusterConfig,
+    WorkerBounds,
+)
+from sweep.tasks.engine.progress import ClusterError
+
+if TYPE_CHECKING:
+    from distributed import Security
+
+
+#: What a worker runs as it starts.
+PRELOAD_MODULE = "sweep.tasks.preload"
+
+#: One thread a worker slot in every library that would start its own.
+ONE_THREAD_VARIABLES = {
+    "OMP_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "NUMBA_NUM_THREADS": "1",
+}
+
+#: Variable that keeps the working directory out of the places that modules are imported from: a
+#: file `socket.py` there would be run by every worker.
+SAFE_PATH_VARIABLE = "PYTHONSAFEPATH"
+
+#: How often Dask looks at itself. By default it does so some 150 times a second in each worker,
+#: which takes a tenth of the processor's time from whatever else the worker does. And no pause near
+#: the memory's limit: tasks leave nothing behind that could be waited for, so a worker that paused
+#: would do so for ever. At the limit it is ended, and its blocks go elsewhere.
+DASK_CONFIG: dict[str, Any] = {
+    "distributed.admin.tick.interval": "500ms",
+    "distributed.admin.system-monitor.interval": "2s",
+    "distributed.worker.profile.interval": "200ms",
+    "distributed.worker.profile.cycle": "10s",
+    "distributed.worker.memory.monitor-interval": "200ms",
+    "distributed.worker.memory.pause": False,
+    "distributed.worker.http.routes": [],  # pages that all users of the machine could see
+}
+
+#: Settings of a scheduler without a dashboard: its HTTP server, which Dask starts all the same, has
+#: no page. By default it shows workers, tasks and logs to all users of the machine.
+NO_PAGES_CONFIG: dict[str, Any] = {"distributed.scheduler.http.routes": []}
+
+#: Seconds of work ahead for which a cluster between bounds takes another worker thread.
+ADAPTIVE_TARGET_DURATION = "1s"
+
+
+def worker_environment(user_variables: Mapping[str, str]) -> dict[str, str]:
+    """Environment variables of workers: one thread a slot, calm, wary, and those given."""
+    dask_variables = {
+        f"DASK_{name.upper().replace('.', '__').replace('-', '_')}": str(setting)
+        for name, setting in DASK_CONFIG.items()
+    }
+    return {**ONE_THREAD_VARIABLES, SAFE_PATH_VARIABLE: "1", **dask_variables, **user_variables}
+
+
+def make_security(cluster: ClusterConfig) -> Security | None:
+    """Certificates of client, scheduler and workers, which then refuse whoever has none."""
+    from distributed import Security
+
+    settings = security_settings(cluster)
+    return Security(**settings) if settings else None
+
+
+def security_settings(cluster: ClusterConfig) -> dict[str, Any]:
+    """Return settings of `distributed.Security`; empty without certificates."""
+    paths = cluster.certificate_paths()
+    if paths is None:
+        return {}
+    ca_file, certificate_file, key_file = paths
+    role_files: dict[str, str] = {}
+    for role in ("client", "scheduler", "worker"):
+        role_files |= {f"tls_{role}_cert": certificate_file, f"tls_{role}_key": key_file}
+    return {"require_encryption": True, "tls_ca_file": ca_file, **role_files}
+
+
+def scheduler_options(scheduler: SchedulerConfig) -> dict[str, Any]:
+    """Address at which a scheduler of this process listens, and that of its dashboard, if any."""
+    options: dict[str, Any] = {
+        "port": scheduler.port,
+        "dashboard": shows_dashboard(scheduler),
+        "dashboard_address": dashboard_address(scheduler),
+    }
+    if scheduler.interface:
+        return options | {"interface": scheduler.interface}
+    return options | {"host": scheduler.host or LOOPBACK_ADDRESS}
+
+
+def shows_dashboard(scheduler: SchedulerConfig) -> bool:
+    """Tell whether a dashboard is asked for."""
+    return scheduler.dashboard != NO_DASHBOARD
+
+
+def dashboard_address(scheduler: SchedulerConfig) -> str:
+    """Address of a scheduler's pages, on this machine's loopback interface.
+
+    The port is the one asked for; any where that is taken, or where no dashboard is asked for.
+    """
+    port = int(scheduler.dashboard.rpartition(":")[2]) if shows_dashboard(scheduler) else 0
+    with socket.socket() as test_socket:
+        try:
+            test_socket.bind((LOOPBACK_ADDRESS, port))
+        except (OSError, OverflowError):
+            return f"{LOOPBACK_ADDRESS}:0"
+    return f"{LOOPBACK_ADDRESS}:{port}"
+
+
+WORKER_BYTES_MIN = 1 << 30
+
+#: Time after which a worker that shows no sign of life is ended, and started anew.
+WORKER_TTL = "2 minutes"
+
+
+@contextmanager
+def spawn_environment() -> Iterator[None]:
+    """Surroundings in which workers are started, and started anew, as processes.
+
+    A process that is spawned imports from the working directory, unless told otherwise, and
+    runs the script that its parent runs, of which workers need nothing: functions in it travel
+    by value.
+    """
+    main_globals, previous_value = vars(sys.modules["__main__"]), os.environ.get(SAFE_PATH_VARIABLE)
+    removed_globals = {
+        name: main_globals.pop(name) for name in [*main_globals] if name in ("__file__", "__spec__")
+    }
+    main_globals["__spec__"] = None
+    os.environ[SAFE_PATH_VARIABLE] = "1"  # for what multiprocessing starts itself, too
+    try:
+        yield
+    finally:
+        main_globals.update(removed_globals)
+        os.environ.pop(SAFE_PATH_VARIABLE)
+        if previous_value is not None:
+            os.environ[SAFE_PATH_VARIABLE] = previous_value
+
+
+def start_local_cluster(
+    cluster: LocalClusterConfig, bounds: WorkerBounds, *, processes: bool
+) -> Any:
+    """Start workers of this machine; OSError, RuntimeError, ImportError where they can't be."""
+    import dask
+    from distributed import LocalCluster, Security
+
+    listen_options = scheduler_options(cluster.scheduler)
+    dashboard_options = {
+        config_name: listen_options.pop(config_name)
+        for config_name in ("dashboard", "dashboard_address")
+    }
+    port = listen_options.pop("port")
+    options: dict[str, Any] = {
+        "n_workers": bounds.least,
+        "threads_per_worker": cluster.worker.threads,
+        "processes": processes,
+        "memory_limit": worker_memory_limit(cluster, bounds) if processes else 0,
+        "preload": [PRELOAD_MODULE],
+        "security": make_security(cluster),
+    }
+    if processes:  # threads need no port
+        options |= listen_options | {"scheduler_port": port}
+        dashboard_options["worker_ttl"] = WORKER_TTL
+        options["security"] = options["security"] or Security.temporary()
+    else:
+        options["worker_dashboard_address"] = (
+            f"{LOOPBACK_ADDRESS}:0"  # by default all networks reach it
+        )
+        options["worker_class"] = _worker_without_pages()
+    config_name = "distributed.nanny.pre-spawn-environ"
+    environment_variables = {
+        **dask.config.get(config_name),
+        **worker_environment(cluster.environment),
+    }
+    with dask.config.set({**DASK_CONFIG, config_name: environment_variables}):
+        try:
+            return LocalCluster(scheduler_kwargs=dashboard_options, **options)
+        except (OSError, ImportError, RuntimeError):  # a study needs no dashboard
+            dashboard_options |= {"dashboard": False, "dashboard_address": f"{LOOPBACK_ADDRESS}:0"}
+            return LocalCluster(scheduler_kwargs=dashboard_options, **options)
+
+
+def _worker_without_pages() -> type:
+    """Class of workers as threads that have an address for pages, as Dask asks for, and no page."""
+    from distributed import Worker
+
+    class WorkerWithoutPages(Worker):
+        def __init__(self, *arguments: Any, **options: Any) -> None:
+            super().__init__(*arguments, **options | {"dashboard": False})
+
+    return WorkerWithoutPages
+
+
+def dashboard_link(dask_cluster: Any) -> str:
+    """Address of the dashboard of a cluster that was started here, for a browser."""
+    from distributed.utils import format_dashboard_link
+
+    return str(
+        format_dashboard_link(
+            LOOPBACK_ADDRESS, dask_cluster.scheduler_info["services"]["dashboard"]
+        )
+    )
+
+
+def worker_memory_limit(cluster: LocalClusterConfig, bounds: WorkerBounds) -> int:
+    """Bytes that a worker may take before Dask restarts it: by default its share of 90 %."""
+    from distributed.system import MEMORY_LIMIT
+
+    requested_bytes = cluster.worker.memory
+    return (
+        int(requested_bytes)
+        if requested_bytes
+        else max(WORKER_BYTES_MIN, int(0.9 * MEMORY_LIMIT / bounds.most))
+    )
+
+
+def start_ssh_cluster(cluster: SSHClusterConfig, bounds: WorkerBounds) -> Any:
+    """Start workers on all machines; OSError, RuntimeError where one can't be reached."""
+    import asyncssh
+    from distributed import Scheduler, SpecCluster
+
+    security = make_security(cluster)
+    protocol = {"protocol": "tls://", "security": security} if security else {}
+    try:
+        return SpecCluster(
+            workers=ssh_worker_specs(cluster, bounds.most),
+            scheduler={
+                "cls": Scheduler,
+                "options": scheduler_options(cluster.scheduler) | protocol,
+            },
+            security=security,
+            name="SSH",
+        )
+    except asyncssh.Error as error:
+        raise RuntimeError(f"{type(error).__name__}: {error}") from error
+
+
+def ssh_worker_specs(cluster: SSHClusterConfig, n_workers: int) -> dict[str, dict[str, Any]]:
+    """Workers to start on each machine, by its name: they are dealt out evenly."""
+    from distributed.deploy.ssh import Worker
+
+    hosts = cluster.hosts[:n_workers]
+    workers_per_host = [
+        n_workers // len(hosts) + (i < n_workers % len(hosts)) for i in range(len(hosts))
+    ]
+    return {
+        host: {
+            "cls": Worker,
+            "options": {
+                "address": host,
+                "connect_options": _ssh_connect_options(cluster),
+                "remote_python": cluster.python or None,
+                "worker_class": "distributed.Nanny",
+                "kwargs": ssh_nanny_options(cluster) | {"n_workers": workers_on_host},
+            },
+        }
+        for host, workers_on_host in zip(hosts, workers_per_host, strict=True)
+    }
+
+
+def _ssh_connect_options(cluster: SSHClusterConfig) -> dict[str, Any]:
+    """Arguments of `asyncssh.connect`."""
+    options = {
+        "username": cluster.user,
+        "client_keys": cluster.identity and [cluster.resolve_path(cluster.identity)],
+        "known_hosts": cluster.known_hosts and cluster.resolve_path(cluster.known_hosts),
+    }
+    return {"port": cluster.port, **{name: value for name, value in options.items() if value}}
+
+
+def ssh_nanny_options(cluster: SSHClusterConfig) -> dict[str, Any]:
+    """Arguments of the nannies there: what JSON can hold."""
+    security = security_settings(cluster)
+    return {
+        "nthreads": cluster.worker.threads,
+        "memory_limit": int(cluster.worker.memory),
+        "preload": [PRELOAD_MODULE],
+        "env": worker_environment(cluster.environment),
+        "dashboard": False,
+        **({"security": security, "protocol": "tls://"} if security else {}),
+    }
+
+
+class Certificates(NamedTuple):
+    """Files of a cluster's own certificate, which signs itself."""
+
+    ca: Path
+    certificate: Path
+    key: Path
+
+
+def make_certificates(directory: Path) -> Certificates:
+    """Make Dask's certificate, of a year, which its owner alone may read; else ClusterError."""
+    from distributed import Security
+
+    certificates = Certificates(*(directory / f"{name}.pem" for name in Certificates._fields))
+    if existing := [file for file in certificates if file.exists()]:
+        raise ClusterError(f"{existing[0]} is there already: name another directory")
+    security = Security.temporary()
+    try:
+        directory.mkdir(parents=True, exist_ok=True, mode=0o700)
+        contents = security.tls_ca_file, security.tls_client_cert, security.tls_client_key
+        for file, content in zip(certificates, contents, strict=True):
+            with open(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as stream:
+                stream.write(content)
+    except OSError as error:
+        raise ClusterError(f"{directory} can't be written: {error}") from error
+    return certificates

@@ -1,0 +1,487 @@
+"""A rolling window of Dask tasks: never more in flight than keeps every worker busy.
+
+A task writes its blocks itself and returns receipts, which the client takes and lets go at once: no
+result stays on a worker that its death could lose.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import queue
+import textwrap
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from concurrent.futures import CancelledError
+from dataclasses import dataclass, field, replace
+from itertools import chain, takewhile
+from typing import TYPE_CHECKING, Any
+
+from sweep.storage.store_format import NotAStoreError
+from sweep.tasks.engine.journal import Receipt
+from sweep.tasks.engine.progress import SchedulerLostError, StoreError, duration_text
+from sweep.tasks.engine.worker import (
+    IDLE_POLL_SECONDS,
+    RESULTS_NOT_VISIBLE_MESSAGE,
+    BlockQueue,
+    ReceiptVerifier,
+    TaskResult,
+    TaskSettings,
+    make_failure,
+    run_blocks,
+)
+
+if TYPE_CHECKING:
+    from dask.typing import Key
+    from distributed import Client, Future
+
+#: Seconds that a task should take: long beside the 3-9 ms that one costs, short beside a study.
+TARGET_TASK_SECONDS = 2.0
+BLOCKS_PER_TASK_MAX = 1000
+
+#: Tasks that a scheduler is given in a second: a third of what it can take. On more than 200
+#: worker threads tasks are longer for it.
+TASKS_PER_SECOND_MAX = 100.0
+
+#: Seconds between looks at the workers that there are.
+SLOT_COUNT_AGE_MAX = 2.0
+
+#: Seconds after which a worker that does not answer is silent; longer where its blocks are.
+LEASE_SECONDS = 30.0
+
+#: Seconds in which a file server shows here what a worker has written: Linux's NFS keeps what it
+#: knows of a folder for as long.
+FILE_VISIBILITY_DELAY_MAX = 60.0
+
+#: Time without an answer after which a run is told to stall [s]; longer where tasks take longer.
+STALL_SECONDS = 60.0
+
+#: Times that a task should take after which a run is told to stall.
+STALL_TASK_TIMES = 5.0
+
+#: Largest number of tasks, and of workers, that a summary of the state lists.
+TASKS_SHOWN_MAX, WORKERS_SHOWN_MAX = 5, 10
+
+SHARED_FOLDER_REMEDY = "workers have to see the store's folder, under the same path"
+
+PrintMessage = Callable[[str], None]
+
+_logger = logging.getLogger("sweep.scheduler")
+
+
+@dataclass
+class ThroughputEstimator:
+    """Blocks that make a task of a sensible length, from the time of those that came back."""
+
+    n_blocks: int = 0
+    seconds: float = 0.0
+
+    def update(self, task_result: TaskResult) -> None:
+        """Take in the measured times of an answer."""
+        self.n_blocks += len(task_result.receipts)
+        self.seconds += sum(receipt.seconds for receipt in task_result.receipts)
+
+    def blocks_per_task(self, n_blocks_left: int, n_slots: int) -> int:
+        """Blocks for the next task; fewer near the end, so that all workers end together."""
+        if not self.n_blocks:
+            return 1
+        task_seconds = max(TARGET_TASK_SECONDS, n_slots / TASKS_PER_SECOND_MAX)
+        n_fitting = int(task_seconds * self.n_blocks / max(self.seconds, 1e-9))
+        return max(1, min(n_fitting, BLOCKS_PER_TASK_MAX, n_blocks_left // (4 * n_slots)))
+
+
+@dataclass
+class WorkerSlots:
+    """Worker threads of a cluster, or those that may come, asked for anew every few seconds."""
+
+    client: Client
+    expected_slots: int = 0
+    n_slots: int = 1
+    threads_by_worker: dict[str, int] = field(default_factory=dict)  # by address of the worker
+    counted_at: float = -1e9
+
+    def current_count(self) -> int:
+        """Worker threads, at least 1."""
+        if time.monotonic() - self.counted_at > SLOT_COUNT_AGE_MAX:
+            self.threads_by_worker = dict(self.client.nthreads())
+            self.n_slots = max(1, self.expected_slots, sum(self.threads_by_worker.values()))
+            self.counted_at = time.monotonic()
+        return self.n_slots
+
+
+@dataclass(eq=False)
+class _InFlightTask:
+    """Blocks that are out: at one worker, and again at others where that one is silent."""
+
+    blocks: list[int]
+    futures: dict[Key, Future] = field(default_factory=dict)
+    last_sent_at: float = 0.0  # last
+
+
+class TaskDispatcher:
+    """Tasks in flight on a cluster.
+
+    A worker that can't open the store, can't write to it, or writes to another one is left out,
+    and its blocks go to the others. Blocks of a silent worker are computed by others too, once
+    these have nothing else to do; the first answer counts. ``seen`` tells whether what a
+    receipt is for is in the store here: by its size, or read and held to its digest, as the
+    first block of each worker is.
+    """
+
+    def __init__(
+        self,
+        client: Client,
+        expected_slots: int,
+        settings: TaskSettings,
+        block_queue: BlockQueue,
+        *,
+        verify_receipt: ReceiptVerifier,
+        say: PrintMessage,
+    ) -> None:
+        self._client, self._settings, self._block_queue = client, settings, block_queue
+        self._verify_receipt, self._say = verify_receipt, say
+        self._in_flight: dict[Key, _InFlightTask] = {}
+        self._superseded: dict[Key, Future] = {}  # out still, though another worker has answered
+        self._finished_futures: queue.SimpleQueue[Future] = queue.SimpleQueue()
+        self._throughput, self._slots = ThroughputEstimator(), WorkerSlots(client, expected_slots)
+        self._resend_counts: Counter[int] = (
+            Counter()
+        )  # how often a task's first block was sent again
+        self._failing_worker: dict[int, str] = {}  # address of the worker by block
+        self._last_response: dict[str, float] = {}  # when a worker last answered
+        self._duplicated_at = self._rechecked_at = time.monotonic()
+        self._unverified_receipts: list[
+            tuple[Receipt, str, float]
+        ] = []  # of which worker, looked for till when
+        self._verified_workers: set[str] = (
+            set()
+        )  # workers that have written to the store that is here
+        self._excluded_workers: dict[str, int] = {}  # workers that are left out, and their threads
+        self._last_progress_at = time.monotonic()  # when an answer last arrived
+        self._stall_patience = STALL_SECONDS  # time from then until the next word of it
+        self._has_reported_stall = False  # since then
+
+    def iter_results(self, is_stopping: Callable[[], bool]) -> Iterator[TaskResult]:
+        """Answers as they arrive; an empty one every `TICK` while none does.
+
+        Once `stopping` says so nothing more is sent, and the iteration ends with what is
+        out, or at once where there is no worker to do it. SchedulerLost where the scheduler
+        is gone; StoreError, OSError where no worker can write to the store.
+        """
+        try:
+            while True:
+                try:
+                    self._submit_tasks(may_submit=not is_stopping())
+                except Exception as error:  # of a client that is closed, of any kind
+                    self._check_connection()
+                    if isinstance(error, OSError | CancelledError | RuntimeError):
+                        raise SchedulerLostError(str(error)) from error
+                    raise
+                if is_stopping() and not (self._in_flight and self._usable_workers()):
+                    return  # nothing that is out will ever come
+                if not (self._in_flight or self._unverified_receipts or self._all_workers_excluded):
+                    return
+                task_result = self._next_result()
+                task_result.n_workers = len(self._usable_workers())
+                yield task_result
+        finally:
+            self._in_flight.clear()  # a task without a future is cancelled
+            self._superseded.clear()
+
+    def state_summary(self) -> str:
+        """Describe the blocks, tasks and workers of the run, one to a line."""
+        now = time.monotonic()
+        tasks = set(self._in_flight.values())
+        lines = [
+            f"{self._block_queue.n_unassigned:,} blocks not yet sent, "
+            f"{len(self._block_queue.failed):,} failed once, "
+            f"{len(self._unverified_receipts):,} written but not yet found in the store",
+            f"{len(tasks):,} tasks in flight, {len(self._superseded):,} superseded; "
+            f"{self._throughput.n_blocks:,} blocks came back in "
+            f"{duration_text(self._throughput.seconds)} of work",
+        ]
+        lines += [
+            f"task of block {task.blocks[0]} and {len(task.blocks) - 1} more: sent "
+            f"{duration_text(now - task.last_sent_at)} ago, {len(task.futures)} times; Dask says "
+            f"{', '.join(sorted({str(future.status) for future in task.futures.values()}))}"
+            for task in sorted(tasks, key=lambda task: task.last_sent_at)[:TASKS_SHOWN_MAX]
+        ]
+        for worker, threads in sorted(self._slots.threads_by_worker.items())[:WORKERS_SHOWN_MAX]:
+            answered_at = self._last_response.get(worker)
+            last_response_text = (
+                "never" if answered_at is None else f"{duration_text(now - answered_at)} ago"
+            )
+            excluded_text = ", left out" if worker in self._excluded_workers else ""
+            lines.append(
+                f"worker {worker}: {threads} threads, last answer "
+                f"{last_response_text}{excluded_text}"
+            )
+        return "\n".join(lines)
+
+    def _report_stall(self) -> None:
+        """Tell that nothing comes back, after ever longer times, and log what is out where."""
+        if (
+            not self._in_flight or not self._usable_workers()
+        ):  # that no worker is there is told by others
+            self._last_progress_at = time.monotonic()
+        seconds_waited = time.monotonic() - self._last_progress_at
+        if seconds_waited < self._stall_patience:
+            return
+        is_first = not self._has_reported_stall
+        self._stall_patience, self._has_reported_stall = 2 * seconds_waited, True
+        summary = self.state_summary()
+        _logger.info("nothing came back for %s:\n%s", duration_text(seconds_waited), summary)
+        stall_text = f"no block has come back for {duration_text(seconds_waited)}"
+        self._say(f"{stall_text}:\n{textwrap.indent(summary, '  ')}" if is_first else stall_text)
+
+    def _usable_workers(self) -> list[str]:
+        """Workers that there are, but for those that are left out."""
+        return [
+            worker
+            for worker in self._slots.threads_by_worker
+            if worker not in self._excluded_workers
+        ]
+
+    @property
+    def _all_workers_excluded(self) -> bool:
+        """Tell whether all workers so far are left out, and others are still to come."""
+        return bool(self._excluded_workers) and not self._usable_workers()
+
+    def _submit_tasks(self, *, may_submit: bool) -> None:
+        n_slots = self._slots.current_count()
+        if time.monotonic() - self._duplicated_at > SLOT_COUNT_AGE_MAX:
+            self._duplicated_at = time.monotonic()
+            self._duplicate_stragglers()
+        while may_submit and not self._all_workers_excluded and len(self._in_flight) < 2 * n_slots:
+            count = self._throughput.blocks_per_task(self._block_queue.n_unassigned, n_slots)
+            if not (
+                blocks := self._block_queue.take_blocks(
+                    count, include_failed=not self._failed_block_in_flight()
+                )
+            ):
+                return
+            self._submit(_InFlightTask(blocks), **self._placement_kwargs(blocks[0]))
+
+    def _failed_block_in_flight(self) -> bool:
+        """Tell whether a block that failed before is out: two could blame each other's deed."""
+        failed = self._block_queue.failed
+        return bool(failed) and any(task.blocks[0] in failed for task in self._in_flight.values())
+
+    def _placement_kwargs(self, block: int) -> dict[str, Any]:
+        """Workers to send a block to: not where it failed before, if there is anywhere else."""
+        failing_worker = self._failing_worker.get(block)
+        others = [worker for worker in self._usable_workers() if worker != failing_worker]
+        if failing_worker and others:
+            return {"workers": others, "allow_other_workers": not self._excluded_workers}
+        return {"workers": self._usable_workers()} if self._excluded_workers else {}
+
+    def _submit(self, task: _InFlightTask, **placement: Any) -> None:
+        first_block = task.blocks[0]
+        key = task_key(
+            self._settings,
+            task.blocks,
+            first_block in self._block_queue.failed,
+            self._resend_counts[first_block],
+        )
+        future = self._client.submit(
+            run_blocks, self._settings, task.blocks, key=key, retries=0, **placement
+        )
+        task.last_sent_at = time.monotonic()
+        _logger.debug("sent block %s and %s more as %s", first_block, len(task.blocks) - 1, key)
+        task.futures[future.key] = future
+        self._in_flight[future.key] = task
+        future.add_done_callback(self._finished_futures.put)
+
+    def _duplicate_stragglers(self) -> None:
+        """Send what silent workers hold to others as well, where these have nothing to do."""
+        now = time.monotonic()
+        overdue = [
+            task
+            for task in set(self._in_flight.values())
+            if now - task.last_sent_at > self._lease_seconds(task)
+            and not any(future.done() for future in task.futures.values())  # yet to be looked at
+        ]
+        if not overdue:
+            return
+        keys_by_worker = {worker: set(keys) for worker, keys in self._client.processing().items()}
+        tasks_by_silent_worker = {
+            worker: tasks
+            for worker, keys in keys_by_worker.items()
+            if now - self._last_response.get(worker, -1e9) > LEASE_SECONDS
+            and (tasks := [task for task in overdue if keys & task.futures.keys()])
+        }
+        idle_workers = [
+            worker
+            for worker in self._usable_workers()
+            if worker not in tasks_by_silent_worker
+            and len(keys_by_worker.get(worker, ())) < self._slots.threads_by_worker[worker]
+        ]
+        if not idle_workers:
+            return
+        for worker, tasks in tasks_by_silent_worker.items():
+            n_blocks = sum(len(task.blocks) for task in tasks)
+            silent_seconds = now - max(
+                self._last_response.get(worker, -1e9), min(task.last_sent_at for task in tasks)
+            )
+            self._say(
+                f"worker {worker} is silent ({duration_text(silent_seconds)}): {n_blocks} "
+                f"block{'s' if n_blocks > 1 else ''} of its go to others as well"
+            )
+        unassigned = [
+            task
+            for task in overdue
+            if not any(task.futures.keys() & k for k in keys_by_worker.values())
+        ]
+        for task in {*unassigned, *chain.from_iterable(tasks_by_silent_worker.values())}:
+            self._resend_counts[task.blocks[0]] += 1
+            self._submit(task, workers=idle_workers)
+
+    def _lease_seconds(self, task: _InFlightTask) -> float:
+        """Seconds after which a task may be sent again; longer each time."""
+        return max(LEASE_SECONDS, 5 * self._task_seconds(task)) * 2.0 ** (len(task.futures) - 1)
+
+    def _task_seconds(self, task: _InFlightTask) -> float:
+        """Time that a task should take by the pace of those before [s]."""
+        throughput = self._throughput
+        return (
+            len(task.blocks) * throughput.seconds / throughput.n_blocks
+            if throughput.n_blocks
+            else LEASE_SECONDS
+        )
+
+    def _next_result(self) -> TaskResult:
+        task_result = TaskResult()
+        try:
+            future = self._finished_futures.get(timeout=IDLE_POLL_SECONDS)
+        except queue.Empty:
+            self._check_connection()
+            self._report_stall()
+        else:
+            if future.key in self._in_flight:
+                task_result = self._finish_task(future)
+            self._superseded.pop(future.key, None)
+        self._verify_receipts(task_result)
+        return task_result
+
+    def _finish_task(self, future: Future) -> TaskResult:
+        task = self._in_flight[future.key]
+        for key in task.futures:
+            del self._in_flight[key]
+        for key in takewhile(lambda key: key != future.key, task.futures):
+            self._superseded[key] = task.futures[key]  # so that its worker does not look idle
+        task_result = _collect_task_result(future, task.blocks)
+        self._last_response[task_result.worker_address] = self._last_progress_at = time.monotonic()
+        self._throughput.update(task_result)
+        self._stall_patience = max(STALL_SECONDS, STALL_TASK_TIMES * self._task_seconds(task))
+        self._has_reported_stall = False
+        _logger.debug(
+            "%s answered: %s blocks written, %s failed, %s begun",
+            task_result.worker_address or "a lost worker",
+            len(task_result.receipts),
+            len(task_result.failures),
+            len(task_result.checkpoint_points),
+        )
+        self._failing_worker.update(
+            (failure.block, task_result.worker_address) for failure in task_result.failures
+        )
+        settled_blocks = {r.block for r in task_result.receipts} | {
+            f.block for f in task_result.failures
+        }
+        self._requeue([block for block in task.blocks if block not in settled_blocks])
+        if task_result.worker_error is not None:
+            self._exclude_worker(
+                task_result.worker_address, task_result.host, task_result.worker_error
+            )
+        return task_result
+
+    def _requeue(self, blocks: list[int]) -> None:
+        """Put blocks back that are begun, or to be sent again by no fault of theirs."""
+        self._block_queue.requeue(blocks)
+        self._resend_counts.update(blocks)
+
+    def _verify_receipts(self, task_result: TaskResult) -> None:
+        """Leave the receipts of what is in the store here, which may show some seconds late."""
+        now = time.monotonic()
+        pending = [
+            (receipt, task_result.worker_address, now + FILE_VISIBILITY_DELAY_MAX)
+            for receipt in task_result.receipts
+        ]
+        if now - self._rechecked_at > IDLE_POLL_SECONDS:
+            self._rechecked_at = now
+            pending, self._unverified_receipts = self._unverified_receipts + pending, []
+        task_result.receipts = []
+        for receipt, worker, deadline in pending:
+            if self._verify_receipt(receipt, worker not in self._verified_workers):
+                self._verified_workers.add(worker)
+                task_result.receipts.append(receipt)
+            elif now < deadline and worker not in self._excluded_workers:
+                self._unverified_receipts.append((receipt, worker, deadline))
+            else:
+                self._requeue([receipt.block])
+                self._exclude_worker(worker, receipt.host, StoreError(RESULTS_NOT_VISIBLE_MESSAGE))
+
+    def _exclude_worker(self, worker: str, host: str, error: Exception) -> None:
+        """Send nothing more to a worker; raise why where no other is left, or may come."""
+        if worker in self._excluded_workers:
+            return
+        self._excluded_workers[worker] = self._slots.threads_by_worker.get(worker, 1)
+        if (
+            self._all_workers_excluded
+            and sum(self._excluded_workers.values()) >= self._slots.expected_slots
+        ):
+            if isinstance(error, NotAStoreError):  # the driver has it
+                raise StoreError(
+                    f"no worker is left: {worker} on {host}: {error}; {SHARED_FOLDER_REMEDY}"
+                )
+            raise error
+        self._say(f"worker {worker} on {host} is left out: {error}")
+
+    def _check_connection(self) -> None:
+        if self._client.status != "running":
+            raise SchedulerLostError(f"the client is {self._client.status}")
+
+
+def _collect_task_result(future: Future, blocks: list[int]) -> TaskResult:
+    """Answer of a task that is over; an empty one where its worker died with it."""
+    error: BaseException | None = None
+    if future.status == "finished":
+        try:
+            return future.result(timeout=LEASE_SECONDS)
+        except TimeoutError:
+            pass  # lost, as below, and not computed again in that time
+        except (CancelledError, OSError) as connection_error:
+            raise SchedulerLostError(str(connection_error)) from connection_error
+        except Exception as task_error:  # gone with its worker, computed again, and that failed
+            error = task_error
+    elif future.status == "error":
+        error = future.exception()
+    elif future.status == "cancelled":
+        raise SchedulerLostError("its tasks were cancelled")
+    return _failed_task_result(error, blocks) if error is not None else TaskResult()
+
+
+def _failed_task_result(error: BaseException, blocks: list[int]) -> TaskResult:
+    """Answer of a task that raised or killed its workers: any of its blocks may be to blame."""
+    from distributed.scheduler import KilledWorker
+
+    failures = [make_failure(block, error) for block in blocks]
+    if isinstance(error, KilledWorker):
+        n_deaths = error.allowed_failures + 1
+        message = (
+            f"KilledWorker: {n_deaths} worker{'s' if n_deaths > 1 else ''} died at it: "
+            "out of memory, stuck beyond --block-timeout, or killed"
+        )
+        failures = [replace(failure, error=message) for failure in failures]
+    return TaskResult(failures=failures)
+
+
+def task_key(
+    settings: TaskSettings, blocks: list[int], is_retry: bool, resend_count: int = 0
+) -> str:
+    """Key of a task: the same work for the same store is the same task, whoever asks."""
+    identity = repr(
+        (settings.store_path, settings.study_id, blocks, is_retry, resend_count)
+    ).encode()
+    digest = hashlib.blake2b(identity, digest_size=12).hexdigest()
+    return f"blocks-{settings.study_id[:8]}-{blocks[0]}-{digest}"

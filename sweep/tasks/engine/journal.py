@@ -1,0 +1,938 @@
+"""The journal of what is committed: one JSON line a block, written after its chunks.
+
+A block is done when its receipt is in the log and its objects are in the store; what is not done is
+computed again, to the same bytes. The log is only appended to, by the one driver that holds the
+store's lock. A receipt whose chunks were later found damaged is withdrawn by a further line; a line
+that does not match its own digest counts for nothing.
+
+The recipe is what a store's own bytes do not say: where its study's files are, and which store it
+extends.
+
+Blocks that take long are computed in pieces. A worker draws for some seconds and saves what it has
+in a file of the journal, with a digest; whoever takes up the block next goes on from there.
+
+The lock says which driver writes to the store, and whether it still lives.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import hashlib
+import io
+import json
+import math
+import os
+import socket
+import stat
+import threading
+import time
+import uuid
+import warnings
+import zipfile
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, fields
+from datetime import UTC, datetime
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sweep.messages import SPEC_PLACEHOLDER, escape_to_one_line, suggestion
+from sweep.regular_files import RefusedFileError, open_regular
+from sweep.safe_json import parse_json
+from sweep.storage.locations import (
+    CONCURRENT_REQUESTS_MAX,
+    HIDDEN_PROCESS,
+    JOURNAL_DIR,
+    Location,
+    ObjectPath,
+    ObjectStoreError,
+    ObjectVersion,
+    atomic_write,
+    process_start_id,
+    read_object,
+)
+from sweep.storage.size_checks import ARRAY_FILE_BYTES_MAX
+from sweep.storage.store_format import (
+    RECEIPTS_FILE,
+    decode_record,
+    encode_record,
+    iter_lines_and_records,
+    iter_records,
+    open_log,
+    read_receipt_totals,
+    verified_body,
+)
+from sweep.tasks.engine.blocks import BlockStudy, PartialResults, ReusedResults
+from sweep.tasks.engine.progress import BusyError, StoreError, raise_as_store_error
+
+FAILURE_LOG = "failures.jsonl"
+SESSION_LOG = "sessions.jsonl"
+LOG_NAMES = (RECEIPTS_FILE, FAILURE_LOG, SESSION_LOG)
+
+RECIPE_FILE = "recipe.json"
+
+#: The place of the store that points are taken from, while this one is extended from it.
+EXTENDS_KEY = "extends"
+
+#: Digests of the modules of the user's that it was begun with.
+USER_CODE_KEY = "code"
+
+#: Id of the study whose store this one is to take the place of; empty where there is none.
+REPLACES_KEY = "replaces"
+
+#: Folders on disk that are listed at once: on a file server each is mostly waiting.
+LISTING_THREADS = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class Receipt:
+    """Note of a worker on a block that it has written."""
+
+    block: int
+    points: int
+    bytes: int  # as stored
+    digest: str  # of the bytes stored, `opening.digest`
+    seconds: float  # evaluating and writing
+    write_seconds: float
+    host: str
+    pid: int
+    versions: dict[str, str]
+    taken: int = 0  # of its points, those that a smaller study's store had
+
+
+@dataclass(frozen=True, kw_only=True)
+class Failure:
+    """Error of a block, and where it was met."""
+
+    block: int
+    error: str
+    traceback: str
+    host: str
+    pid: int
+
+
+class Journal:
+    """Logs of a store, to append to; on opening, lines that are damaged or cut short are dropped.
+
+    The caller holds the store's lock. A receipt of a `durable` one is on the disk once
+    committed.
+    """
+
+    def __init__(self, store_path: Location, *, durable: bool = False) -> None:
+        journal_path = store_path / JOURNAL_DIR
+        self._logs = {name: open_log(journal_path / name, durable=durable) for name in LOG_NAMES}
+        for log in self._logs.values():
+            log.remove_damaged_lines(lambda line: verified_body(line) is not None)
+
+    def commit(self, *receipts: Receipt) -> None:
+        """Append receipts: their blocks are done; in an object store from the next `flush` on."""
+        commit_time = round(time.time(), 3)
+        self._append(
+            RECEIPTS_FILE, *({**asdict(receipt), "time": commit_time} for receipt in receipts)
+        )
+
+    def withdraw(self, block: int, reason: str) -> None:
+        """Take back the receipt of a block: from here on it is to be computed again."""
+        self._append(
+            RECEIPTS_FILE, {"block": block, "withdrawn": reason, "time": round(time.time(), 3)}
+        )
+
+    def flush(self, *, force: bool = False) -> bool:
+        """Write what was gathered, if it is time to; True where nothing is left to write."""
+        is_flushed = [log.flush(force=force) for log in self._logs.values()]
+        return all(is_flushed)
+
+    def record_failure(self, failure: Failure) -> None:
+        """Append the error of a block that was given up."""
+        self._append(FAILURE_LOG, asdict(failure))
+
+    def record_run_event(self, event: str, **details: Any) -> None:
+        """Append what happened to a run: begun, ended, by whom and when; all else is written."""
+        utc = datetime.now(UTC).isoformat(timespec="seconds")
+        self._append(SESSION_LOG, {"event": event, "time": time.time(), "utc": utc, **details})
+        self.flush(force=True)
+
+    def _append(self, log_name: str, *records: dict[str, Any]) -> None:
+        """Append lines, whole or not at all; OSError where they can't be written."""
+        if records:
+            self._logs[log_name].append(b"".join(map(encode_record, records)))
+
+
+def committed_digests(store_path: Location, n_blocks: int) -> np.ndarray:
+    """Digests of the blocks that were committed, (blocks,) of bytes, empty where there is none."""
+    digest_by_block = np.zeros(n_blocks, dtype="S32")
+    for record in iter_records(store_path / JOURNAL_DIR / RECEIPTS_FILE):
+        if 0 <= record["block"] < n_blocks:
+            digest_by_block[record["block"]] = record.get(
+                "digest", ""
+            )  # none in a line that withdraws
+    return digest_by_block
+
+
+def blocks_with_receipt(store_path: Location, study: BlockStudy) -> np.ndarray:
+    """Blocks with a receipt, (blocks,) bool, whose chunks need not be there."""
+    return read_receipt_totals(store_path, study.n_blocks).points_by_block > 0
+
+
+def committed_blocks(store_path: Location, study: BlockStudy) -> np.ndarray:
+    """Blocks that are done, (blocks,) bool: with a receipt, and every object in the store."""
+    return scan_complete_blocks(store_path, study, blocks_with_receipt(store_path, study))
+
+
+def permanently_failed(store_path: Location, n_blocks: int) -> dict[int, dict[str, Any]]:
+    """Last failure of each block that was given up and never done since."""
+    last_failures = {
+        record["block"]: record for record in iter_records(store_path / JOURNAL_DIR / FAILURE_LOG)
+    }
+    if last_failures:
+        for record in iter_records(store_path / JOURNAL_DIR / RECEIPTS_FILE):
+            last_failures.pop(record["block"], None)
+    return {block: failure for block, failure in last_failures.items() if block < n_blocks}
+
+
+def last_run_start(store_path: Location) -> float:
+    """Time at which the last run began [s since the epoch]; infinite where there was none."""
+    runs = iter_records(store_path / JOURNAL_DIR / SESSION_LOG)
+    start_times = [run["time"] for run in runs if run.get("event") == "begun"]
+    return float(start_times[-1]) if start_times else np.inf
+
+
+def write_recipe(store_path: Location, **facts: Any) -> None:
+    """Put down where a study's files are, in one step."""
+    atomic_write(store_path / JOURNAL_DIR / RECIPE_FILE, encode_record(facts))
+
+
+def read_recipe(store_path: Location) -> dict[str, Any]:
+    """Facts that were put down; empty where nothing was, or where it is damaged."""
+    records = [
+        record for _, record in iter_lines_and_records(store_path / JOURNAL_DIR / RECIPE_FILE)
+    ]
+    return records[0] or {} if len(records) == 1 else {}
+
+
+def remove_recipe_predecessors(store_path: Path) -> None:
+    """Take away which store a study's extends and replaces."""
+    facts = read_recipe(store_path)
+    for name in (EXTENDS_KEY, REPLACES_KEY):
+        facts.pop(name, None)
+    if facts:
+        write_recipe(store_path, **facts)
+    else:
+        (store_path / JOURNAL_DIR / RECIPE_FILE).unlink(missing_ok=True)
+
+
+def refuse_damaged_recipe(store_path: Location) -> None:
+    """Refuse a store that no longer says where the files of its study are."""
+    recipe_path = store_path / JOURNAL_DIR / RECIPE_FILE
+    if any(record is None for _, record in iter_lines_and_records(recipe_path)):
+        raise StoreError(
+            f"{recipe_path} is damaged, and with it where the files of the study are: "
+            f"{suggestion('resume', store_path, spec=SPEC_PLACEHOLDER)} puts it down anew"
+        )
+
+
+class ChunkScan:
+    """A look at the chunks of blocks that are marked, (blocks,) bool, begun as it is made."""
+
+    def __init__(self, store_path: Location, study: BlockStudy, candidates: np.ndarray) -> None:
+        self._candidates, self._is_stopped = candidates.copy(), False
+        n_threads = (
+            CONCURRENT_REQUESTS_MAX if isinstance(store_path, ObjectPath) else LISTING_THREADS
+        )
+        self._executor = ThreadPoolExecutor(n_threads, thread_name_prefix="look")
+
+        def blocks_lacking_chunk(array_name: str, owner_blocks: np.ndarray) -> np.ndarray:
+            """Blocks that lack their chunk of an array."""
+            if self._is_stopped:
+                return np.empty(0, np.int64)
+            is_present = existing_chunks(store_path / array_name / "c", owner_blocks.shape)
+            return owner_blocks[~is_present & self._candidates[owner_blocks]]
+
+        owners_by_array = study.chunk_owners() if candidates.any() else {}
+        self._array_scans = [
+            self._executor.submit(blocks_lacking_chunk, *name_and_owners)
+            for name_and_owners in owners_by_array.items()
+        ]
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Tell whether the look is over, waited for no longer than that."""
+        return not wait(self._array_scans, timeout).not_done
+
+    def complete_blocks(self) -> np.ndarray:
+        """Blocks that lack nothing as far as was looked, (blocks,) bool; OSError if unreadable."""
+        is_complete = self._candidates.copy()
+        for scan in self._array_scans:
+            if scan.done():
+                is_complete[scan.result()] = False
+        return is_complete
+
+    def stop(self) -> None:
+        """Look no further."""
+        self._is_stopped = True
+        self._executor.shutdown(wait=False)
+
+
+def scan_complete_blocks(
+    store_path: Location, study: BlockStudy, candidates: np.ndarray
+) -> np.ndarray:
+    """Blocks, among some, that have every object in the store, and bytes in it, (blocks,) bool."""
+    scan = ChunkScan(store_path, study, candidates)
+    try:
+        scan.wait()
+        return scan.complete_blocks()
+    finally:
+        scan.stop()
+
+
+def existing_chunks(folder: Location, shape: tuple[int, ...]) -> np.ndarray:
+    """Chunks of an array that are there and hold something, bool in the shape of its grid."""
+    is_present = np.zeros(shape, bool)
+    if isinstance(folder, ObjectPath):
+        for position, size in _iter_chunk_keys(folder, shape):
+            is_present[position] = size > 0
+    elif shape:
+        _mark_existing_chunks(folder, is_present)
+    else:
+        with suppress(FileNotFoundError):
+            is_present[()] = _is_nonempty_file(folder.lstat())
+    return is_present
+
+
+def _is_nonempty_file(status: os.stat_result) -> bool:
+    """Tell whether a path is a file with something in it, and no directory."""
+    return stat.S_ISREG(status.st_mode) and status.st_size > 0
+
+
+def _iter_chunk_keys(
+    folder: ObjectPath, shape: tuple[int, ...]
+) -> Iterator[tuple[tuple[int, ...], int]]:
+    if not shape:
+        yield (), max(0, folder.size())
+        return
+    for key, size in folder.iter_objects_below():
+        parts = key.split("/")
+        if len(parts) == len(shape) and all(map(str.isdecimal, parts)):
+            position = tuple(map(int, parts))
+            if all(index < count for index, count in zip(position, shape, strict=True)):
+                yield position, size
+
+
+def _mark_existing_chunks(
+    folder_or_name: Path | str, is_present: np.ndarray, parent_descriptor: int | None = None
+) -> None:
+    """Note the chunks in a folder and below, (positions,) bool; it is in an open one."""
+    try:
+        # no links: what they lead to is no part of the store
+        descriptor = os.open(
+            folder_or_name, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW, dir_fd=parent_descriptor
+        )
+    except (FileNotFoundError, NotADirectoryError):
+        return
+    try:
+        with os.scandir(descriptor) as entries:
+            for entry in entries:
+                name = entry.name
+                if not name.isdecimal() or (index := int(name)) >= len(is_present):
+                    continue
+                if is_present.ndim > 1:
+                    _mark_existing_chunks(name, is_present[index], descriptor)
+                else:
+                    is_present[index] = _is_nonempty_file(entry.stat(follow_symlinks=False))
+    finally:
+        os.close(descriptor)
+
+
+#: Beginning of the names of files in the journal, each of one block.
+CHECKPOINT_PREFIX = "begun-"
+
+
+class Checkpoint(NamedTuple):
+    """The saved part of a block."""
+
+    results: ReusedResults = ReusedResults()
+    points: float = 0.0  # that this comes to; a point that is drawn in part counts in part
+    seconds: float = 0.0  # spent on it
+
+
+def write_checkpoint(
+    store_path: Location, study_id: str, block: int, checkpoint: Checkpoint
+) -> None:
+    """Save what there is of a block, in the place of less; OSError where it can't be written."""
+    if read_checkpoint(store_path, study_id, block).points >= checkpoint.points:
+        return  # another worker, that was thought to be lost, was quicker
+    buffer = io.BytesIO()
+    np.savez(buffer, **dict(_checkpoint_arrays(checkpoint.results)))
+    content = buffer.getvalue()
+    header = {
+        "study": study_id,
+        "block": block,
+        "points": checkpoint.points,
+        "seconds": checkpoint.seconds,
+        "digest": _content_digest(content),
+    }
+    atomic_write(_checkpoint_path(store_path, block), encode_record(header) + content)
+
+
+def read_checkpoint(store_path: Location, study_id: str, block: int) -> Checkpoint:
+    """Return the saved part of a block of a study."""
+    try:
+        file_content = read_object(
+            store_path, f"{JOURNAL_DIR}/{CHECKPOINT_PREFIX}{block}", ARRAY_FILE_BYTES_MAX
+        )
+    except (FileNotFoundError, NotADirectoryError, IsADirectoryError, RefusedFileError):
+        return Checkpoint()
+    line, _, content = file_content.partition(b"\n")
+    header = decode_record(line + b"\n") or {}
+    if (header.get("study"), header.get("block")) != (study_id, block):
+        return Checkpoint()
+    if header["digest"] != _content_digest(content):
+        return Checkpoint()
+    arrays_by_part: dict[str, dict[str, np.ndarray]] = {"done": {}, "begun": {}}
+    try:
+        for key, values in _iter_npz_arrays(content):
+            part, _, name = key.partition("/")
+            arrays_by_part[part][name] = values
+    except (ValueError, KeyError, zipfile.BadZipFile):  # a stranger's, with a digest of its own
+        return Checkpoint()
+    results = ReusedResults(
+        **{
+            part: PartialResults(arrays.pop("points"), arrays)
+            for part, arrays in arrays_by_part.items()
+        }
+    )
+    return Checkpoint(results, header["points"], header["seconds"])
+
+
+def _iter_npz_arrays(content: bytes) -> Iterator[tuple[str, np.ndarray]]:
+    """Arrays that `numpy.savez` packed, by name; ValueError where they are of other sizes."""
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        for member in archive.infolist():
+            if member.compress_type != zipfile.ZIP_STORED or member.file_size > len(content):
+                raise ValueError("packed otherwise than numpy.savez packs")
+            member_file = io.BytesIO(archive.read(member))
+            version = np.lib.format.read_magic(member_file)
+            read_header = {
+                (1, 0): np.lib.format.read_array_header_1_0,
+                (2, 0): np.lib.format.read_array_header_2_0,
+            }[version]
+            shape, _, dtype = read_header(member_file)
+            # before numpy makes room for what the header declares
+            if math.prod(shape) * dtype.itemsize != member.file_size - member_file.tell():
+                raise ValueError("its header declares another size")
+            member_file.seek(0)
+            yield member.filename.removesuffix(".npy"), np.load(member_file, allow_pickle=False)
+
+
+def checkpoint_points(store_path: Location, study_id: str) -> dict[int, float]:
+    """Points that there are, in part, of blocks that are begun."""
+    block_names = [
+        file.name.removeprefix(CHECKPOINT_PREFIX)
+        for file in (store_path / JOURNAL_DIR).glob(f"{CHECKPOINT_PREFIX}*")
+    ]
+    checkpoints = {
+        int(block_name): read_checkpoint(store_path, study_id, int(block_name))
+        for block_name in block_names
+        if block_name.isdecimal()
+    }
+    return {
+        block: checkpoint.points for block, checkpoint in checkpoints.items() if checkpoint.points
+    }
+
+
+def delete_checkpoints(store_path: Location, block: int | str = "*") -> None:
+    """Remove what there is of a block, or of all."""
+    for file in (store_path / JOURNAL_DIR).glob(f"{CHECKPOINT_PREFIX}{block}"):
+        file.unlink(missing_ok=True)
+
+
+def _checkpoint_path(store_path: Location, block: int) -> Location:
+    return store_path / JOURNAL_DIR / f"{CHECKPOINT_PREFIX}{block}"
+
+
+def _checkpoint_arrays(results: ReusedResults) -> dict[str, Any]:
+    return {
+        f"{part}/{name}": values
+        for part, (points, arrays) in results._asdict().items()
+        for name, values in {"points": points, **arrays}.items()
+    }
+
+
+def _content_digest(content: bytes) -> str:
+    return hashlib.blake2b(content, digest_size=16).hexdigest()
+
+
+LOCK_FILE = "lock"
+
+#: Tries at a lock in an object store that others try for, too.
+LOCK_ATTEMPTS_MAX = 5
+
+#: Seconds between heartbeats, and how old one may be before a holder on another host is doubted.
+HEARTBEAT_INTERVAL = 10.0
+HEARTBEAT_AGE_MAX = 120.0
+
+#: Seconds for which the heartbeat of such a holder is watched before it is held for dead. Its age
+#: alone may come from a clock that was set; that it does not change can't.
+SILENCE_WATCH_SECONDS = 35.0
+
+#: Bytes of a lock at most.
+LOCK_BYTES_MAX = 1 << 16
+
+#: Errors of file systems that have no flock (Lustre without it, some NFS), or no hard links (FUSE,
+#: SMB, exFAT; a file system of several disks may say that the link leads to another one).
+FLOCK_UNSUPPORTED_ERRNOS = {errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP}
+HARD_LINK_UNSUPPORTED_ERRNOS = {
+    errno.EPERM,
+    errno.ENOSYS,
+    errno.ENOTSUP,
+    errno.EOPNOTSUPP,
+    errno.EXDEV,
+    errno.EMLINK,
+}
+
+_released_tokens: set[str] = set()
+"""Tokens of locks that this process has given up, which a store out of reach may not know."""
+
+_issued_warnings: set[str] = set()
+"""Warnings about file systems that this process has given."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LockHolder:
+    """Holder of a lock."""
+
+    host: str = "unknown"
+    pid: int = 0
+    start: int = 0  # of the process, as `process_start` has it: a number is used again
+    token: str = ""
+    machine: str = ""  # hosts of one name may be many, where a store is seen from everywhere
+
+    @classmethod
+    def of_this_process(cls) -> LockHolder:
+        """Return the running process, with a token of its own."""
+        pid = os.getpid()
+        return cls(
+            host=socket.gethostname(),
+            pid=pid,
+            start=process_start_id(pid),
+            token=uuid.uuid4().hex,
+            machine=_machine_id(),
+        )
+
+    @property
+    def is_on_this_machine(self) -> bool:
+        """Tell whether its process is one of this machine, if it still runs."""
+        return self.host == socket.gethostname() and self.machine in ("", _machine_id())
+
+
+@cache
+def _machine_id() -> str:
+    """Boot and namespace in which a process number has a meaning."""
+    try:
+        boot_id = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+        return f"{boot_id} {os.readlink('/proc/self/ns/pid')}"
+    except OSError:
+        return ""
+
+
+def read_lock_holder(store_path: Location) -> LockHolder | None:
+    """Holder of the lock of a store, living or dead; None where nobody does."""
+    holder_json = _lock_of_store(store_path).read_holder_json()
+    return None if holder_json is None else _parse_lock_holder(holder_json)
+
+
+def _parse_lock_holder(holder_json: str) -> LockHolder:
+    """Holder that a lock names; one that is damaged, or of another version, as far as it does."""
+    try:
+        record = parse_json(holder_json)
+    except ValueError:
+        return LockHolder()
+    types = {field.name: type(field.default) for field in fields(LockHolder)}
+    known_fields: dict[str, Any] = {}
+    if isinstance(record, dict):
+        known_fields = {
+            name: value for name, value in record.items() if type(value) is types.get(name)
+        }
+    return LockHolder(**known_fields)
+
+
+def is_holder_alive(store_path: Location, holder: LockHolder) -> bool:
+    """Tell whether the holder of a lock runs: its process here, its heartbeat elsewhere."""
+    if (is_running := _is_running_here(holder)) is not None:
+        return is_running
+    return heartbeat_age(store_path) < HEARTBEAT_AGE_MAX
+
+
+def _is_running_here(holder: LockHolder) -> bool | None:
+    """Tell whether a holder of this machine runs; None of others, and where it can't be seen."""
+    if not (holder.is_on_this_machine and holder.start):
+        return None
+    current_start = process_start_id(holder.pid)
+    return None if current_start == HIDDEN_PROCESS else current_start == holder.start
+
+
+def heartbeat_age(store_path: Location) -> float:
+    """Age of a lock's last heartbeat [s], by the file system's clock; infinite without one."""
+    lock_path = store_path / JOURNAL_DIR / LOCK_FILE
+    probe = lock_path.with_name(f"clock-{os.getpid()}-{uuid.uuid4().hex[:8]}")
+    file_system_time: float | None = None
+    try:
+        probe.write_bytes(b"clock")
+        file_system_time = _modification_time(probe)
+    except OSError:
+        pass  # a reader of a store that it can't write to
+    finally:
+        with suppress(OSError):
+            probe.unlink()
+    heartbeat_time = _modification_time(lock_path)
+    return (
+        float("inf")
+        if heartbeat_time is None
+        else (file_system_time or time.time()) - heartbeat_time
+    )
+
+
+def _modification_time(path: Location) -> float | None:
+    if isinstance(path, ObjectPath):
+        return path.last_modified()
+    try:
+        return path.stat().st_mtime
+    except FileNotFoundError:
+        return None
+
+
+class _FileLock:
+    """A lock as a file."""
+
+    def __init__(self, lock_path: Path) -> None:
+        self._lock_path = lock_path
+
+    def read_holder_json(self) -> str | None:
+        """Text of its holder; None where nobody holds it."""
+        return _read_lock_file(self._lock_path)
+
+    def heartbeat_mark(self) -> object:
+        """Mark of the last heartbeat, another one after each."""
+        try:
+            descriptor = open_regular(
+                self._lock_path, follow_links=False
+            )  # opened: a file server is asked anew
+        except FileNotFoundError:
+            return None
+        try:
+            status = os.fstat(descriptor)
+        finally:
+            os.close(descriptor)
+        return status.st_ino, status.st_mtime_ns
+
+    def acquire(
+        self, holder_json: str, check_holder: Callable[[], None], say: Callable[[str], None]
+    ) -> None:
+        """Take it, unless `judge`, asked while no other process judges, raises."""
+        self._lock_path.parent.mkdir(exist_ok=True)
+        with self._acquisition_guard(say):  # one process at a time judges and takes
+            stale_json = self.read_holder_json()
+            check_holder()
+            self._remove_stale(stale_json)
+            new_lock_path = self._lock_path.with_name(f"lock.{uuid.uuid4().hex}")
+            atomic_write(
+                new_lock_path, holder_json.encode()
+            )  # an empty lock, after a power cut, would look alive
+            try:
+                self._create_lock_file(new_lock_path, holder_json, say)
+            except FileExistsError:
+                if (
+                    self.read_holder_json() != holder_json
+                ):  # a file server may have done it, and lost its answer
+                    raise BusyError(
+                        f"another process was quicker to lock {self._lock_path}"
+                    ) from None
+            finally:
+                new_lock_path.unlink(missing_ok=True)
+
+    @contextmanager
+    def _acquisition_guard(self, say: Callable[[str], None]) -> Iterator[None]:
+        """Keep others from judging, where the file system has such locks."""
+        guard_path = self._lock_path.with_name("lock.guard")
+        open_flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK
+        guard_descriptor = os.open(guard_path, open_flags, 0o666)
+        try:
+            if not stat.S_ISREG(os.fstat(guard_descriptor).st_mode):
+                raise RefusedFileError(errno.EINVAL, "is no plain file", str(guard_path))
+            try:
+                fcntl.flock(guard_descriptor, fcntl.LOCK_EX)
+            except OSError as error:
+                if error.errno not in FLOCK_UNSUPPORTED_ERRNOS:
+                    raise
+                _warn_once(
+                    say,
+                    f"the file system of {self._lock_path} has no flock ({error.strerror}): start "
+                    "no "
+                    "two runs of one store within the same second",
+                )
+            yield
+        finally:
+            os.close(guard_descriptor)
+
+    def _remove_stale(self, stale_json: str | None) -> None:
+        """Take the lock of a dead holder away, and no other, where nothing keeps others out."""
+        if stale_json is None:
+            return
+        aside_path = self._lock_path.with_name(f"lock.{uuid.uuid4().hex}")
+        with suppress(FileNotFoundError):
+            os.rename(self._lock_path, aside_path)
+            if _read_lock_file(aside_path) != stale_json:  # somebody was quicker
+                try:
+                    os.link(aside_path, self._lock_path)
+                except OSError:
+                    if not self._lock_path.exists():
+                        os.rename(aside_path, self._lock_path)
+            aside_path.unlink()
+
+    def _create_lock_file(
+        self, new_lock_path: Path, holder_json: str, say: Callable[[str], None]
+    ) -> None:
+        """Put the lock in its place; FileExistsError where somebody was quicker."""
+        try:
+            os.link(new_lock_path, self._lock_path)  # fails where somebody was quicker, on NFS too
+            return
+        except OSError as error:
+            if error.errno not in HARD_LINK_UNSUPPORTED_ERRNOS:
+                raise
+            reason = error.strerror
+        _warn_once(
+            say,
+            f"the file system of {self._lock_path} has no hard links ({reason}): its lock is a "
+            "file that "
+            "is made if none is there, which not every file server does in one step",
+        )
+        descriptor = os.open(self._lock_path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+        try:
+            os.write(descriptor, holder_json.encode())
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+    def send_heartbeat(self) -> None:
+        """Say that the holder lives."""
+        os.utime(self._lock_path)
+
+    def release(self) -> None:
+        """Give it up."""
+        self._lock_path.unlink(missing_ok=True)
+
+
+def _read_lock_file(lock_path: Path) -> str | None:
+    try:
+        descriptor = open_regular(lock_path, follow_links=False)
+    except FileNotFoundError:
+        return None
+    with open(descriptor, "rb") as file:
+        return file.read(LOCK_BYTES_MAX).decode("utf-8", "replace")
+
+
+def _warn_once(say: Callable[[str], None], warning: str) -> None:
+    if warning not in _issued_warnings:
+        _issued_warnings.add(warning)
+        say(f"warning: {warning}")
+
+
+class _ObjectLock:
+    """A lock as an object, changed by conditional puts: its holder, and a count of heartbeats."""
+
+    def __init__(self, lock_path: ObjectPath) -> None:
+        self._lock_path = lock_path
+        self._holder_json, self._n_heartbeats = "", 0
+        self._tag: ObjectVersion | None = None
+
+    def read_holder_json(self) -> str | None:
+        """Text of its holder; None where nobody holds it."""
+        tagged = self._lock_path.read_with_version()
+        return _first_line(tagged[0]) if tagged and tagged[0] else None
+
+    def heartbeat_mark(self) -> object:
+        """Mark of the last heartbeat, another one after each."""
+        tagged = self._lock_path.read_with_version()
+        return tagged and tagged[0]
+
+    def acquire(
+        self, holder_json: str, check_holder: Callable[[], None], say: Callable[[str], None]
+    ) -> None:
+        """Take it, unless `judge` raises."""
+        for _ in range(LOCK_ATTEMPTS_MAX):
+            tagged = self._lock_path.read_with_version()
+            if tagged and _first_line(tagged[0]) == holder_json:  # put, though its answer was lost
+                self._holder_json, self._tag = holder_json, tagged[1]
+                return
+            check_holder()
+            tag = self._lock_path.put_if_unchanged(
+                f"{holder_json}\n0\n".encode(), tagged[1] if tagged else None
+            )
+            if tag is not None:
+                self._holder_json, self._tag = holder_json, tag
+                return
+        raise ObjectStoreError(11, "others are quicker to lock it: try again", str(self._lock_path))
+
+    def send_heartbeat(self) -> None:
+        """Say that the holder lives."""
+        self._replace_content(f"{self._holder_json}\n{self._n_heartbeats + 1}\n")
+        self._n_heartbeats += 1
+
+    def release(self) -> None:
+        """Give it up."""
+        self._replace_content("")
+
+    def _replace_content(self, content: str) -> None:
+        """Put something in the place of what was last put; of what is there, where that is ours."""
+        tag = self._lock_path.put_if_unchanged(content.encode(), self._tag)
+        if tag is None:
+            tagged = self._lock_path.read_with_version()
+            if tagged and _first_line(tagged[0]) == self._holder_json:
+                tag = self._lock_path.put_if_unchanged(content.encode(), tagged[1])
+        if tag is not None:
+            self._tag = tag
+
+
+def _first_line(content: bytes) -> str:
+    return content.decode("utf-8", "replace").partition("\n")[0]
+
+
+def _lock_of_store(store_path: Location) -> _FileLock | _ObjectLock:
+    lock_path = store_path / JOURNAL_DIR / LOCK_FILE
+    return _ObjectLock(lock_path) if isinstance(lock_path, ObjectPath) else _FileLock(lock_path)
+
+
+def wait_for_stale_lock(store_path: Location, say: Callable[[str], None]) -> None:
+    """Wait until the last heartbeat of a holder elsewhere is old, or another one comes.
+
+    So a job that is started again on another node, soon after it was killed, need not be refused.
+    """
+    other_holder, heartbeat_mark = (
+        read_lock_holder(store_path),
+        _lock_of_store(store_path).heartbeat_mark(),
+    )
+    if (
+        other_holder is None
+        or other_holder.token in _released_tokens
+        or _is_running_here(other_holder) is not None
+    ):
+        return
+    seconds_left = HEARTBEAT_AGE_MAX - heartbeat_age(store_path)
+    if 0 < seconds_left <= HEARTBEAT_AGE_MAX:
+        _stays_silent(store_path, other_holder, heartbeat_mark, seconds_left, say)
+
+
+def _stays_silent(
+    store_path: Location,
+    other_holder: LockHolder,
+    heartbeat_mark: object,
+    watch_seconds: float,
+    say: Callable[[str], None],
+) -> bool:
+    """Watch a lock for some time by this process's own clock; tell whether it stayed as it was."""
+    holder_text = f"process {other_holder.pid} on {escape_to_one_line(other_holder.host)}"
+    say(
+        f"waiting up to {watch_seconds:.0f} s to see whether {holder_text}, "
+        f"which has locked {store_path}, still lives"
+    )
+    end_time, lock = time.monotonic() + watch_seconds, _lock_of_store(store_path)
+    while (seconds_left := end_time - time.monotonic()) > 0:
+        time.sleep(min(1.0, seconds_left, watch_seconds / 10))
+        if (read_lock_holder(store_path), lock.heartbeat_mark()) != (other_holder, heartbeat_mark):
+            return False
+    return True
+
+
+class StoreLock:
+    """A store's lock, held and kept alive until released.
+
+    BusyError where a living driver holds it, StoreError where the store can't be written. ``say``
+    is told what a user should know: by default it warns.
+    """
+
+    def __init__(self, store_path: Location, say: Callable[[str], None] = warnings.warn) -> None:
+        self._store_path, self._lock = store_path, _lock_of_store(store_path)
+        self._own_holder = LockHolder.of_this_process()
+        self._is_released = threading.Event()
+        with raise_as_store_error(f"{store_path} can't be locked"):
+            self._silent_state = self._watch_other_holder(say)
+            self._lock.acquire(
+                json.dumps(asdict(self._own_holder)), self._refuse_living_holder, say
+            )
+        self._heartbeat_thread = threading.Thread(
+            target=self._send_heartbeats, name="lock-heartbeat", daemon=True
+        )
+        self._heartbeat_thread.start()
+
+    def _watch_other_holder(self, say: Callable[[str], None]) -> object:
+        """Watch the heartbeat of a holder elsewhere; return what its lock was, if it is silent."""
+        other_holder, heartbeat_mark = (
+            read_lock_holder(self._store_path),
+            self._lock.heartbeat_mark(),
+        )
+        if (
+            other_holder is None
+            or other_holder.token in _released_tokens
+            or _is_running_here(other_holder) is not None
+        ):
+            return None
+        is_doubtful = not 0 <= heartbeat_age(self._store_path) < HEARTBEAT_AGE_MAX
+        if is_doubtful and _stays_silent(
+            self._store_path, other_holder, heartbeat_mark, SILENCE_WATCH_SECONDS, say
+        ):
+            return other_holder, heartbeat_mark
+        raise self._busy_error(other_holder)
+
+    def _refuse_living_holder(self) -> None:
+        other_holder = read_lock_holder(self._store_path)
+        if (
+            other_holder is None
+            or other_holder.token in _released_tokens
+            or _is_running_here(other_holder) is False
+        ):
+            return
+        if self._silent_state is None or self._silent_state != (
+            other_holder,
+            self._lock.heartbeat_mark(),
+        ):
+            raise self._busy_error(other_holder)
+
+    def _busy_error(self, other_holder: LockHolder) -> BusyError:
+        holder_text = (
+            f"process {escape_to_one_line(other_holder.pid)} on "
+            f"{escape_to_one_line(other_holder.host)}"
+        )
+        return BusyError(
+            f"{self._store_path} is being written by {holder_text}: "
+            f"wait for it, or stop it; {suggestion('status', self._store_path)} shows how far it is"
+        )
+
+    def _send_heartbeats(self) -> None:
+        while not self._is_released.wait(HEARTBEAT_INTERVAL):
+            with suppress(OSError):
+                if self.is_held():
+                    self._lock.send_heartbeat()
+
+    def is_held(self) -> bool:
+        """Tell whether the lock is still this driver's."""
+        current_holder = read_lock_holder(self._store_path)
+        return current_holder is not None and current_holder.token == self._own_holder.token
+
+    def __enter__(self) -> StoreLock:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.release()
+
+    def release(self) -> None:
+        """Give the lock up, if it is still ours."""
+        self._is_released.set()
+        self._heartbeat_thread.join()
+        _released_tokens.add(self._own_holder.token)
+        with suppress(OSError):
+            if self.is_held():
+                self._lock.release()

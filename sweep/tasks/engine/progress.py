@@ -1,0 +1,322 @@
+"""Words to whoever runs a study: errors; a bar in a terminal, or plain lines."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import IO, TYPE_CHECKING, Any, cast
+
+from sweep.messages import PrintableError, escape_unprintable
+from sweep.regular_files import RefusedFileError
+from sweep.storage.store_format import StoreError as StoreError
+from sweep.tasks.engine.text_streams import PatientStream, is_terminal
+
+if TYPE_CHECKING:
+    from rich.progress import TaskID
+
+#: Seconds between lines without a terminal.
+LINE_INTERVAL = 30.0
+
+#: Times a second that a bar is drawn, each some ms of the driver's time.
+BAR_REFRESH_RATE = 4.0
+
+#: Columns of a terminal that has room for workers and bytes beside a bar.
+WIDE_TERMINAL_COLUMNS = 100
+
+#: Seconds before anything is shown of what is mostly over by then.
+ACTIVITY_SILENT_SECONDS = 2.0
+
+_logger = logging.getLogger("sweep")
+
+
+class TaskError(PrintableError):
+    """A study that can't be run as asked: the text says why and what to do."""
+
+
+class BusyError(StoreError):
+    """A store that another process writes to."""
+
+
+class ClusterError(TaskError):
+    """A scheduler or workers that can't be had."""
+
+
+class CodeError(TaskError):
+    """A function of the user's that may not run, can't be imported, or answers wrongly."""
+
+
+class SchedulerLostError(Exception):
+    """A scheduler that went away with work still out; what was committed stays."""
+
+
+@contextmanager
+def raise_as_store_error(problem: str) -> Iterator[None]:
+    """Say what can't be done where the disk, or an object store, raises."""
+    try:
+        yield
+    except RefusedFileError as error:
+        raise StoreError(f"{problem}: {error}") from error
+    except OSError as error:
+        raise StoreError(f"{problem}: {error.strerror or error}") from error
+
+
+class Progress:
+    """Listener to a run, told of how far it is; this one shows nothing."""
+
+    def begin(self, *, points: int, done: float, unit: str) -> None:
+        """Begin a run, with so many points of the study done already, some in part."""
+
+    def advance(self, *, points: float, failed: int) -> None:
+        """Points that were computed and blocks that were given up; both 0 as time passes."""
+
+    def at_work(self, *, workers: int, stored: int) -> None:
+        """Workers that there are, and bytes that are stored; told before `advance`."""
+
+    def say(self, text: str) -> None:
+        """Something to know, in words."""
+
+    def end(self) -> None:
+        """End the run."""
+
+
+def make_progress(progress: bool | Progress) -> Progress:
+    """Return the progress asked for: none, the one given, or a display on standard error."""
+    if progress is True:
+        return ProgressBar() if is_terminal(sys.stderr) else ProgressLines()
+    if progress is False:
+        return Progress()
+    return progress if isinstance(progress, _GuardedListener) else _GuardedListener(progress)
+
+
+class _GuardedListener(Progress):
+    """A listener of the user's, which is told nothing more once it has raised an error."""
+
+    def __init__(self, listener: Progress) -> None:
+        self._listener, self._has_failed = listener, False
+
+    def _call_listener(self, method: str, *values: Any, **keywords: Any) -> None:
+        if self._has_failed:
+            return
+        try:
+            getattr(self._listener, method)(*values, **keywords)
+        except Exception as error:
+            self._has_failed = True
+            _logger.warning(
+                "the listener to the progress failed in %s (%s: %s): the run goes on without it",
+                method, type(error).__name__, error,
+            )  # fmt: skip
+
+    def begin(self, **keywords: Any) -> None:
+        self._call_listener("begin", **keywords)
+
+    def advance(self, **keywords: Any) -> None:
+        self._call_listener("advance", **keywords)
+
+    def at_work(self, **keywords: Any) -> None:
+        self._call_listener("at_work", **keywords)
+
+    def say(self, text: str) -> None:
+        self._call_listener("say", text)
+
+    def end(self) -> None:
+        self._call_listener("end")
+
+
+@contextmanager
+def show_activity(activity: str, progress: Progress | None = None) -> Iterator[None]:
+    """Say from the third second on that something goes on, or that kernels are compiled."""
+    from numba.core.event import install_recorder
+
+    listener, start_time, is_over = (
+        progress or make_progress(True),
+        time.monotonic(),
+        threading.Event(),
+    )
+
+    def activity_text() -> str:
+        n_compiled = sum(event.is_end for _, event in compile_events.buffer)
+        is_compiling = len(compile_events.buffer) > 2 * n_compiled
+        compiling_text = f"compiling the model, once; functions so far: {n_compiled}"
+        return (
+            f"{compiling_text if is_compiling else activity}, "
+            f"{duration_text(time.monotonic() - start_time)}"
+        )
+
+    def report() -> None:
+        delay = ACTIVITY_SILENT_SECONDS
+        while not is_over.wait(delay):
+            if isinstance(listener, ProgressBar):
+                with listener.console.status(activity_text()) as status:
+                    while not is_over.wait(1 / BAR_REFRESH_RATE):
+                        status.update(activity_text())
+            else:
+                listener.say(activity_text())
+                delay = min(2 * delay, LINE_INTERVAL)
+
+    with install_recorder("numba:compile") as compile_events:
+        reporter_thread = threading.Thread(target=report, daemon=True)
+        reporter_thread.start()
+        try:
+            yield
+        finally:
+            is_over.set()
+            reporter_thread.join()
+
+
+class _CountingProgress(Progress):
+    """Progress that adds up what it is told."""
+
+    def __init__(self) -> None:
+        self._n_points = self._n_failed = 0
+        self._points_done = self._points_before = 0.0
+        self._points_noun, self._workers_text = "points", ""
+        self._start_time = time.monotonic()
+
+    def begin(self, *, points: int, done: float, unit: str) -> None:
+        self._n_points, self._points_done, self._points_before, self._points_noun = (
+            points,
+            done,
+            done,
+            unit,
+        )
+        self._start_time = time.monotonic()
+        self._show(is_start=True)
+
+    def advance(self, *, points: float, failed: int) -> None:
+        self._points_done += points
+        self._n_failed += failed
+        self._show()
+
+    def _show(self, *, is_start: bool = False) -> None:
+        """Show how far it is."""
+
+    def at_work(self, *, workers: int, stored: int) -> None:
+        from rich.filesize import decimal
+
+        count = f"{workers:,} worker{'' if workers == 1 else 's'}"
+        self._workers_text = f"{count}, {decimal(stored)} stored"
+
+    @property
+    def _rate(self) -> float:
+        """Points a second of this run."""
+        return (self._points_done - self._points_before) / max(
+            time.monotonic() - self._start_time, 1e-9
+        )
+
+    @property
+    def _column_texts(self) -> dict[str, Any]:
+        """All of it in words, by the names of a bar's columns."""
+        return {
+            "done": amount_text(self._points_done),
+            "rate": f"{amount_text(self._rate)} {self._points_noun}/s" if self._rate > 0 else "",
+            "work": self._workers_text,
+            "failures": f"{self._n_failed} blocks failed" if self._n_failed else "",
+        }
+
+
+class ProgressLines(_CountingProgress):
+    """One line at the start, every 30 s and at the end, for logs."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._printed_at = time.monotonic()
+        self._stream = PatientStream(sys.stderr)
+
+    def _show(self, *, is_start: bool = False) -> None:
+        if is_start or time.monotonic() - self._printed_at >= LINE_INTERVAL:
+            self.end()
+
+    def say(self, text: str) -> None:
+        """Print a line of its own."""
+        print(escape_unprintable(text), file=self._stream, flush=True)
+
+    def end(self) -> None:
+        """Say how far it is."""
+        self._printed_at = time.monotonic()
+        done_text, rate_text, workers_text, failures_text = self._column_texts.values()
+        seconds_left = (self._n_points - self._points_done) / self._rate if self._rate > 0 else 0.0
+        parts = [f"{done_text} of {self._n_points:,} {self._points_noun}", rate_text]
+        parts += [
+            f"{duration_text(seconds_left)} left" if seconds_left > 0 else "",
+            workers_text,
+            failures_text,
+        ]
+        self.say(", ".join(filter(None, parts)))
+
+
+class ProgressBar(_CountingProgress):
+    """A bar with points, rate, time left, workers, bytes and failures, on standard error."""
+
+    def __init__(self) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+        from rich.table import Column
+
+        super().__init__()
+        self.console = Console(file=cast("IO[str]", PatientStream(sys.stderr)))
+
+        def text_column(text: str) -> TextColumn:
+            return TextColumn(text, table_column=Column())  # folded where others would be cut
+
+        workers_column = (
+            [text_column("{task.fields[work]}")]
+            if self.console.width >= WIDE_TERMINAL_COLUMNS
+            else []
+        )
+        self._bar = Progress(
+            BarColumn(bar_width=min(40, max(self.console.width - WIDE_TERMINAL_COLUMNS, 8))),
+            text_column("{task.fields[done]} of {task.total:,.0f} {task.description}"),
+            text_column("{task.fields[rate]}"),
+            TimeRemainingColumn(compact=True),
+            *workers_column,
+            text_column("[red]{task.fields[failures]}"),
+            console=self.console,
+            refresh_per_second=BAR_REFRESH_RATE,
+        )
+        self._task: TaskID | None = None
+
+    def _show(self, *, is_start: bool = False) -> None:
+        if is_start:
+            self._task = self._bar.add_task(
+                self._points_noun,
+                total=self._n_points,
+                completed=int(self._points_done),
+                **self._column_texts,
+            )
+            self._bar.start()
+        if self._task is not None:
+            self._bar.update(self._task, completed=self._points_done, **self._column_texts)
+
+    def say(self, text: str) -> None:
+        """Print a line above the bar."""
+        self.console.print(escape_unprintable(text), markup=False, highlight=False, soft_wrap=True)
+
+    def end(self) -> None:
+        """Leave the bar as it is."""
+        self._bar.stop()
+
+
+def amount_text(points: float) -> str:
+    """Points in words: `4,500`, or `0.31` where one is drawn in part; a low rate in two digits."""
+    if points >= 10 or abs(points - round(points)) < 1e-6:
+        return f"{points:,.0f}"
+    return f"{points:.2g}"
+
+
+def duration_text(seconds: float) -> str:
+    """Put a time into words: `0.3 s`, `45 s`, `3 min 20 s`, `5 h 02 min`, `5,950 years`."""
+    if seconds < 0.95:
+        return f"{max(seconds, 0.0):.1g} s"
+    whole_seconds = int(seconds + 0.5)
+    if whole_seconds < 60:
+        return f"{whole_seconds} s"
+    if whole_seconds < 3600:
+        return f"{whole_seconds // 60} min {whole_seconds % 60:02d} s"
+    if whole_seconds < 2 * 86400:
+        return f"{whole_seconds // 3600} h {whole_seconds % 3600 // 60:02d} min"
+    days = seconds / 86400
+    return f"{days:,.0f} days" if days < 2 * 365 else f"{days / 365.25:,.0f} years"

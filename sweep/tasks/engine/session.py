@@ -1,0 +1,739 @@
+"""One run over what a store lacks: where to compute, answers committed, an outcome at its end."""
+
+from __future__ import annotations
+
+import gc
+import logging
+import math
+import os
+import re
+import socket
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field, fields
+from functools import partial
+from numbers import Integral
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sweep.messages import option_text
+from sweep.spec import GridSpec
+from sweep.spec.cluster_config import (
+    DASHBOARD_PORT,
+    NO_DASHBOARD,
+    AnyClusterConfig,
+    ClusterConfig,
+    ExistingSchedulerConfig,
+    KubernetesClusterConfig,
+    LocalClusterConfig,
+    LocalWorkerConfig,
+    WorkerBounds,
+    cluster_config_from_mapping,
+    load_cluster_config,
+)
+from sweep.spec.rules import suggest_similar_name
+from sweep.spec.sections import Execution
+from sweep.storage.locations import Location, ObjectStoreError, os_error_reason, write_remedy
+from sweep.storage.store_format import read_receipt_totals
+from sweep.tasks.engine import journal, study_store
+from sweep.tasks.engine.blocks import (
+    BlockEvaluator,
+    BlockStudy,
+    user_functions,
+    worst_cpu_seconds_per_point,
+)
+from sweep.tasks.engine.interrupts import InterruptHandler
+from sweep.tasks.engine.journal import (
+    ChunkScan,
+    Failure,
+    Journal,
+    Receipt,
+    StoreLock,
+    permanently_failed,
+)
+from sweep.tasks.engine.progress import (
+    ClusterError,
+    Progress,
+    SchedulerLostError,
+    StoreError,
+    TaskError,
+    duration_text,
+    make_progress,
+    show_activity,
+)
+from sweep.tasks.engine.worker import (
+    IDLE_POLL_SECONDS,
+    BlockQueue,
+    ReceiptVerifier,
+    TaskResult,
+    TaskSettings,
+    run_serial,
+)
+from sweep.tasks.studies.memory_limits import (
+    refuse_too_large_point,
+    refuse_too_large_study,
+    serial_worker_memory,
+    worker_memory,
+)
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+    from sweep.spec import SceneSpec
+    from sweep.tasks.engine.cluster_connection import ClusterConnection
+    from sweep.tasks.studies.flight_study import FlightStudy
+    from sweep.tasks.studies.grid_study import GridStudy
+
+#: Scheduler "address" of the plain loop.
+SERIAL_SCHEDULER = "none"
+
+#: Work that is done here and at once, where nobody says otherwise [s of one core]: workers take
+#: some seconds to start.
+SERIAL_CPU_SECONDS_MAX = 10.0
+
+#: Seconds of a core that a ray, and a draw of a shot, take at the most, about.
+CPU_SECONDS_PER_RAY, CPU_SECONDS_PER_SHOT = 5e-6, 4e-4
+
+#: Blocks that may fail before any succeeds: beyond, the fault is not in the blocks.
+MAX_INITIAL_FAILURES = 20
+
+#: Seconds for which a run waits to see that what is committed is there; of more files it begins
+#: with what the log says, and looks on meanwhile.
+CHUNK_SCAN_TIMEOUT = 2.0
+
+#: Seconds without any worker after which that is said.
+NO_WORKER_WARNING_AFTER = 20.0
+
+#: Figures of receipts that a run adds up.
+RECEIPT_TOTALS = ("points", "taken", "bytes", "seconds", "write_seconds")
+
+_logger = logging.getLogger("sweep.session")
+
+CHECKPOINT_LOST_MESSAGE = (
+    "block {} is computed in pieces, and what one worker saved was not found by the next: "
+    "do all of them see the same store?"
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions:
+    """Ways to compute a study; nothing of them shows in the results.
+
+    Parameters
+    ----------
+    client
+        Dask client to compute with; without one, `scheduler` and `workers` say what to use. By
+        default little work is done here, in a plain loop, and more of it by workers on all cores of
+        this machine.
+    workers, processes
+        Workers to start on this machine, as processes or as threads.
+    scheduler
+        Address of a Dask scheduler, or "none" for a plain loop in this process.
+    cluster
+        The file that describes a cluster, or what such a file holds; `workers` fixes how many.
+    progress
+        True for a bar or lines on standard error, False for none, or a `Progress`.
+    block_timeout
+        Seconds that a block may take; beyond, it is tried once more and then given up.
+    durable
+        Whether blocks are on the disk, and not only with the operating system, once committed: a
+        power failure then loses none of them.
+    retry_failed
+        Whether to try blocks again that were given up, for their errors, in an earlier run.
+    performance_report
+        HTML file to put Dask's own account of the run into.
+    dashboard
+        Whether the workers that are started have Dask's dashboard, on a port of this machine alone.
+        It has no password: all users of this machine can see it.
+    allow_code
+        Python modules whose detectors and estimators the study may run, here and on its workers.
+    evaluate
+        What computes a block in place of the model, with the same results; for instrumenting.
+    """
+
+    client: Client | None = None
+    workers: int | None = None
+    processes: bool = True
+    scheduler: str | None = None
+    cluster: str | Path | Mapping[str, Any] | AnyClusterConfig | None = None
+    progress: bool | Progress = True
+    block_timeout: float | None = None
+    durable: bool = False
+    retry_failed: bool = False
+    performance_report: str | Path | None = None
+    dashboard: bool = False
+    allow_code: Sequence[str] = ()
+    evaluate: BlockEvaluator | None = None
+
+    def __post_init__(self) -> None:
+        is_integer = isinstance(self.workers, Integral) and not isinstance(self.workers, bool)
+        if self.workers is not None and not (is_integer and self.workers > 0):
+            raise ClusterError(f"workers must be a whole number above 0, not {self.workers!r}")
+        if self.scheduler not in (None, SERIAL_SCHEDULER) and not _is_address(self.scheduler):
+            raise ClusterError(
+                f"{self.scheduler!r} is no address of a Dask scheduler: write e.g. "
+                f"'tcp://10.0.0.5:8786', or '{SERIAL_SCHEDULER}' for a plain loop here"
+            )
+        timeout = self.block_timeout
+        if timeout is not None and not (isinstance(timeout, int | float) and timeout > 0):
+            raise TaskError(f"block_timeout must be a number of seconds above 0, not {timeout!r}")
+        if self.allow_code:
+            from sweep.tasks.studies.user_functions import allow_modules
+
+            allow_modules(
+                [self.allow_code] if isinstance(self.allow_code, str) else self.allow_code
+            )
+
+    @classmethod
+    def from_mapping(cls, options: Mapping[str, Any]) -> RunOptions:
+        """Options by name; a TypeError with the nearest name for one that there isn't."""
+        names = [field.name for field in fields(cls)]
+        for name in options.keys() - set(names):
+            raise TypeError(
+                f"there is no option {name!r}; {suggest_similar_name(name, names)}".rstrip("; ")
+            )
+        return cls(**options)
+
+    def resolve_cluster(self, spec: GridSpec | SceneSpec) -> AnyClusterConfig | None:
+        """Return the cluster given here or by the spec's `execution`; None for a plain loop.
+
+        ClusterError where both a scheduler and a cluster are named, or workers that are not
+        ours to start.
+        """
+        if self.cluster is not None:
+            if self.scheduler is not None:
+                raise ClusterError("a scheduler and a cluster are both named: leave out one")
+            cluster = self.cluster
+            if not isinstance(cluster, ClusterConfig):
+                cluster = (
+                    cluster_config_from_mapping(cluster)
+                    if isinstance(cluster, Mapping)
+                    else load_cluster_config(cluster)
+                )
+            return self._with_dashboard(_with_worker_count(cluster, self.workers))
+        scheduler, execution = self.scheduler, spec.execution
+        if scheduler is None and self.workers is None:
+            scheduler = execution.scheduler or None
+        if scheduler == SERIAL_SCHEDULER and self.dashboard:
+            raise ClusterError(
+                f"a plain loop has no dashboard: leave out {option_text('dashboard')}"
+            )
+        if scheduler == SERIAL_SCHEDULER or (scheduler is None and self._prefers_serial(spec)):
+            return None
+        if scheduler is not None:
+            if self.dashboard:
+                raise ClusterError(
+                    f"the scheduler {scheduler} runs already: leave out {option_text('dashboard')}"
+                )
+            return ExistingSchedulerConfig.model_construct(
+                kind="scheduler", address=scheduler, security=None
+            )
+        local_cluster = LocalClusterConfig(
+            kind="local", worker=LocalWorkerConfig(threads=execution.threads)
+        )
+        return self._with_dashboard(
+            _with_worker_count(local_cluster, self.workers or execution.workers or None)
+        )
+
+    def _with_dashboard(self, cluster: AnyClusterConfig) -> AnyClusterConfig:
+        """Give a cluster that is started here a dashboard, if one is asked for."""
+        if not self.dashboard:
+            return cluster
+        if isinstance(cluster, ExistingSchedulerConfig | KubernetesClusterConfig):
+            raise ClusterError(
+                "the scheduler is not started on this machine: leave out "
+                f"{option_text('dashboard')}"
+            )
+        if cluster.scheduler.dashboard != NO_DASHBOARD:
+            return cluster
+        scheduler = cluster.scheduler.model_copy(update={"dashboard": str(DASHBOARD_PORT)})
+        return cluster.model_copy(update={"scheduler": scheduler})
+
+    def _prefers_serial(self, spec: GridSpec | SceneSpec) -> bool:
+        """Tell whether nothing is said that takes workers, and the work takes none."""
+        asks_for_workers = (
+            self.workers or self.block_timeout or self.performance_report or self.evaluate
+        )
+        if (
+            asks_for_workers
+            or self.dashboard
+            or not self.processes
+            or spec.execution != Execution()
+        ):
+            return False
+        return (
+            not any(user_functions(spec)) and estimate_cpu_seconds(spec) <= SERIAL_CPU_SECONDS_MAX
+        )
+
+
+def _is_address(address: object) -> bool:
+    """Tell whether a text is an address of a Dask scheduler, with or without a protocol."""
+    return isinstance(address, str) and bool(
+        re.fullmatch(r"(\w+://)?[^\s/:]\S*:\d+|inproc://.+", address)
+    )
+
+
+def _with_worker_count(cluster: AnyClusterConfig, n_workers: int | None) -> AnyClusterConfig:
+    """Fix the number of workers of a cluster, if one is given and they are ours."""
+    if n_workers is None:
+        return cluster
+    if isinstance(cluster, ExistingSchedulerConfig):
+        raise ClusterError(
+            f"the workers of {cluster.address} are there already: leave out their number"
+        )
+    return cluster.model_copy(update={"workers": WorkerBounds(n_workers, n_workers)})
+
+
+def estimate_cpu_seconds(spec: GridSpec | SceneSpec) -> float:
+    """Time of one core that a study takes, about [s]; infinite if rays follow a tolerance."""
+    n_axis_points = math.prod(int(axis.size) for axis in spec.axes)
+    if isinstance(spec, GridSpec):
+        return n_axis_points * worst_cpu_seconds_per_point(spec)
+    if spec.is_ray_number_set_by_tolerance:
+        return math.inf
+    n_shots = sum(
+        spec.number_of_cycles(scanner) * spec.shots_per_cycle(scanner) for scanner in spec.scanners
+    )
+    rays_per_shot = float(spec.parameters()["footprint.beamlets"])
+    return n_shots * (
+        rays_per_shot * CPU_SECONDS_PER_RAY
+        + n_axis_points * int(spec.draws.number) * CPU_SECONDS_PER_SHOT
+    )
+
+
+class ComputeBackend(ExitStack):
+    """A place in use: its workers serve one study after another, and end with it."""
+
+    def __init__(self, options: RunOptions, spec: GridSpec | SceneSpec) -> None:
+        super().__init__()
+        self.options, self.progress = options, make_progress(options.progress)
+        self.interrupts = InterruptHandler(self.progress)
+        self._cluster, self._spec = options.resolve_cluster(spec), spec
+        self.memory = (
+            serial_worker_memory()
+            if self.is_serial
+            else worker_memory(options.client, self._cluster)
+        )
+        refuse_too_large_point(spec, self.memory)
+        self.study: GridStudy | FlightStudy | None = None  # once it is known
+        self.max_workers = 1  # blocks of the study: more workers than that have nothing to do
+        self._connection: ClusterConnection | None = None
+
+    @property
+    def is_serial(self) -> bool:
+        """Tell whether blocks are computed in a plain loop, without workers."""
+        return self.options.client is None and self._cluster is None
+
+    @property
+    def uses_running_scheduler(self) -> bool:
+        """Tell whether the workers are those of a scheduler that runs already."""
+        return self.options.client is None and isinstance(self._cluster, ExistingSchedulerConfig)
+
+    def connect(self) -> ClusterConnection:
+        """Reach the workers, no more than `most`; ClusterError where there are none to be had."""
+        from sweep.tasks.engine.cluster_connection import (
+            ClusterConnection,
+            connect_cluster,
+            write_performance_report,
+        )
+
+        if self._connection is None:
+            client = self.options.client
+            if client is None:
+                assert self._cluster is not None
+                self._connection = self.enter_context(
+                    connect_cluster(
+                        self._cluster,
+                        max_workers=self.max_workers,
+                        processes=self.options.processes,
+                        say=self.progress.say,
+                    )
+                )
+                if self.uses_running_scheduler and self.study is not None:
+                    # Its workers are known from here on.
+                    refuse_too_large_study(self.study, worker_memory(self._connection.client, None))
+            elif client.asynchronous:
+                raise ClusterError("the client is asynchronous: give one of another kind, Client()")
+            else:
+                self._connection = ClusterConnection(client, 0)
+            if report_path := self.options.performance_report:
+                report_context = write_performance_report(
+                    self._connection.client, Path(report_path), self.progress.say
+                )
+                self.enter_context(report_context)
+        return self._connection
+
+    def iter_results(
+        self,
+        store_path: str,
+        study_id: str,
+        block_queue: BlockQueue,
+        verify_receipt: ReceiptVerifier,
+    ) -> Iterator[TaskResult]:
+        """Answers of a study's blocks as they arrive; `seen` tells what is in the store here."""
+        options = self.options
+        settings = TaskSettings(
+            store_path,
+            study_id,
+            options.evaluate,
+            options.block_timeout,
+            options.durable,
+            self._user_code_digests(),
+        )
+        if self.is_serial:
+            _logger.info("blocks are computed in this process, one after the other")
+            if options.performance_report is not None:
+                self.progress.say(
+                    "no performance report: a plain loop has no scheduler to tell of it"
+                )
+            return run_serial(
+                settings, block_queue, lambda: self.interrupts.is_stopping, verify_receipt
+            )
+        from sweep.tasks.engine.dispatcher import TaskDispatcher
+
+        client, expected_slots, _ = self.connect()
+        _logger.info("blocks are computed by the workers of %s", client)
+        dispatcher = TaskDispatcher(
+            client,
+            expected_slots,
+            settings,
+            block_queue,
+            verify_receipt=verify_receipt,
+            say=self.progress.say,
+        )
+        return dispatcher.iter_results(lambda: self.interrupts.is_stopping)
+
+    def _user_code_digests(self) -> tuple[tuple[str, str], ...]:
+        """Modules of the user's whose functions the study names, and their digests."""
+        if not any(user_functions(self._spec)):
+            return ()
+        from sweep.tasks.studies.user_functions import allowed_module_digests
+
+        return tuple(allowed_module_digests(self._spec).items())
+
+    def restart_workers(self) -> None:
+        """Start workers of this machine again that are gone."""
+        if self._connection is not None:
+            self._connection.restart_workers()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """Result of a run."""
+
+    store: Location
+    unit: str  # what the points are called
+    points: int  # of the whole study
+    blocks: int
+    points_done: int  # committed, in this run or before
+    blocks_done: int
+    points_computed: int  # in this run; not those that a smaller study's store had
+    blocks_computed: int
+    failures: tuple[Failure, ...]
+    left_out: int  # blocks that were given up before and not tried again
+    stopped: str  # why the run ended before its blocks did; empty where it didn't
+    seconds: float  # wall time of this run
+    work_seconds: float  # evaluating and writing, summed over workers
+    write_seconds: float  # the writing in it
+    rays: Mapping[str, int] = field(default_factory=dict)  # cast in this run, by scanner
+
+    @property
+    def complete(self) -> bool:
+        """Tell whether every block of the study is committed."""
+        return self.blocks_done == self.blocks
+
+    @property
+    def why(self) -> str:
+        """Why blocks are missing, in words; empty if the study is complete."""
+        if self.complete:
+            return ""
+        if self.stopped:
+            return self.stopped
+        if not self.failures:
+            retry = option_text("retry_failed")
+            return f"{_blocks_text(self.left_out)} failed before; {retry} tries them again"
+        return f"{_blocks_text(len(self.failures))} failed, the first with {self.failures[0].error}"
+
+
+def _blocks_text(count: int) -> str:
+    """Put a number of blocks into words."""
+    return f"{count:,} block{'' if count == 1 else 's'}"
+
+
+class NoWorkerMonitor:
+    """Says when a cluster has had no worker for long, again after twice as long, and so on."""
+
+    def __init__(self) -> None:
+        self._last_seen, self._has_had_workers, self._warn_after = (
+            time.monotonic(),
+            False,
+            NO_WORKER_WARNING_AFTER,
+        )
+
+    def message(self, n_workers: int, *, has_receipts: bool = False) -> str:
+        """Words for so many workers now, mostly none; ``has_receipts``: one has answered since."""
+        if n_workers or has_receipts:
+            self._last_seen, self._has_had_workers, self._warn_after = (
+                time.monotonic(),
+                True,
+                NO_WORKER_WARNING_AFTER,
+            )
+        seconds_without_worker = time.monotonic() - self._last_seen
+        if seconds_without_worker < self._warn_after:
+            return ""
+        self._warn_after *= 2
+        situation = "no worker is left" if self._has_had_workers else "no worker yet"
+        return (
+            f"{situation} ({duration_text(seconds_without_worker)}): the cluster has none ready; "
+            "Ctrl-C stops, nothing is lost"
+        )
+
+
+class Session:
+    """One run over what a store lacks, whose lock this process holds."""
+
+    def __init__(
+        self, store_path: Location, study: BlockStudy, backend: ComputeBackend, lock: StoreLock
+    ) -> None:
+        self._store_path, self._study, self._backend, self._lock = store_path, study, backend, lock
+        self._progress, self._interrupts = backend.progress, backend.interrupts
+        try:
+            self._journal = Journal(store_path, durable=backend.options.durable)
+        except OSError as error:
+            raise StoreError(write_failure_text(store_path, error)) from error
+        self._receipt_totals: dict[str, float] = defaultdict(
+            float
+        )  # what receipts of this run come to
+        self._permanent_failures: list[Failure] = []
+        self._unflushed_receipts: list[
+            Receipt
+        ] = []  # committed as soon as the journal has written them
+        self._bytes_before = 0  # bytes that there were before
+        self._checkpoint_points: dict[int, float] = {}  # points there are of unfinished blocks
+
+    def run(
+        self, *, prior_stop_reason: str = "", rays_by_scanner: Mapping[str, int] | None = None
+    ) -> Outcome:
+        """Compute all that is left; ``prior_stop_reason``: why what comes before is not there."""
+        start_time = time.monotonic()
+        self._checkpoint_points = journal.checkpoint_points(self._store_path, self._study.id)
+        receipts = read_receipt_totals(self._store_path, self._study.n_blocks)
+        self._bytes_before = int(receipts.bytes_by_block.sum())
+        chunk_scan = ChunkScan(self._store_path, self._study, receipts.points_by_block > 0)
+        try:
+            chunk_scan.wait(CHUNK_SCAN_TIMEOUT)
+            is_done = chunk_scan.complete_blocks()
+            is_settled = is_done.copy()
+            if not self._backend.options.retry_failed:
+                is_settled[list(permanently_failed(self._store_path, is_done.size))] = True
+            n_blocks_skipped = int(np.count_nonzero(is_settled & ~is_done))
+            _logger.info(
+                "%s: study %s of %s blocks, %s done before, %s left out for their errors",
+                self._store_path,
+                self._study.id,
+                is_done.size,
+                np.count_nonzero(is_done),
+                n_blocks_skipped,
+            )
+            stop_reason = (
+                self._record_event("begun", host=socket.gethostname(), pid=os.getpid())
+                or prior_stop_reason
+            )
+            stop_reason = (
+                stop_reason
+                or self._compute_blocks(is_settled, is_done)
+                or self._finish_chunk_scan(chunk_scan, is_done)
+            )
+            is_done &= chunk_scan.complete_blocks()
+        finally:
+            chunk_scan.stop()
+        study, totals = self._study, self._receipt_totals
+        outcome = Outcome(
+            store=self._store_path,
+            unit=study.points_noun,
+            points=study.n_points,
+            blocks=study.n_blocks,
+            points_done=study.count_points(is_done) + int(totals["points"]),
+            blocks_done=int(np.count_nonzero(is_done)) + int(totals["blocks"]),
+            points_computed=int(totals["points"] - totals["taken"]),
+            blocks_computed=int(totals["blocks"]),
+            failures=tuple(self._permanent_failures),
+            left_out=n_blocks_skipped,
+            stopped=stop_reason,
+            seconds=time.monotonic() - start_time,
+            work_seconds=totals["seconds"],
+            write_seconds=totals["write_seconds"],
+            rays=rays_by_scanner or {},
+        )
+        _logger.info(
+            "%s: %s blocks computed in %s, %s failed%s",
+            self._store_path,
+            outcome.blocks_computed,
+            duration_text(outcome.seconds),
+            len(outcome.failures),
+            f"; stopped: {stop_reason}" if stop_reason else "",
+        )
+        if outcome.complete:
+            study_store.remove_partial_files(self._store_path)
+            journal.delete_checkpoints(self._store_path)
+        self._record_event(
+            "ended",
+            blocks=outcome.blocks_computed,
+            failed=len(outcome.failures),
+            stopped=stop_reason,
+        )
+        return outcome
+
+    def _record_event(self, event: str, **details: Any) -> str:
+        """Put down what happened to the run; why that can't be, where it can't."""
+        try:
+            self._journal.record_run_event(event, **details)
+        except OSError as error:
+            return write_failure_text(self._store_path, error)
+        return ""
+
+    def _finish_chunk_scan(self, chunk_scan: ChunkScan, is_done: np.ndarray) -> str:
+        """See the look at what was done to its end, and compute what of it is not there."""
+        if not chunk_scan.wait(CHUNK_SCAN_TIMEOUT):
+            self._progress.say("looking whether the chunks of what was done before are there")
+        while not chunk_scan.wait(CHUNK_SCAN_TIMEOUT):
+            if self._interrupts.is_stopping:
+                return "interrupted"
+        is_settled = chunk_scan.complete_blocks() | ~is_done
+        return self._compute_blocks(is_settled, is_settled & is_done)
+
+    def _compute_blocks(self, is_settled: np.ndarray, is_done: np.ndarray) -> str:
+        """Compute all blocks but those that are settled; why it ended before, where it did."""
+        if is_settled.all():
+            return ""
+        block_queue = BlockQueue(is_settled)
+        points_before = self._study.count_points(is_done) + self._receipt_totals["points"]
+        with ExitStack() as stack:
+            try:
+                compile_thread = threading.Thread(target=self._compile_kernels, daemon=True)
+                activity = "loading the model" + (
+                    "" if self._backend.is_serial else ", reaching workers"
+                )
+                with show_activity(activity, self._progress):
+                    compile_thread.start()  # beside the workers' start, which is mostly waiting
+                    verify_receipt = partial(
+                        study_store.is_block_visible, self._store_path, self._study
+                    )
+                    task_results = self._backend.iter_results(
+                        str(self._store_path), self._study.id, block_queue, verify_receipt
+                    )
+                    while compile_thread.is_alive() and not self._interrupts.is_stopping:
+                        compile_thread.join(IDLE_POLL_SECONDS)
+                self._progress.begin(
+                    points=self._study.n_points,
+                    done=points_before + sum(self._checkpoint_points.values()),
+                    unit=self._study.points_noun,
+                )
+                stack.callback(self._progress.end)
+                self._interrupts.is_computing = True
+                return self._consume_results(task_results, block_queue)
+            except SchedulerLostError as error:
+                return f"the scheduler is gone ({error})"
+            except KeyboardInterrupt:
+                return "stopped at once"
+            except OSError as error:
+                return write_failure_text(self._store_path, error)
+            except StoreError:
+                if _store_exists(self._store_path):
+                    raise
+                return write_failure_text(self._store_path, FileNotFoundError())
+            finally:
+                self._interrupts.is_computing = False
+
+    def _compile_kernels(self) -> None:
+        if self._backend.options.evaluate:  # in place of the model
+            return
+        gc_threshold = gc.get_threshold()
+        gc.set_threshold(100_000)  # a compiler's objects live on: looking at them takes a tenth
+        with suppress(Exception):  # what raises here is a block's failure, recorded as one
+            self._study.compile_kernels()
+        gc.set_threshold(*gc_threshold)
+
+    def _consume_results(self, task_results: Iterator[TaskResult], block_queue: BlockQueue) -> str:
+        no_worker_monitor = NoWorkerMonitor()
+        for task_result in task_results:
+            if not self._lock.is_held():
+                if not _store_exists(self._store_path):
+                    raise FileNotFoundError(self._store_path)
+                return "another process took the store's lock"
+            if warning := no_worker_monitor.message(
+                task_result.n_workers, has_receipts=bool(task_result.receipts)
+            ):
+                self._progress.say(warning)
+                self._backend.restart_workers()
+            self._commit(task_result, block_queue)
+            if self._interrupts.is_stopping:
+                self._interrupts.print_stopping()
+            if (
+                not self._receipt_totals["blocks"]
+                and len(self._permanent_failures) >= MAX_INITIAL_FAILURES
+            ):
+                return f"the first {MAX_INITIAL_FAILURES} blocks all failed"
+        points_before = self._points_so_far()
+        self._flush_commits(force=True)
+        self._progress.advance(points=self._points_so_far() - points_before, failed=0)
+        return "interrupted" if self._interrupts.is_stopping else ""
+
+    def _commit(self, task_result: TaskResult, block_queue: BlockQueue) -> None:
+        points_before, failures_before = self._points_so_far(), len(self._permanent_failures)
+        self._journal.commit(*task_result.receipts)
+        self._unflushed_receipts += task_result.receipts
+        for failure in task_result.failures:
+            if not block_queue.requeue_failed(failure.block):
+                self._journal.record_failure(failure)
+                self._permanent_failures.append(failure)
+            _logger.info("block %s failed on %s: %s", failure.block, failure.host, failure.error)
+        for block, saved_points in task_result.checkpoint_points.items():
+            if saved_points <= self._checkpoint_points.get(block, 0.0):
+                raise StoreError(CHECKPOINT_LOST_MESSAGE.format(block))
+            self._checkpoint_points[block] = saved_points
+        self._flush_commits()
+        bytes_stored = self._bytes_before + int(self._receipt_totals["bytes"])
+        self._progress.at_work(workers=task_result.n_workers, stored=bytes_stored)
+        self._progress.advance(
+            points=self._points_so_far() - points_before,
+            failed=len(self._permanent_failures) - failures_before,
+        )
+
+    def _flush_commits(self, *, force: bool = False) -> None:
+        """Count the blocks whose receipts are written."""
+        if not self._journal.flush(force=force):
+            return
+        if self._unflushed_receipts:
+            _logger.debug("committed %s blocks", len(self._unflushed_receipts))
+        for receipt in self._unflushed_receipts:
+            self._receipt_totals["blocks"] += 1
+            for quantity in RECEIPT_TOTALS:
+                self._receipt_totals[quantity] += getattr(receipt, quantity)
+            if self._checkpoint_points.pop(receipt.block, None) is not None:
+                journal.delete_checkpoints(self._store_path, receipt.block)
+        self._unflushed_receipts.clear()
+
+    def _points_so_far(self) -> float:
+        """Points that there are so far of this run's blocks."""
+        return self._receipt_totals["points"] + sum(self._checkpoint_points.values())
+
+
+def write_failure_text(store_path: Location, error: OSError) -> str:
+    """Why a run stops that can't write, and what to do about it."""
+    if isinstance(error, ObjectStoreError):
+        return f"the store can't be written: {error.strerror}"
+    if not _store_exists(store_path):
+        return f"{store_path} is no longer there: have its disk back, or its folder"
+    remedy = write_remedy(error, store_path, "see to its disk")
+    return f"the store can't be written ({os_error_reason(error, store_path)}): {remedy}"
+
+
+def _store_exists(store_path: Location) -> bool:
+    """Tell whether a store is there: of one that went away, writers may leave folders anew."""
+    return (store_path / "zarr.json").exists()

@@ -1,0 +1,211 @@
+"""Output to a terminal, a pipe or a log that may be full, gone or missing.
+
+Words of a program must not end its computing: a stream that fails goes silent.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import queue
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import Any
+
+#: Descriptors of standard input, output and error.
+STANDARD_DESCRIPTORS = (0, 1, 2)
+
+#: Time for which a text waits for a reader that has stopped [s].
+READER_PATIENCE_SECONDS = 0.3
+
+#: Time without any text after which the thread that writes ends [s].
+WRITER_IDLE_SECONDS_MAX = 5.0
+
+#: Texts that wait for such a reader; further ones are dropped.
+WAITING_TEXTS_MAX = 1000
+
+
+class ForgivingStream(io.TextIOBase):
+    """Text stream around another, which may be None; silent once that one has failed."""
+
+    def __init__(self, stream: Any) -> None:
+        self._stream = stream
+        self.failure: Exception | None = None  # why it is silent
+
+    @property
+    def encoding(self) -> str:  # type: ignore[override]
+        """Encoding of the stream inside."""
+        return getattr(self._stream, "encoding", None) or "utf-8"
+
+    def isatty(self) -> bool:
+        """Tell whether the stream inside is a terminal."""
+        return is_terminal(self._stream)
+
+    def fileno(self) -> int:
+        """Return the descriptor of the stream inside; UnsupportedOperation if it has none."""
+        try:
+            return int(self._stream.fileno())
+        except (AttributeError, OSError, ValueError, TypeError):
+            raise io.UnsupportedOperation("fileno") from None
+
+    def writable(self) -> bool:
+        """Tell that text can be written."""
+        return True
+
+    def write(self, text: str) -> int:
+        """Write text, or drop it."""
+        if not isinstance(text, str):
+            raise TypeError(f"a stream of text takes no {type(text).__name__}")
+        if self._stream is None or self.failure is not None:
+            return len(text)
+        try:
+            try:
+                self._stream.write(text)
+            except UnicodeEncodeError:
+                encoded = text.encode(self.encoding, "backslashreplace")
+                self._stream.write(encoded.decode(self.encoding))
+        except BlockingIOError:  # a reader that is late: the next text may pass
+            pass
+        except Exception as error:
+            self._go_silent(error)
+        return len(text)
+
+    def flush(self) -> None:
+        """Pass on what is written, or drop it."""
+        if self._stream is None or self.failure is not None:
+            return
+        with suppress(BlockingIOError):
+            try:
+                self._stream.flush()
+            except BlockingIOError:
+                raise
+            except Exception as error:
+                self._go_silent(error)
+
+    def finish_writing(self) -> None:
+        """Pass on the last that is written, so that nothing is left to fail after this."""
+        self.flush()
+        try:
+            if self._stream is not None:
+                self._stream.flush()
+        except Exception as error:
+            self._go_silent(error)
+
+    def _go_silent(self, error: Exception) -> None:
+        self.failure = error
+        with suppress(OSError, ValueError):
+            if (descriptor := self.fileno()) in STANDARD_DESCRIPTORS:
+                # What the stream holds still is written as the program ends, which fails as well.
+                null_descriptor = os.open(os.devnull, os.O_WRONLY)
+                os.dup2(null_descriptor, descriptor)
+                os.close(null_descriptor)
+
+
+class PatientStream(ForgivingStream):
+    """Text stream whose reader may stop for a while, as a terminal does after Ctrl-S.
+
+    A thread writes to the descriptor of the stream inside. Whoever writes waits for it for
+    `PATIENCE_SECONDS` at the most, and from then on not at all until the reader goes on. Beyond
+    `WAITING_TEXTS_MAX` waiting texts, further ones are dropped. A stream without a
+    descriptor is written to at once.
+    """
+
+    def __init__(self, stream: Any) -> None:
+        super().__init__(stream)
+        self._waiting_texts: queue.Queue[str] = queue.Queue(WAITING_TEXTS_MAX)
+        self._is_reader_stopped = False
+        self._writer_thread: threading.Thread | None = None
+        self._handover_lock = threading.Lock()
+
+    def write(self, text: str) -> int:
+        """Hand over text, or drop it."""
+        try:
+            self.fileno()
+        except io.UnsupportedOperation:
+            return super().write(text)
+        if not isinstance(text, str):
+            raise TypeError(f"a stream of text takes no {type(text).__name__}")
+        if self.failure is None:
+            with self._handover_lock:
+                with suppress(queue.Full):
+                    self._waiting_texts.put_nowait(text)
+                if self._writer_thread is None:
+                    super().flush()  # what others have written comes first
+                    self._writer_thread = threading.Thread(target=self._write_all, daemon=True)
+                    self._writer_thread.start()
+        return len(text)
+
+    def flush(self) -> None:
+        """Wait until all is written, but not for a reader that has stopped."""
+        if self._writer_thread is None:
+            super().flush()
+            return
+        deadline = time.monotonic() + (0.0 if self._is_reader_stopped else READER_PATIENCE_SECONDS)
+        with self._waiting_texts.all_tasks_done:
+            while (
+                self._waiting_texts.unfinished_tasks
+                and (seconds_left := deadline - time.monotonic()) > 0
+            ):
+                self._waiting_texts.all_tasks_done.wait(seconds_left)
+            self._is_reader_stopped = self._waiting_texts.unfinished_tasks > 0
+
+    def _write_all(self) -> None:
+        """Write texts as they come: past buffers, whose locks the main thread needs to end."""
+        while True:
+            try:
+                text = self._waiting_texts.get(timeout=WRITER_IDLE_SECONDS_MAX)
+            except queue.Empty:
+                with self._handover_lock:
+                    if self._waiting_texts.empty():
+                        self._writer_thread = None
+                        return
+                continue
+            try:
+                data = text.encode(self.encoding, "backslashreplace")
+                while data and self.failure is None:
+                    try:
+                        data = data[os.write(self.fileno(), data) :]
+                    except BlockingIOError:
+                        time.sleep(READER_PATIENCE_SECONDS)
+            except Exception as error:
+                self._go_silent(error)
+            finally:
+                self._waiting_texts.task_done()
+
+
+def is_terminal(stream: Any) -> bool:
+    """Tell whether a stream, which may be missing, closed or of any kind, is a terminal."""
+    try:
+        return bool(stream.isatty())
+    except Exception:
+        return False
+
+
+@contextmanager
+def forgiving_output() -> Iterator[None]:
+    """Have standard output and error of this process go silent where they fail."""
+    _open_standard_descriptors()
+    original_streams = sys.stdout, sys.stderr
+    output, errors = (ForgivingStream(stream) for stream in original_streams)
+    sys.stdout, sys.stderr = output, errors
+    try:
+        yield
+    finally:
+        output.finish_writing()
+        if output.failure is not None and not isinstance(output.failure, BrokenPipeError):
+            errors.write(f"standard output can't be written: {output.failure}\n")
+        errors.finish_writing()
+        sys.stdout, sys.stderr = original_streams
+
+
+def _open_standard_descriptors() -> None:
+    """Open those that are closed: the next file would get their number, and others' output."""
+    for descriptor in STANDARD_DESCRIPTORS:
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            with suppress(OSError):
+                os.open(os.devnull, os.O_RDWR)

@@ -1,0 +1,370 @@
+"""Blocks handed out, and on a worker: evaluated in the time they may take, written, receipted."""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import os
+import socket
+import sys
+import threading
+import time
+import traceback
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextvars import copy_context
+from dataclasses import dataclass, field
+from functools import lru_cache, partial
+from itertools import islice
+from typing import TypeVar
+
+import numpy as np
+
+from sweep.storage.locations import parse_location, store_identity
+from sweep.storage.store_format import read_attributes
+from sweep.tasks.engine import journal, study_store
+from sweep.tasks.engine.blocks import BlockEvaluator, Deadline, Results, UnfinishedBlock
+from sweep.tasks.engine.journal import Checkpoint, Failure, Receipt
+from sweep.tasks.engine.progress import CodeError, StoreError
+from sweep.tasks.studies import study_loading
+from sweep.tasks.studies.grid_study import GridStudy
+
+T = TypeVar("T")
+
+#: Errors of the place that results go to: every further block would meet them too.
+STORAGE_ERRNOS = {
+    errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.ESTALE,
+    errno.ECONNREFUSED, errno.ETIMEDOUT, errno.ENXIO,
+}  # fmt: skip
+
+#: Seconds after which draws are saved, and their block put back for another task: what is lost
+#: where a worker dies, and waited for after Ctrl-C.
+CHECKPOINT_INTERVAL = 10.0
+
+#: Seconds that a thread has, after its time, to come back from compiled code and be interrupted.
+INTERRUPT_GRACE_SECONDS = 10.0
+
+#: Seconds between looks at the scheduler, the lock and the clock while nothing arrives.
+IDLE_POLL_SECONDS = 0.5
+
+#: Studies that a worker holds open at once.
+OPEN_STUDIES_MAX = 4
+
+
+RESULTS_NOT_VISIBLE_MESSAGE = (
+    "what was written is not in the store here: does the worker see the same file system?"
+)
+
+ReceiptVerifier = Callable[[Receipt, bool], bool]
+
+
+@dataclass(frozen=True)
+class TaskSettings:
+    """Part that all tasks of a run have in common; small, for it travels with each."""
+
+    store_path: str
+    study_id: str
+    evaluate: BlockEvaluator | None = None  # in place of the study, with the same results
+    block_timeout: float | None = None  # that one block may take
+    durable: bool = False  # whether its chunks are on the disk before its receipt
+    user_code: tuple[
+        tuple[str, str], ...
+    ] = ()  # modules of the user's that may run, and their digests
+
+
+@dataclass
+class TaskResult:
+    """Results of one task: what was written, what failed, what is begun."""
+
+    receipts: list[Receipt] = field(default_factory=list)
+    failures: list[Failure] = field(default_factory=list)
+    checkpoint_points: dict[int, float] = field(
+        default_factory=dict
+    )  # points there are of unfinished blocks
+    worker_address: str = ""  # address of the one that computed them, where there is one
+    host: str = ""  # its machine
+    worker_error: Exception | None = None  # why that worker can't compute any
+    n_workers: int = 1  # that there were as it arrived
+
+
+_open_writer_lock = threading.Lock()
+
+
+def block_writer_of_store(store_path: str, study_id: str) -> study_store.BlockWriter:
+    """Return the study of a store, opened for writing once a process; StoreError for another."""
+    with _open_writer_lock:
+        return _cached_block_writer(store_path, study_id)
+
+
+def _open_block_writer(store_path: str, study_id: str) -> study_store.BlockWriter:
+    attributes, stored_study = study_loading.read_study(parse_location(store_path))
+    _refuse_replaced_store(store_path, study_id)
+    study_store.refuse_other_versions(
+        store_path, attributes, reader=f"worker on {socket.gethostname()}"
+    )
+    return study_store.BlockWriter(store_path, stored_study)
+
+
+_cached_block_writer = lru_cache(maxsize=OPEN_STUDIES_MAX)(_open_block_writer)
+
+
+def _refuse_replaced_store(store_path: str, study_id: str) -> None:
+    """Refuse a store that was put in the place of the one that a task was sent for."""
+    store_stamp = store_identity(parse_location(store_path))
+    stored_id = (
+        _stored_study_id(store_path, store_stamp)
+        if store_stamp
+        else _stored_study_id.__wrapped__(store_path, store_stamp)
+    )
+    if stored_id != study_id:
+        raise StoreError(f"{store_path} now holds study {stored_id}, not {study_id}")
+
+
+@lru_cache(maxsize=OPEN_STUDIES_MAX)
+def _stored_study_id(store_path: str, store_stamp: tuple[int, ...] | None) -> str:
+    """Id of the study in a store, which has a stamp."""
+    return str(read_attributes(parse_location(store_path))["study_id"])
+
+
+def run_blocks(settings: TaskSettings, blocks: list[int]) -> TaskResult:
+    """Evaluate and write blocks, each on its own: one that raises does not stop the next.
+
+    Of one that takes long a piece is computed, and saved for the next task.
+    """
+    task_result = TaskResult(worker_address=worker_address(), host=socket.gethostname())
+    try:
+        if task_result.worker_address:
+            _allow_user_code(settings)
+        _run_blocks(
+            task_result,
+            block_writer_of_store(settings.store_path, settings.study_id),
+            blocks,
+            settings,
+        )
+    except (CodeError, StoreError, OSError) as error:
+        task_result.worker_error = error
+    return task_result
+
+
+def _allow_user_code(settings: TaskSettings) -> None:
+    """Allow the code that the run's driver allows in this worker; CodeError if it has another."""
+    if settings.user_code:
+        from sweep.tasks.studies.user_functions import allow_same_module
+
+        for module, digest in settings.user_code:
+            allow_same_module(module, digest)
+
+
+def _run_blocks(
+    task_result: TaskResult,
+    writer: study_store.BlockWriter,
+    blocks: list[int],
+    settings: TaskSettings,
+) -> None:
+    receipts, checkpoint_time = [], time.monotonic() + CHECKPOINT_INTERVAL
+    for block in blocks:
+        try:
+            receipt_or_points = _run_block(writer, block, settings, Deadline(checkpoint_time))
+            if isinstance(receipt_or_points, Receipt):
+                receipts.append(receipt_or_points)
+            else:
+                task_result.checkpoint_points[block] = receipt_or_points
+        except StoreError:
+            raise
+        except Exception as error:
+            if isinstance(error, OSError) and error.errno in STORAGE_ERRNOS:
+                raise
+            task_result.failures.append(make_failure(block, error))
+    if settings.durable and (receipts or task_result.checkpoint_points):
+        study_store.sync_to_disk(writer.store_path)
+    task_result.receipts = receipts
+
+
+def _run_block(
+    writer: study_store.BlockWriter, block: int, settings: TaskSettings, deadline: Deadline
+) -> Receipt | float:
+    """Receipt of a block, or the points that there are of it."""
+    stored_study, store_path, checkpoint = writer.study, writer.store_path, Checkpoint()
+    started_at = time.perf_counter()
+    evaluate: Callable[[], Results]
+    if settings.evaluate:
+        evaluate = partial(settings.evaluate, stored_study, block)
+    elif isinstance(stored_study, GridStudy) and stored_study.spec.draws.has_draws:
+        checkpoint = journal.read_checkpoint(store_path, stored_study.id, block)
+        evaluate = partial(stored_study.evaluate, block, checkpoint.results, deadline)
+    else:
+        evaluate = partial(stored_study.evaluate, block)
+    try:
+        results = run_with_timeout(evaluate, settings.block_timeout, checkpoint.seconds)
+    except UnfinishedBlock as unfinished:
+        _refuse_replaced_store(str(store_path), stored_study.id)
+        seconds_spent = checkpoint.seconds + time.perf_counter() - started_at
+        journal.write_checkpoint(
+            store_path,
+            stored_study.id,
+            block,
+            Checkpoint(unfinished.results, unfinished.n_points, seconds_spent),
+        )
+        return unfinished.n_points
+    evaluated_at = time.perf_counter()
+    _refuse_replaced_store(str(store_path), stored_study.id)  # its driver may be long dead
+    stored_block = writer.write(block, results)
+    ended_at = time.perf_counter()
+    reuse_source = getattr(stored_study, "reuse_source", None)
+    return Receipt(
+        block=block,
+        points=stored_study.block_size(block),
+        bytes=stored_block.n_bytes,
+        digest=stored_block.digest,
+        seconds=round(checkpoint.seconds + ended_at - started_at, 6),
+        write_seconds=round(ended_at - evaluated_at, 6),
+        host=socket.gethostname(),
+        pid=os.getpid(),
+        versions=study_store.current_versions(),
+        taken=reuse_source.reused_points_by_block.pop(block, 0) if reuse_source else 0,
+    )
+
+
+def make_failure(block: int, error: BaseException) -> Failure:
+    """Record of a block's error, as met in this process."""
+    traceback_lines = traceback.format_exception(type(error), error, error.__traceback__)
+    return Failure(
+        block=block,
+        error=f"{type(error).__name__}: {error}",
+        traceback="".join(traceback_lines)[-8000:],
+        host=socket.gethostname(),
+        pid=os.getpid(),
+    )
+
+
+class BlockTimeoutError(Exception):
+    """A block took longer than it may."""
+
+
+class _TimeoutInterruption(SystemExit):
+    """Raised in a thread from outside; no `except Exception` on its way takes it for its own."""
+
+
+def run_with_timeout(
+    function: Callable[[], T], timeout: float | None, seconds_spent: float = 0.0
+) -> T:
+    """Do some work, for no longer than some seconds less those spent before; Overtime where it was.
+
+    It is done in a thread, in which Python code is interrupted. A worker process whose thread is
+    still in compiled code `GRACE` seconds later ends itself; any other waits for it to return.
+    """
+    if timeout is None:
+        return function()
+    return_values: list[T] = []
+    errors: list[BaseException] = []
+    is_finished, may_exit = threading.Event(), threading.Event()
+
+    def call_function() -> None:
+        try:
+            return_values.append(function())
+        except BaseException as error:
+            errors.append(error)
+        is_finished.set()
+        may_exit.wait()  # until then no other thread has the number that is interrupted
+
+    # which sees what is set here, such as Dask's worker
+    thread = threading.Thread(target=copy_context().run, args=(call_function,), daemon=True)
+    in_time = False
+    thread.start()
+    try:
+        in_time = is_finished.wait(max(timeout - seconds_spent, 0.0))
+    finally:  # after Ctrl-C too
+        if not in_time:
+            thread_id, error = (
+                ctypes.c_ulong(thread.ident or 0),
+                ctypes.py_object(_TimeoutInterruption),
+            )
+            ctypes.pythonapi.PyThreadState_SetAsyncExc(thread_id, error)
+        may_exit.set()
+    if not in_time:
+        # A worker in a process of its own may end without harm.
+        is_own_process = worker_address().partition("://")[0] not in ("", "inproc")
+        thread.join(INTERRUPT_GRACE_SECONDS if is_own_process else None)
+        if thread.is_alive():
+            os._exit(1)  # stuck in compiled code; a nanny starts another worker
+        message = f"took longer than the {timeout:g} s that a block may take"
+        raise BlockTimeoutError(message) from (errors[0] if errors else None)
+    if errors:
+        raise errors[0]
+    return return_values[0]
+
+
+def worker_address() -> str:
+    """Address of the Dask worker that this thread computes for; empty where there is none."""
+    if "distributed" not in sys.modules:
+        return ""
+    from distributed import get_worker
+
+    try:
+        return str(get_worker().address)
+    except ValueError:
+        return ""
+
+
+class BlockQueue:
+    """Blocks that are not done, (blocks,) bool, handed out lazily; what fails comes back, alone."""
+
+    def __init__(self, is_done: np.ndarray) -> None:
+        self.n_unassigned = int(is_done.size - np.count_nonzero(is_done))  # not yet handed out
+        self._untried = _iter_unmarked(is_done)
+        self._failed_once: deque[int] = deque()
+        self._requeued: deque[int] = deque()
+        self.failed: set[int] = set()
+
+    def take_blocks(self, count: int, *, include_failed: bool = True) -> list[int]:
+        """Up to `count` blocks for one task; one that failed before comes by itself, if at all."""
+        if self._failed_once and include_failed:
+            return [self._failed_once.popleft()]
+        if self._requeued:
+            return [self._requeued.popleft()]
+        blocks = list(islice(self._untried, count))
+        self.n_unassigned -= len(blocks)
+        return blocks
+
+    def requeue_failed(self, block: int) -> bool:
+        """Put a failed block back; False where this was its second failure."""
+        if block in self.failed:
+            return False
+        self.failed.add(block)
+        self._failed_once.append(block)
+        return True
+
+    def requeue(self, blocks: list[int]) -> None:
+        """Put blocks back whose answer was lost, by no fault of theirs, or that are begun.
+
+        One that failed before stays a suspect, and is never out together with another.
+        """
+        for block in blocks:
+            (self._failed_once if block in self.failed else self._requeued).append(block)
+
+
+def _iter_unmarked(mask: np.ndarray, step: int = 1 << 16) -> Iterator[int]:
+    for start in range(0, mask.size, step):
+        yield from (start + np.flatnonzero(~mask[start : start + step])).tolist()
+
+
+def run_serial(
+    settings: TaskSettings,
+    block_queue: BlockQueue,
+    is_stopping: Callable[[], bool],
+    verify_receipt: ReceiptVerifier,
+) -> Iterator[TaskResult]:
+    """Answers of a study computed here, one block after the other: what defines its bytes."""
+    while not is_stopping() and (task_blocks := block_queue.take_blocks(1)):
+        task_result = run_blocks(settings, task_blocks)
+        if not all(verify_receipt(receipt, False) for receipt in task_result.receipts):
+            task_result = TaskResult(
+                failures=[
+                    make_failure(block, StoreError(RESULTS_NOT_VISIBLE_MESSAGE))
+                    for block in task_blocks
+                ]
+            )
+        block_queue.requeue(list(task_result.checkpoint_points))
+        yield task_result
+        if task_result.worker_error is not None:
+            raise task_result.worker_error

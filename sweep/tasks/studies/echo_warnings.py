@@ -1,0 +1,525 @@
+"""Echoes of a study that arrive late, are read as another range, or walk in phase, in words.
+
+A record begins at the acquisition delay and ends fft_size samples later, or where the chirp does.
+An echo is there from 2 R / c on. Beats beyond half the sample rate fold, and the readings of three
+peaks, or of two by an assumption, then give another range. Both follow from a few parameters, so
+they are told of a whole grid, and of shots spread over a flight, before anything runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from sweep.model import beam, waveform
+from sweep.model.constants import SPEED_OF_LIGHT
+from sweep.model.effects.catalogue import DEFAULTS
+from sweep.model.effects.points import missing_of
+from sweep.model.estimators import ESTIMATOR
+from sweep.model.preparation import CHIRP, LASER, PROCESSING, RECEIVER, RECORD, categories
+from sweep.model.shot import MISREAD_BINS
+from sweep.model.window import canonical_name, window
+from sweep.tasks.studies.flight_study import FlightStudy
+
+if TYPE_CHECKING:
+    from sweep.model.eyepoints import Eyepoints
+    from sweep.tasks.studies.grid_study import GridStudy
+
+ECHO_LOSS_WARNING_DB = 3.0
+"""Loss of an echo's power beyond which is warned of."""
+
+PHASE_WALK_DELAY_RATIO_MIN, PHASE_WALK_VARIANCE_MAX = 0.125, 0.3
+"""Delay over the record's duration, and variance of the laser's phase over it [rad^2], beyond which
+a random walk leaves more than 0.02 of error in probabilities of detection."""
+
+ECHO_POINTS_SAMPLED_MAX = 200_000
+"""Points of the grid of the parameters that matter; of larger grids so many, spread over them."""
+
+SAMPLED_TILES_PER_SCANNER = 16
+"""Tiles of a flight's shots that are looked at, of each scanner."""
+
+EDGE_SPREAD_BINS_MIN, EDGE_DISTANCE_BINS, EDGE_DISTANCE_DEVIATIONS = 0.2, 4.0, 3.0
+"""Deviation of a footprint's lines [bins of fs/L] beyond which an echo that any bin detects is not
+one line. With the bins and deviations within which such an echo lies across DC or Nyquist."""
+
+ECHO_PARAMETERS = (
+    "target.range", "target.radial_velocity", LASER + "wavelength", CHIRP + "bandwidth",
+    CHIRP + "duration", CHIRP + "start_frequency", waveform.ORDER, waveform.DOPPLER_SLOPE,
+    waveform.DOWN_SLOPE, PROCESSING + "acquisition_delay", PROCESSING + "sample_rate",
+    PROCESSING + "fft_size", PROCESSING + "window", waveform.TWO_BEATS, RECORD,
+    RECEIVER + "architecture", LASER + "line_width", LASER + "line_shape",
+    PROCESSING + "detection", "footprint.speckle", "footprint.phases", "target.grazing_angle",
+    "target.transverse_velocity", beam.WAIST, beam.RECEIVED_WAIST, beam.DIVERGENCE, beam.QUALITY,
+    beam.FOCUS, beam.COUPLING,
+)  # fmt: skip
+"""Parameters by which echoes arrive and are read."""
+
+
+PHASE_ESTIMATOR_LOSS_MAX = 0.03
+"""Share of the window's sum that an echo may lack for places by the phases of bins to be within
+some 0.02 bin. Half a record without an echo sets them off by up to 0.6 bin."""
+
+PHASE_ESTIMATORS = ("jacobsen", "candan")
+"""Estimators that take the phases of neighbouring bins for those of a whole record."""
+
+
+class EchoDiagnosis(NamedTuple):
+    """Echoes of n points."""
+
+    range: np.ndarray
+    """(n,) [m]."""
+    window_fraction_lost: np.ndarray
+    """(n,): share of the window's sum before the echo arrives, 0..1; 1: it never does."""
+    is_misread: np.ndarray
+    """(n,): true where its beats are read as another range or velocity."""
+    has_phase_walk: np.ndarray
+    """(n,): true where the laser's phase walks further than the law of detection allows."""
+    is_exchanged: np.ndarray
+    """(n,): true where up and down beat alone are read with range and velocity exchanged, and would
+    be read right by the other assumption of two beats."""
+    is_exchanged_by_other: np.ndarray
+    """(n,): likewise by the other assumption, where this one is right."""
+    crosses_spectrum_edge: np.ndarray
+    """(n,): true where an echo in developed speckle that any bin detects spreads over bins across
+    DC or Nyquist."""
+
+
+class FootprintDeviations(NamedTuple):
+    """Standard deviations over the beam of n footprints."""
+
+    range: np.ndarray
+    """[m]"""
+    radial_velocity: np.ndarray
+    """[m/s]"""
+
+    @classmethod
+    def on_plane(cls, p: Mapping[str, Any], range_: np.ndarray) -> FootprintDeviations:
+        """Return the widths of footprints on the plane of points of one category."""
+        with np.errstate(all="ignore"):
+            places, directions = beam.angles(p, range_)
+            range_deviation = range_ * places / 4 / np.tan(p["target.grazing_angle"])
+        velocity_deviation = np.abs(p["target.transverse_velocity"]) * directions / 4
+        return cls(*(np.nan_to_num(v + 0 * range_) for v in (range_deviation, velocity_deviation)))
+
+    @classmethod
+    def on_ground(cls, eyepoints: Eyepoints) -> FootprintDeviations:
+        """Return the widths of footprints that rays have found; 0 where there are several surfaces.
+
+        Surfaces at different ranges are echoes of their own.
+        """
+        weight = eyepoints.weight / eyepoints.weight.sum()
+        deviations = []
+        for values in (eyepoints.offset, eyepoints.velocity_offset):
+            finite_values = np.where(np.isfinite(values), values, 0.0)
+            mean = (weight * finite_values).sum(axis=1)[:, None]
+            deviations.append(np.sqrt((weight * (finite_values - mean) ** 2).sum(axis=1)))
+        has_one_surface = (eyepoints.surface == eyepoints.surface[:, :1]).all(axis=1)
+        return cls(*(np.where(has_one_surface, v, 0.0) for v in deviations))
+
+    def select(self, points: np.ndarray) -> FootprintDeviations:
+        """Select points by their numbers."""
+        return FootprintDeviations(self.range[points], self.radial_velocity[points])
+
+
+def diagnose_echoes(
+    parameters: Mapping[str, Any], footprint: FootprintDeviations | None = None
+) -> EchoDiagnosis:
+    """Find when the echoes of points arrive, and how their beats are read, without a footprint.
+
+    ``footprint`` are those of footprints on any ground; by default on a plane.
+    """
+    relevant = {
+        path: parameter for path, parameter in parameters.items() if path in ECHO_PARAMETERS
+    }
+    n_points = max((np.size(value) for value in relevant.values()), default=1)
+    relevant["target.range"] = np.broadcast_to(relevant["target.range"], (n_points,))
+    relevant |= {path: DEFAULTS[path] for path in DEFAULTS if path not in relevant}
+    relevant |= {"footprint.beamlets": 1}
+    diagnosis = EchoDiagnosis(*np.zeros((2, n_points)), *np.zeros((5, n_points), bool))
+    for index, p in categories(relevant):
+        record_window = window(canonical_name(str(p[PROCESSING + "window"])), int(p["record"]))
+        range_, velocity = (p[name] for name in ("target.range", "target.radial_velocity"))
+        first_echo_sample = waveform.samples_before_echo(
+            delay=2 / SPEED_OF_LIGHT * range_, beta=0.0,
+            start=p[PROCESSING + "acquisition_delay"],
+            sample_rate=p[PROCESSING + "sample_rate"], length=record_window.length,
+        )  # fmt: skip
+        diagnosis.range[index] = range_
+        diagnosis.window_fraction_lost[index] = np.where(
+            first_echo_sample >= record_window.length,
+            1.0,
+            np.minimum(missing_of(record_window, first_echo_sample).lost, 1.0),
+        )
+        velocity = np.asarray(velocity)
+        diagnosis.is_misread[index] = _is_misread(p, range_, velocity)
+        if str(p[RECORD]) != "complex":
+            assumption = str(p[waveform.TWO_BEATS])
+            (other_assumption,) = {waveform.FAR_TARGET, waveform.FAST_TARGET} - {assumption}
+            is_misread_by = {
+                name: _is_misread(p, range_, velocity, name)
+                for name in (assumption, other_assumption)
+            }
+            diagnosis.is_exchanged[index] = (
+                is_misread_by[assumption] & ~is_misread_by[other_assumption]
+            )
+            diagnosis.is_exchanged_by_other[index] = (
+                is_misread_by[other_assumption] & ~is_misread_by[assumption]
+            )
+        diagnosis.crosses_spectrum_edge[index] = _crosses_spectrum_edge(
+            p,
+            range_,
+            velocity,
+            record_window.length,
+            None if footprint is None else footprint.select(index),
+        )
+        if str(p[LASER + "line_shape"]) == "lorentzian":
+            delay, record = (
+                2 / SPEED_OF_LIGHT * range_,
+                record_window.length / p[PROCESSING + "sample_rate"],
+            )
+            variance = 2 * np.pi * p[LASER + "line_width"] * np.minimum(delay, record)
+            diagnosis.has_phase_walk[index] = (delay > PHASE_WALK_DELAY_RATIO_MIN * record) & (
+                variance > PHASE_WALK_VARIANCE_MAX
+            )
+    return diagnosis
+
+
+def _crosses_spectrum_edge(
+    p: Mapping[str, Any], range_: np.ndarray, velocity: np.ndarray, record_length: int,
+    footprint: FootprintDeviations | None,
+) -> np.ndarray:  # fmt: skip
+    """Mark echoes of the kind of :attr:`EchoDiagnosis.crosses_spectrum_edge`, (n,)."""
+    is_speckled = str(p["footprint.speckle"]) != "none" and str(p["footprint.phases"]) != "coherent"
+    is_speckled &= str(p[RECEIVER + "architecture"]) != "direct"
+    if (
+        str(p[RECORD]) == "complex"
+        or str(p[PROCESSING + "detection"]) != "any_bin"
+        or not is_speckled
+    ):
+        return np.zeros(range_.shape, bool)
+    footprint = FootprintDeviations.on_plane(p, range_) if footprint is None else footprint
+    chirp_rate, bin_width = (
+        p[CHIRP + "bandwidth"] / p[CHIRP + "duration"],
+        p[PROCESSING + "sample_rate"] / record_length,
+    )
+    segment_order = waveform.order_of(str(p[RECEIVER + "architecture"]), str(p[waveform.ORDER]))
+    crosses = np.zeros(range_.shape, bool)
+    segments = zip(waveform.SEGMENTS, waveform.slopes_of(p), waveform.carriers_of(p), strict=True)
+    for name, slope, carrier in segments:
+        if name not in segment_order:
+            continue
+        beat = waveform.beat_frequency(
+            slope, carrier=carrier, chirp_rate=chirp_rate, range=range_, radial_velocity=velocity
+        )
+        beat_over_nyquist = 2 * beat / p[PROCESSING + "sample_rate"]
+        distance_bins = np.abs(beat_over_nyquist - np.rint(beat_over_nyquist)) * record_length / 2
+        spread_bins = 2 / SPEED_OF_LIGHT * carrier * footprint.radial_velocity
+        spread_bins = (
+            spread_bins + 2 / SPEED_OF_LIGHT * np.abs(slope) * chirp_rate * footprint.range
+        ) / bin_width
+        crosses |= (spread_bins > EDGE_SPREAD_BINS_MIN) & (
+            distance_bins < EDGE_DISTANCE_BINS + EDGE_DISTANCE_DEVIATIONS * spread_bins
+        )
+    return crosses
+
+
+def _is_misread(
+    p: Mapping[str, Any], range_: np.ndarray, velocity: np.ndarray, assumption: str | None = None
+) -> np.ndarray:
+    """Return true where a target's beats, as a spectrum shows them, tell another target, (n,).
+
+    All its beats, or up and down beat alone, read by the assumption ``assumption``.
+    """
+    carriers, slopes = waveform.carriers_of(p), waveform.slopes_of(p)
+    chirp_rate = p[CHIRP + "bandwidth"] / p[CHIRP + "duration"]
+    sample_rate, is_signed = p[PROCESSING + "sample_rate"], str(p[RECORD]) == "complex"
+    bin_width = sample_rate / int(p[PROCESSING + "fft_size"])
+    segment_order = waveform.order_of(str(p[RECEIVER + "architecture"]), str(p[waveform.ORDER]))
+    if assumption is not None:
+        segment_order = tuple(name for name in segment_order if name != "doppler")
+    peaks = []
+    for slope, carrier in zip(slopes, carriers, strict=True):
+        beat = waveform.beat_frequency(
+            slope, carrier=carrier, chirp_rate=chirp_rate, range=range_, radial_velocity=velocity
+        )
+        folded_beat = beat - sample_rate * np.floor(beat / sample_rate + 0.5)
+        peaks.append((folded_beat if is_signed else np.abs(folded_beat)) + 0 * range_)
+    reading_assumption = assumption or str(p[waveform.TWO_BEATS])
+    if slopes == waveform.SIGNS:
+        reading = waveform.resolve(
+            up=peaks[0],
+            doppler=peaks[1] if "doppler" in segment_order else None,
+            down=peaks[2],
+            carrier=carriers[0],
+            bandwidth=p[CHIRP + "bandwidth"],
+            duration=p[CHIRP + "duration"],
+            sample_rate=sample_rate,
+            bin_width=bin_width,
+            signed=is_signed,
+            assumed=reading_assumption,
+        )
+    else:
+        table_shape = 3, range_.size
+        weights = [float(name in segment_order) for name in waveform.SEGMENTS]
+        columns = [np.broadcast_to(carrier, range_.shape) for carrier in carriers]
+        rates = [np.broadcast_to(slope * chirp_rate, range_.shape) for slope in slopes]
+        reading = waveform.fit(
+            np.array(peaks),
+            weights=np.broadcast_to(np.reshape(weights, (3, 1)), table_shape),
+            carriers=np.array(columns),
+            rates=np.array(rates),
+            sample_rate=np.broadcast_to(sample_rate, range_.shape),
+            bin_width=np.broadcast_to(bin_width, range_.shape),
+            signed=is_signed,
+            assumed=reading_assumption,
+        )
+    range_tolerance = MISREAD_BINS * bin_width / (2 / SPEED_OF_LIGHT * chirp_rate)
+    with np.errstate(divide="ignore"):  # a carrier of 0, of direct detection, tells no velocity
+        velocity_tolerance = MISREAD_BINS * bin_width * SPEED_OF_LIGHT / carriers[0]
+    is_off = np.abs(reading.range - range_) > range_tolerance
+    return np.asarray(is_off | (np.abs(reading.radial_velocity - velocity) > velocity_tolerance))
+
+
+def echo_warnings(study: GridStudy | FlightStudy) -> Iterator[str]:
+    """Echoes that a study has not, has in part, or reads as others, a sentence each."""
+    is_flight = isinstance(study, FlightStudy)
+    diagnosis = _diagnose_flight(study) if isinstance(study, FlightStudy) else _diagnose_grid(study)
+    if not diagnosis.range.size:
+        return
+    points_noun, has_overlap = (
+        "shots" if is_flight else "points",
+        study.spec.effect_modes()["overlap"] != "off",
+    )
+    is_absent = (
+        (diagnosis.window_fraction_lost >= 1)
+        if has_overlap
+        else np.zeros(diagnosis.window_fraction_lost.shape, bool)
+    )
+    if is_absent.any():
+        yield (
+            f"no echo arrives before its record ends at {_fraction_text(is_absent)} of the "
+            f"{points_noun}, "
+            f"{_range_text(is_absent, diagnosis.range)}: nothing is detected there. A record lasts "
+            "from "
+            "processing.acquisition_delay for processing.fft_size samples, up to chirp.duration, "
+            "and an echo arrives after 2R/c"
+        )
+    with np.errstate(divide="ignore"):
+        is_weak = (
+            has_overlap
+            & ~is_absent
+            & (
+                20 * np.log10(1 - np.minimum(diagnosis.window_fraction_lost, 1.0))
+                < -ECHO_LOSS_WARNING_DB
+            )
+        )
+    if is_weak.any():
+        yield (
+            "echoes that arrive after their record has begun lose more than "
+            f"{ECHO_LOSS_WARNING_DB:g} dB at "
+            f"{_fraction_text(is_weak)} of the {points_noun}, "
+            f"{_range_text(is_weak, diagnosis.range, is_absent)}: raise "
+            "processing.acquisition_delay to the largest 2R/c, and chirp.duration with it"
+        )
+    is_shifted = (
+        has_overlap & ~is_absent & (diagnosis.window_fraction_lost > PHASE_ESTIMATOR_LOSS_MAX)
+    )
+    if (kinds := _phase_estimators(study)) and is_shifted.any():
+        yield (
+            f"instrument.processing.estimator.kind {' and '.join(kinds)} takes echoes for whole "
+            f"records, and echoes begin within theirs at {_fraction_text(is_shifted)} of the "
+            f"{points_noun}, "
+            f"{_range_text(is_shifted, diagnosis.range, is_absent)}: places there are off by up to "
+            "half a bin. "
+            "Take maximum_likelihood or chirp_z, or raise processing.acquisition_delay to the "
+            "largest 2R/c, and chirp.duration with it"
+        )
+    is_wrong = diagnosis.is_misread & ~is_absent
+    if _reads_two_beats(study):
+        yield from _exchanged_warning(study, diagnosis, is_absent, points_noun)
+        is_wrong &= ~diagnosis.is_exchanged
+    if is_wrong.any():
+        yield (
+            f"the peaks are read as another range or velocity at {_fraction_text(is_wrong)} of the "
+            f"{points_noun}, "
+            f"{_range_text(is_wrong, diagnosis.range, is_absent)} (misread): beats beyond half the "
+            "sample rate "
+            "fold, and two beats are read by processing.two_beats. What is detected there has a "
+            "wrong range or velocity: raise processing.sample_rate, or lower chirp.bandwidth over "
+            "chirp.duration"
+        )
+    has_phase_walk = (
+        diagnosis.has_phase_walk & ~is_absent & (study.spec.effect_modes()["line_width"] != "off")
+    )
+    if has_phase_walk.any() and (study.spec.draws is None or study.spec.draws.method != "spectra"):
+        yield (
+            "the laser's phase walks so far within the delay of the echo at "
+            f"{_fraction_text(has_phase_walk)} of "
+            f"the {points_noun}, {_range_text(has_phase_walk, diagnosis.range, is_absent)}, that "
+            "probabilities of detection "
+            "may be off by up to 0.1: take draws.method: spectra, which draws the walk, or lower "
+            "instrument.laser.line_width"
+        )
+    crosses_edge = (
+        diagnosis.crosses_spectrum_edge
+        & ~is_absent
+        & (study.spec.effect_modes()["fading"] != "off")
+    )
+    if crosses_edge.any() and (
+        study.spec.draws is None or study.spec.draws.method == "probabilities"
+    ):
+        yield (
+            "the speckle of the footprint spreads an echo over bins on both sides of DC or half "
+            f"the sample rate at {_fraction_text(crosses_edge)} of the {points_noun}, "
+            f"{_range_text(crosses_edge, diagnosis.range, is_absent)}: its probability of "
+            "detection by any_bin may "
+            "be up to 0.06 too high. Take draws.method: noise or spectra, which draw the bins, or "
+            "instrument.processing.detection: peak_bin"
+        )
+
+
+def _phase_estimators(study: GridStudy | FlightStudy) -> list[str]:
+    """List the estimators of a study that places of late echoes are wrong by."""
+    path = f"{ESTIMATOR}kind"
+    values = [
+        member.values
+        for axis in study.spec.axes
+        for member in axis.parameters
+        if member.path == path
+    ]
+    kinds = values[0] if values else [study.spec.parameters().get(path)]
+    return [kind for kind in PHASE_ESTIMATORS if kind in {str(name) for name in kinds}]
+
+
+def _reads_two_beats(study: GridStudy | FlightStudy) -> bool:
+    """Return true if up and down beat alone tell range and velocity, always or now and then."""
+    spec = study.spec
+    p = DEFAULTS | dict(spec.parameters())
+    has_no_doppler = "doppler" not in waveform.order_of(
+        str(p[RECEIVER + "architecture"]), str(p[waveform.ORDER])
+    )
+    return (
+        has_no_doppler
+        or isinstance(study, FlightStudy)
+        or p[waveform.SHOT_DETECTION] == waveform.ANY_TWO
+    )
+
+
+def _exchanged_warning(
+    study: GridStudy | FlightStudy,
+    diagnosis: EchoDiagnosis,
+    is_absent: np.ndarray,
+    points_noun: str,
+) -> Iterator[str]:
+    """Yield at how many points the assumption of two beats is wrong, and whether to change it.
+
+    Not where the target is fast at some points and far at others, and is taken to be fast.
+    """
+    is_exchanged, is_exchanged_by_other = (
+        diagnosis.is_exchanged & ~is_absent,
+        diagnosis.is_exchanged_by_other & ~is_absent,
+    )
+    assumes_far = (
+        str((DEFAULTS | dict(study.spec.parameters()))[waveform.TWO_BEATS]) == waveform.FAR_TARGET
+    )
+    if not is_exchanged.any() or (not assumes_far and is_exchanged_by_other.any()):
+        return
+    relation, other_name = ("exceeds", "fast") if assumes_far else ("is below", "far")
+    if np.count_nonzero(is_exchanged_by_other) < np.count_nonzero(is_exchanged):
+        remedy = f"write processing.two_beats: {other_name}"
+        if is_exchanged_by_other.any():
+            remedy += (
+                f", which is wrong at {_fraction_text(is_exchanged_by_other)} of the {points_noun}"
+            )
+    else:
+        remedy = (
+            f"{other_name} would be wrong at more of the {points_noun}. Leave unconfirmed points "
+            "out there, "
+            "or raise chirp.bandwidth over chirp.duration"
+        )
+    yield (
+        f"the Doppler shift {relation} the beat of the range at {_fraction_text(is_exchanged)} of "
+        f"the {points_noun}, "
+        f"{_range_text(is_exchanged, diagnosis.range, is_absent)}, and processing.two_beats is "
+        f"{'far' if assumes_far else 'fast'}: an up and a down beat that no Doppler beat confirms "
+        "are read "
+        f"there with range and velocity exchanged (misread): {remedy}"
+    )
+
+
+def _fraction_text(mask: np.ndarray) -> str:
+    return f"{100 * np.count_nonzero(mask) / mask.size:.3g} %"
+
+
+def _range_text(mask: np.ndarray, ranges: np.ndarray, is_absent: np.ndarray | None = None) -> str:
+    """Ranges of some points: from one on where all beyond are among them, or are ``is_absent``."""
+    if is_absent is not None and is_absent.any():
+        mask, ranges = mask[~is_absent], ranges[~is_absent]
+    low, high = ranges[mask].min(), ranges[mask].max()
+    if mask.all():
+        return "at all ranges"
+    if mask[ranges >= low].all():
+        return f"from {low:,.6g} m on"
+    if mask[ranges <= high].all():
+        return f"up to {high:,.6g} m"
+    return f"at ranges of {low:,.6g} to {high:,.6g} m"
+
+
+def _diagnose_grid(study: GridStudy) -> EchoDiagnosis:
+    axes = study.spec.axes
+    sizes = [axis.size for axis in axes]
+    used_indices = [
+        np.arange(
+            axis.size if any(member.path in ECHO_PARAMETERS for member in axis.parameters) else 1
+        )
+        for axis in axes
+    ]
+    n_points = (
+        int(np.prod([indices.size for indices in used_indices], dtype=np.int64))
+        if used_indices
+        else 1
+    )
+    grid_indices = np.arange(n_points)
+    if n_points > ECHO_POINTS_SAMPLED_MAX:
+        grid_indices = np.unique(
+            np.linspace(0, n_points - 1, ECHO_POINTS_SAMPLED_MAX).astype(np.int64)
+        )
+    if sizes:
+        grid_indices = np.ravel_multi_index(
+            np.unravel_index(grid_indices, [indices.size for indices in used_indices]), sizes
+        )
+    return diagnose_echoes(study.grid.parameters_at(grid_indices))
+
+
+def _diagnose_flight(study: FlightStudy) -> EchoDiagnosis:
+    from sweep.model.eyepoints import seen_ground
+    from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
+
+    diagnoses = []
+    axis_corners = {
+        tuple(end_factor * (int(axis.size) - 1) for axis in study.spec.axes)
+        for end_factor in (0, 1)
+    }
+    for eyepoints in study.eyepoint_studies():
+        eyepoints_of_sample = eyepoints_from_arrays(
+            eyepoints.cast_shots(eyepoints.sample_tiles(SAMPLED_TILES_PER_SCANNER)),
+            eyepoints.beamlet_weights,
+        )
+        hitting_shots = eyepoints_of_sample.seen.nonzero()[0]
+        if not hitting_shots.size:
+            continue
+        for corner in sorted(axis_corners):
+            flight_block = study.scanner_grids[eyepoints.scanner].first_flight_block(corner)
+            parameters = DEFAULTS | dict(study.parameters_at(flight_block))
+            hitting_eyepoints = eyepoints_of_sample.some(hitting_shots)
+            shot_parameters, _ = seen_ground(hitting_eyepoints, parameters, study.surfaces)
+            diagnoses.append(
+                diagnose_echoes(shot_parameters, FootprintDeviations.on_ground(hitting_eyepoints))
+            )
+    return (
+        EchoDiagnosis(*map(np.concatenate, zip(*diagnoses, strict=True)))
+        if diagnoses
+        else EchoDiagnosis(*[np.empty(0)] * 7)
+    )

@@ -1,0 +1,362 @@
+"""Eyepoints as a study of its own: what every shot of a flight sees through one scanner.
+
+Rays are cast here and nowhere else. The store is named by its content, so that every study of the
+same geometry finds it. Shots that need more rays are cast again as they are looked at
+(:func:`refine_rays`).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sweep.model.accuracy import Accuracy
+from sweep.model.outputs import BEAMLETS, CYCLES, SHOTS, WEIGHT
+from sweep.model.resolution import more_rays
+from sweep.storage.store_format import MAP_GROUP
+from sweep.tasks.engine.blocks import (
+    FILL_VALUE_BY_KIND,
+    SHOTS_PER_TILE,
+    ArrayLayout,
+    BlockGrid,
+    BlockStudy,
+    Results,
+    cf_attributes,
+)
+
+if TYPE_CHECKING:
+    from sweep.model.eyepoints import Eyepoints
+    from sweep.spec import SceneSpec
+    from sweep.spec.scene_sections import BuiltScene
+
+#: Shots and beamlets of a block, as far as whole cycles allow.
+BLOCK_SHOTS_MAX = 4096
+BLOCK_BEAMLETS_MAX = 1 << 20
+
+#: Beamlets cast at once, which bounds a worker's memory where cycles are long.
+RAYS_PER_CAST_MAX = 1 << 18
+
+#: Nodes of a scene's map along the longer side, and along the shorter at least.
+MAP_NODES_MAX = 256
+MAP_NODES_MIN = 16
+
+#: Shots of each scanner that say where the flight looks, or times that say where it is; and the
+#: room left around what they see.
+FLIGHT_SAMPLES = 512
+MAP_MARGIN_FRACTION = 0.08
+
+#: Distance above the scene from which it is seen for its map [m].
+MAP_VIEW_CLEARANCE = 1.0
+
+#: Distance of the ground up to which a platform stands on it [m].
+GROUND_CONTACT_MAX = 1e-6
+
+#: Size of an axis named by the model.
+VECTOR_DIM_SIZES = {"xyz": 3, "xyz_again": 3}
+
+
+class EyepointStudy(BlockStudy):
+    """Eyepoints of a flight's shots through one scanner; rays and scene by default its own."""
+
+    points_noun = "shots"
+
+    def __init__(
+        self,
+        spec: SceneSpec,
+        scanner: str,
+        n_beamlets: int | None = None,
+        world: BuiltScene | None = None,
+    ) -> None:
+        self.spec, self.scanner, self._world = spec, scanner, world
+        self.n_cycles = spec.number_of_cycles(scanner)
+        self.shots_per_cycle = spec.shots_per_cycle(scanner)
+        self.n_beamlets = n_beamlets or int(spec.parameters()["footprint.beamlets"])
+        shots_max = max(1, min(BLOCK_SHOTS_MAX, BLOCK_BEAMLETS_MAX // self.n_beamlets))
+        cycles_per_block = min(self.n_cycles, max(1, shots_max // self.shots_per_cycle))
+        self._grid = BlockGrid(
+            ("cycle",),
+            (self.n_cycles,),
+            (cycles_per_block,),
+            fine_dim="shot",
+            fine_steps=self.shots_per_cycle,
+        )
+
+    @property
+    def grids(self) -> tuple[BlockGrid]:
+        """Its cycles."""
+        return (self._grid,)
+
+    @cached_property
+    def id(self) -> str:
+        """Hash of the geometry."""
+        return self.spec.geometry_id(self.scanner)
+
+    @property
+    def n_rays(self) -> int:
+        """Rays that all blocks cast: one a beamlet, and one straight down a cycle."""
+        return self.count_rays(self.n_points)
+
+    def count_rays(self, n_shots: int) -> int:
+        """Rays that are cast for a number of shots in whole cycles."""
+        return n_shots * self.n_beamlets + n_shots // self.shots_per_cycle
+
+    def store_attributes(self) -> dict[str, Any]:
+        """Return the geometry, as it was hashed."""
+        return {
+            "kind": "eyepoints",
+            "geometry": json.dumps(self.spec.geometry_identity(self.scanner), sort_keys=True),
+            "shots_a_cycle": self.shots_per_cycle,
+        }
+
+    def constant_arrays(self) -> list[ArrayLayout]:
+        """Weights of the beamlets."""
+        weight_attributes = cf_attributes(WEIGHT.units, WEIGHT.long_name)
+        return [
+            ArrayLayout.from_values(
+                "weight",
+                WEIGHT.dims,
+                self.beamlet_weights,
+                weight_attributes,
+                fill_value=FILL_VALUE_BY_KIND["f"],
+            )
+        ]
+
+    @cached_property
+    def beamlet_weights(self) -> np.ndarray:
+        """Power fractions of the beamlets, (beamlets,)."""
+        from sweep.model.footprint import beamlets
+
+        return beamlets(self.n_beamlets, self.spec.beamlet_pattern)[1]
+
+    def output_layouts(self) -> list[ArrayLayout]:
+        """Shots, beamlets and cycles."""
+        sizes = VECTOR_DIM_SIZES | {"beamlet": self.n_beamlets}
+        return [
+            self._grid.make_layout(name, output, output.dims, sizes)
+            for name, output in (SHOTS | BEAMLETS | CYCLES).items()
+        ]
+
+    def evaluate(self, block: int) -> Results:
+        """Eyepoints of a block."""
+        (cycles,) = self._grid.block_slices(block)
+        return self.cast_cycles(
+            np.arange(cycles.start * self.shots_per_cycle, cycles.stop * self.shots_per_cycle)
+        )
+
+    def compile_kernels(self) -> None:
+        """Compile the ray caster, on the first cycle."""
+        self.cast_cycles(np.arange(self.shots_per_cycle))
+
+    def cast_cycles(self, shot_numbers: np.ndarray) -> Results:
+        """Arrays of shots, by number (n,), in whole cycles, and of these."""
+        shot_arrays = self.cast_shots(shot_numbers)
+        return shot_arrays | self._cycle_arrays(shot_arrays)
+
+    def cast_shots(self, shot_numbers: np.ndarray) -> Results:
+        """Arrays of any shots, by number (n,)."""
+        from sweep.scenes.eyepoint_arrays import eyepoints_to_arrays
+
+        shots_per_cast = max(1, RAYS_PER_CAST_MAX // self.n_beamlets)
+        parts = [
+            eyepoints_to_arrays(self.cast_eyepoints(shot_numbers[start : start + shots_per_cast]))
+            for start in range(0, len(shot_numbers), shots_per_cast)
+        ]
+        if len(parts) == 1:
+            return parts[0]
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+    def sample_tiles(self, n_tiles: int) -> np.ndarray:
+        """Numbers of the shots of some tiles, as the study plans them, spread over the flight."""
+        last_tile = (self.n_points - 1) // SHOTS_PER_TILE
+        first_shots = (
+            np.unique(np.linspace(0, last_tile, n_tiles).astype(np.int64)) * SHOTS_PER_TILE
+        )
+        shot_numbers = (first_shots[:, None] + np.arange(SHOTS_PER_TILE)).ravel()
+        return np.asarray(shot_numbers[shot_numbers < self.n_points])
+
+    def sample_cycles(self, n_tiles: int) -> np.ndarray:
+        """Numbers of the shots of whole cycles that hold some tiles, spread over the flight."""
+        cycle_numbers = np.unique(self.sample_tiles(n_tiles) // self.shots_per_cycle)
+        return np.asarray(
+            (
+                cycle_numbers[:, None] * self.shots_per_cycle + np.arange(self.shots_per_cycle)
+            ).ravel()
+        )
+
+    def cast_eyepoints(self, shot_numbers: np.ndarray) -> Eyepoints:
+        """Eyepoints of any shots, by number (n,): all their rays are cast at once."""
+        from sweep.model.eyepoints import observe
+
+        world = self.world
+        return observe(
+            shot_numbers, caster=world.caster, bodies=world.body_flights, **self._observe_keywords
+        )
+
+    def _cycle_arrays(self, shot_arrays: Results) -> Results:
+        cycle_starts = slice(None, None, self.shots_per_cycle)
+        time, position = (
+            shot_arrays["time"][cycle_starts],
+            shot_arrays["platform_position"][cycle_starts],
+        )
+        velocity = shot_arrays["platform_velocity"].reshape(-1, self.shots_per_cycle, 3)
+        return {
+            "cycle_time": time,
+            "true_velocity": velocity.mean(axis=1),
+            "true_altitude": height_above_surface(self.world, position, time),
+        }
+
+    @property
+    def world(self) -> BuiltScene:
+        """The scene, built when it is first looked at."""
+        return self._world or build_world(self.spec)
+
+    @cached_property
+    def _observe_keywords(self) -> dict[str, Any]:
+        """Arguments of :func:`sweep.model.eyepoints.observe` that say what looks at the scene."""
+        return {
+            "flight": self.spec.build_flight(),
+            "scanner": self.spec.scan_pattern(self.scanner),
+            "beam_divergence": float(self.spec.instrument.laser.beam_divergence),
+            "number": self.n_beamlets,
+            "pattern": self.spec.beamlet_pattern,
+            "jitter": self.spec.pointing_jitter(),
+            "angles": self.spec.footprint_angles(),
+            "rotation": self.spec.effect_modes()["rotation"] != "off",
+        }
+
+
+@lru_cache(maxsize=1)
+def build_world(spec: SceneSpec) -> BuiltScene:
+    """Build the scene of a study; the last one is cached, as building can take seconds."""
+    return spec.build_scene()
+
+
+def height_above_surface(
+    world: BuiltScene, position: np.ndarray, time: float | np.ndarray
+) -> np.ndarray:
+    """Height above what lies straight below positions (n, 3) at times (n,) [m]; inf for nothing."""
+    down = np.broadcast_to([0.0, 0.0, -1.0], (len(position), 1, 3))
+    return np.asarray(world.caster.bundle(position, down, poses=_body_poses(world, time)).range)
+
+
+def below_surface_warning(spec: SceneSpec) -> str:
+    """Warning of a flight that lies beneath its scene for a while; empty for one that does not."""
+    world, flight = build_world(spec), spec.build_flight()
+    time = np.linspace(flight.start, flight.stop, FLIGHT_SAMPLES)
+    position = flight.state(time).position
+    up = np.broadcast_to([0.0, 0.0, 1.0], (len(position), 1, 3))
+    hits_above = world.caster.bundle(position, up, poses=_body_poses(world, time))
+    # Whoever stands on the ground may be told, by rounding, that it lies above.
+    is_covered = np.isfinite(hits_above.range) & (hits_above.range > GROUND_CONTACT_MAX)
+    is_low = is_covered & np.isinf(height_above_surface(world, position, time))
+    if not is_low.any():
+        return ""
+    times_below, depth = time[is_low], np.where(is_low, hits_above.range, 0.0)
+    surface = world.surfaces[hits_above.surface[depth.argmax(), 0]].name
+    return (
+        f"the platform is beneath {surface} from time {times_below[0]:.4g} to "
+        f"{times_below[-1]:.4g} s, by "
+        f"{depth.max():.4g} m at the most, with nothing below it: raise its path, or let the "
+        "scene's origin be the ground"
+    )
+
+
+def _body_poses(world: BuiltScene, time: float | np.ndarray) -> list[Any]:
+    """Place and attitude of each body at a time, or at one for each ray; None of those at rest."""
+    from sweep.model.geometry.rays import Pose
+
+    states = [
+        None if body is None else body.state(np.atleast_1d(time)) for body in world.body_flights
+    ]
+    return [None if state is None else Pose(state.position, state.attitude) for state in states]
+
+
+def refine_rays(
+    n_rays: int,
+    ray_errors: np.ndarray,
+    accuracy: Accuracy,
+    cast_more_rays: Callable[[np.ndarray, int], np.ndarray],
+) -> None:
+    """Look at shots again, with more rays, until what these leave is within the tolerance.
+
+    The ``n_rays`` of each shot leave an ``ray_errors`` so far, (n,); ``cast_more_rays`` looks at
+    shots, by place, with more, and says what these leave.
+    """
+    rays_needed = more_rays(n_rays, ray_errors, accuracy)
+    for n_rays_now in accuracy.rays:  # rising, and so are the needs of each shot
+        shot_rows = np.flatnonzero(rays_needed == n_rays_now)
+        shots_per_cast = max(1, RAYS_PER_CAST_MAX // n_rays_now)
+        for start in range(0, len(shot_rows), shots_per_cast):
+            batch_rows = shot_rows[start : start + shots_per_cast]
+            rays_needed[batch_rows] = more_rays(
+                n_rays_now, cast_more_rays(batch_rows, n_rays_now), accuracy
+            )
+
+
+def height_map_layouts(spec: SceneSpec) -> list[ArrayLayout]:
+    """Heights of what a flight passes and looks at, as seen from above at its start."""
+    world = build_world(spec)
+    positions = np.concatenate([_sampled_positions(spec, world, name) for name in spec.scanners])
+    low, high = positions[:, :2].min(axis=0), positions[:, :2].max(axis=0)
+    margin = MAP_MARGIN_FRACTION * max(*(high - low), 1.0)
+    x, y = _map_nodes(low - margin, high + margin)
+    mesh_tops = [
+        float(mesh.vertices[:, 2].max() + mesh.origin[2])
+        for mesh, body in zip(world.caster.meshes, world.body_flights, strict=True)
+        if body is None
+    ]
+    view_height = max(max(mesh_tops, default=0.0), positions[:, 2].max()) + MAP_VIEW_CLEARANCE
+    view_points = np.stack(
+        [*np.meshgrid(x, y), np.full((len(y), len(x)), view_height)], axis=-1
+    ).reshape(-1, 3)
+    depth = height_above_surface(world, view_points, spec.build_flight().start)
+    height = np.where(np.isfinite(depth), view_height - depth, np.nan).reshape(len(y), len(x))
+    return [
+        ArrayLayout.from_values(
+            f"{MAP_GROUP}/{name}",
+            dims,
+            values,
+            cf_attributes("m", long_name),
+            fill_value=FILL_VALUE_BY_KIND["f"],
+        )
+        for name, dims, values, long_name in (
+            ("x", ("x",), x, "x of the map's nodes"),
+            ("y", ("y",), y, "y of the map's nodes"),
+            ("height", ("y", "x"), height, "height seen from above"),
+        )
+    ]
+
+
+def _sampled_positions(spec: SceneSpec, world: BuiltScene, scanner: str) -> np.ndarray:
+    """Positions of the platform and of what its beams hit, (n, 3)."""
+    from sweep.model.geometry.quaternion import rotate
+
+    n_shots = spec.number_of_cycles(scanner) * spec.shots_per_cycle(scanner)
+    scan = spec.scan_pattern(scanner).shots(
+        np.unique(np.linspace(0, n_shots - 1, FLIGHT_SAMPLES).astype(int))
+    )
+    flight = spec.build_flight()
+    state = flight.state(flight.start + scan.time)
+    direction = rotate(state.attitude, scan.direction)
+    # Bodies that move are looked at where they are as the flight begins: it is only a map.
+    poses = _body_poses(world, flight.start)
+    hits = world.caster.bundle(state.position, direction[:, None], poses=poses)
+    hit = np.isfinite(hits.range)
+    ground = state.position[hit] + direction[hit] * hits.range[hit, None]
+    return np.concatenate([state.position, ground])
+
+
+def _map_nodes(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Coordinates of square cells over a rectangle."""
+    step = float((high - low).max()) / (MAP_NODES_MAX - 1)
+    count = np.maximum(np.ceil((high - low) / step).astype(int) + 1, MAP_NODES_MIN)
+    centre = (low + high) / 2
+    x, y = (
+        axis_centre + step * (np.arange(n_nodes) - (n_nodes - 1) / 2)
+        for axis_centre, n_nodes in zip(centre, count, strict=True)
+    )
+    return x, y

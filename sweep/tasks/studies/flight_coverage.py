@@ -1,0 +1,167 @@
+"""Share of a flight's shots that hit something, and the extents of its path and its scene."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import lru_cache
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from sweep.scenes.scene_files import SceneError
+from sweep.tasks.studies.eyepoint_study import EyepointStudy, build_world
+
+if TYPE_CHECKING:
+    from sweep.spec import SceneSpec
+    from sweep.spec.scene_sections import BuiltScene
+
+SAMPLED_RAYS_PER_SCANNER = 1 << 17
+"""Rays of each scanner that tell what it sees, spread over the flight."""
+
+MISSED_FRACTION_MAX = 0.01
+"""Share of a scanner's shots that hit nothing, above which it is warned of."""
+
+_SAMPLED_TIMES = 65
+"""Times at which the places of the platform and of moving objects are looked at."""
+
+
+class ScannerHits(NamedTuple):
+    """Share of a scanner's shots that hit something, of a sample."""
+
+    name: str
+    n_shots: int
+    """Shots looked at."""
+    hit_fraction: float
+    """Share of them of which any beamlet hits something."""
+    partial_hit_fraction: float
+    """Share of them of which some beamlets hit, and others do not."""
+    beams_without_hits: tuple[int, ...]
+    """Beams of which no shot hits anything."""
+
+    def hits_text(self) -> str:
+        """Sentence for people."""
+        sentence = f"{_percent_text(self.hit_fraction)} of the shots hit something"
+        if self.partial_hit_fraction:
+            sentence += f", {_percent_text(self.partial_hit_fraction)} with a part of their light"
+        if self.beams_without_hits and self.hit_fraction:
+            beams = ", ".join(map(str, self.beams_without_hits[:8])) + ", ..." * (
+                len(self.beams_without_hits) > 8
+            )
+            sentence += f"; beam{'s' * (len(self.beams_without_hits) > 1)} {beams} never"
+        return sentence
+
+
+class FlightCoverage(NamedTuple):
+    """Shots of a flight that hit something, by scanner, and the extents of path and scene."""
+
+    scanners: tuple[ScannerHits, ...]
+    path_box: np.ndarray
+    """(2, 3): least and largest coordinates of the platform [m]."""
+    scene_box: np.ndarray
+    """(2, 3): the same of the scene."""
+
+    def extents_text(self) -> str:
+        """Extents of path and scene, for people."""
+        return (
+            f"the path spans {_box_text(self.path_box)}, and the scene {_box_text(self.scene_box)}"
+        )
+
+    def warnings(self) -> Iterator[str]:
+        """Sentences on scanners of which more than `MISSED_SHARE` of the shots hit nothing."""
+        mostly_missing = [
+            scanner for scanner in self.scanners if scanner.hit_fraction < 1 - MISSED_FRACTION_MAX
+        ]
+        for scanner in mostly_missing:
+            yield f"scanners.{scanner.name}: only {scanner.hits_text()}: {self.extents_text()}"
+
+
+@lru_cache(maxsize=1)
+def sample_coverage(spec: SceneSpec) -> FlightCoverage:
+    """Cast a sample of the shots of each scanner; the last result is cached."""
+    world, flight = build_world(spec), spec.build_flight()
+    times = np.linspace(flight.start, flight.stop, _SAMPLED_TIMES)
+    positions = flight.state(times).position
+    scanners = tuple(_sample_scanner(spec, scanner) for scanner in spec.scanners)
+    return FlightCoverage(
+        scanners, _bounding_box(positions), _bounding_box(_body_corners(world, times))
+    )
+
+
+def refuse_flight_without_hits(spec: SceneSpec) -> None:
+    """Refuse a flight of which no beam of the sample hits anything: a SceneError that says why."""
+    flight_coverage = sample_coverage(spec)
+    if any(scanner.hit_fraction for scanner in flight_coverage.scanners):
+        return
+    n_shots = sum(scanner.n_shots for scanner in flight_coverage.scanners)
+    rule = (
+        f"leads nowhere that a beam hits anything, of {n_shots:,} shots: "
+        f"{flight_coverage.extents_text()}"
+    )
+    remedy = (
+        "give the path in the scene's coordinates, whose zero is the middle of scene.origin, or "
+        "take 'origin: world' for those of the map; or turn the beams towards the scene"
+    )
+    raise SceneError("platform.path", rule, remedy)
+
+
+def _sample_scanner(spec: SceneSpec, name: str) -> ScannerHits:
+    study = EyepointStudy(spec, name)
+    n_shots_max, shots_per_cycle = (
+        max(1, SAMPLED_RAYS_PER_SCANNER // study.n_beamlets),
+        study.shots_per_cycle,
+    )
+    n_cycles = min(study.n_cycles, -(-n_shots_max // shots_per_cycle))
+    first_shots = (
+        np.unique(np.linspace(0, study.n_cycles - 1, n_cycles).astype(np.int64)) * shots_per_cycle
+    )
+    shot_numbers = (
+        first_shots[:, None] + np.arange(shots_per_cycle)
+    ).ravel()  # whole cycles hold all beams
+    if shot_numbers.size > n_shots_max:
+        shot_numbers = shot_numbers[
+            np.linspace(0, shot_numbers.size - 1, n_shots_max).astype(np.int64)
+        ]
+    eyepoints = study.cast_eyepoints(shot_numbers)
+    is_hit = eyepoints.surface >= 0
+    has_hit, is_full_hit = is_hit.any(axis=1), is_hit.all(axis=1)
+    beams = np.unique(eyepoints.beam)
+    beams_with_hits = np.unique(eyepoints.beam[has_hit])
+    return ScannerHits(
+        name=name,
+        n_shots=int(shot_numbers.size),
+        hit_fraction=float(has_hit.mean()),
+        partial_hit_fraction=float((has_hit & ~is_full_hit).mean()),
+        beams_without_hits=tuple(np.setdiff1d(beams, beams_with_hits).tolist()),
+    )
+
+
+def _body_corners(world: BuiltScene, times: np.ndarray) -> np.ndarray:
+    """Corners of all bodies, (n, 3); of one that moves, of a ball about it all along its way."""
+    corners = []
+    for mesh, body in zip(world.caster.meshes, world.body_flights, strict=True):
+        box = _bounding_box(mesh.vertices) + mesh.origin
+        if body is not None:
+            radius = np.sqrt((np.abs(box).max(axis=0) ** 2).sum())
+            body_positions = body.state(times).position
+            box = np.concatenate([body_positions - radius, body_positions + radius])
+        corners.append(box)
+    return np.concatenate(corners)
+
+
+def _bounding_box(points: np.ndarray) -> np.ndarray:
+    return np.stack([points.min(axis=0), points.max(axis=0)])
+
+
+def _box_text(box: np.ndarray) -> str:
+    axis_texts = (
+        f"{axis} {low:.6g}" + (f" to {high:.6g}" if high != low else "")
+        for axis, low, high in zip("xyz", *box, strict=True)
+    )
+    return ", ".join(axis_texts) + " m"
+
+
+def _percent_text(fraction: float) -> str:
+    """Share in per cent, never rounded to all or nothing."""
+    if 0.0 < fraction < 0.001:
+        return "under 0.1 %"
+    return "over 99.9 %" if 0.999 < fraction < 1.0 else f"{100 * fraction:.3g} %"

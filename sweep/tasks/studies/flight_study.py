@@ -1,0 +1,729 @@
+"""A point cloud as a study: radiometry, draws and navigation on eyepoints that are there."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import cache, cached_property, partial
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from sweep.model.accuracy import Accuracy
+from sweep.model.effects.catalogue import DEFAULTS, flag_attributes, flags_of
+from sweep.model.effects.points import Points
+from sweep.model.ground import of_rays
+from sweep.model.outputs import (
+    BEAMLETS,
+    CYCLES,
+    NAVIGATION,
+    POINTS,
+    SHOTS,
+    SIMULATED,
+    STATISTICS,
+)
+from sweep.model.resolution import by_tolerance, effects_tolerance
+from sweep.spec.rules import Mistake, SpecError
+from sweep.spec.scene_sections import scene_projection
+from sweep.storage.locations import Location, eyepoints_path
+from sweep.storage.store_format import MAP_GROUP
+from sweep.storage.verified_store import open_array_group
+from sweep.tasks.engine.blocks import (
+    BLOCKS_MAX,
+    SHOTS_PER_TILE,
+    ArrayLayout,
+    BlockGrid,
+    ExtendableStudy,
+    ParameterGrid,
+    Results,
+)
+from sweep.tasks.studies.eyepoint_study import (
+    VECTOR_DIM_SIZES,
+    EyepointStudy,
+    build_world,
+    height_map_layouts,
+    refine_rays,
+)
+from sweep.tasks.studies.grid_study import (
+    EFFECTS_ARRAY,
+    EFFECTS_ERROR_ARRAY,
+    SelectedEffects,
+    axis_coordinate_layouts,
+)
+
+if TYPE_CHECKING:
+    from sweep.model.effects.planning import Plan
+    from sweep.model.error_floor import ErrorFloor
+    from sweep.model.eyepoints import Eyepoints
+    from sweep.model.geometry.mesh import Surface
+    from sweep.model.own_motion import MotionPriors
+    from sweep.spec import SceneSpec
+    from sweep.spec.scene_sections import BuiltScene
+
+    CloudSimulator = Callable[[tuple[str, ...], Eyepoints, np.ndarray, np.ndarray], Results]
+    """Results of shots with some effects, by their eyepoints, numbers and flags."""
+
+#: Domain of the keys of draws; a shot's key is its number, so that the draws of a flight are the
+#: same along every axis and for every instrument.
+FLIGHT_KEY_DOMAIN = "sweep.flight"
+
+#: Shots that a cycle must have for a velocity vector.
+NAVIGATION_SHOTS_MIN = 3
+
+#: Geometry of shots and cycles, the same at every place along a study's axes.
+GEOMETRY_OUTPUTS = SHOTS | CYCLES
+
+
+@cache
+def flag_array_attributes() -> dict[str, dict[str, Any]]:
+    """Attributes of the arrays that hold flags or one of some values, as the CF conventions say."""
+    from sweep.model.navigation import EXCLUDED, SOLVED, UNDETERMINED, WITHHELD
+    from sweep.model.pairing import FLAGS
+
+    status_attributes = {
+        "flag_values": [SOLVED, EXCLUDED, WITHHELD, UNDETERMINED],
+        "flag_meanings": "solved one_beam_excluded withheld undetermined",
+    }
+    point_attributes = {"flag_masks": list(FLAGS.values()), "flag_meanings": " ".join(FLAGS)}
+    return {
+        EFFECTS_ARRAY: flag_attributes(), "flags": point_attributes,
+        "velocity_status": status_attributes, "altitude_status": status_attributes,
+    }  # fmt: skip
+
+
+class FlightBlock(NamedTuple):
+    """The part of a flight that a block holds, at one place along the axes."""
+
+    scanner: str
+    axis_indices: tuple[int, ...]
+    draws: range
+    cycles: range
+
+
+class ScannerGrid(ParameterGrid, BlockGrid):
+    """The blocks of one scanner: along the axes, draws and cycles, the last fastest."""
+
+    def __init__(self, spec: SceneSpec, scanner: str) -> None:
+        ParameterGrid.__init__(self, spec)
+        self.scanner, self.axes_shape = scanner, self.shape
+        self.n_cycles, self.shots_per_cycle = (
+            spec.number_of_cycles(scanner),
+            spec.shots_per_cycle(scanner),
+        )
+        self.n_draws = int(spec.draws.number)
+        _refuse_too_many_shots(spec, self.n_cycles * self.shots_per_cycle)
+        cycles_per_block = max(1, int(spec.storage.block_shots) // self.shots_per_cycle)
+        BlockGrid.__init__(
+            self,
+            (*(axis.name for axis in spec.axes), "draw", "cycle"),
+            (*self.axes_shape, self.n_draws, self.n_cycles),
+            (
+                *(1 for _ in self.axes_shape),
+                min(self.n_draws, int(spec.storage.block_draws)),
+                min(self.n_cycles, cycles_per_block),
+            ),
+            group=scanner,
+            fine_dim="shot",
+            fine_steps=self.shots_per_cycle,
+        )
+        if self.n_blocks > BLOCKS_MAX:
+            rule = (
+                f"cuts {self.n_draws:,} draws of {self.n_cycles:,} cycles of {scanner} into "
+                f"{self.n_blocks:.3g} blocks, and a study has at most {BLOCKS_MAX:.0e}"
+            )
+            size = f"{spec.storage.block_draws}"
+            remedy = "raise it or storage.block_shots, or take fewer draws"
+            raise SpecError([Mistake("storage.block_draws", rule, size, remedy)])
+
+    def values_by_dim(self) -> list[dict[str, np.ndarray]]:
+        """Values along each dimension, by what they are of; there may be very many."""
+        draw_values = {"draw": np.arange(self.n_draws)}
+        return [*self.values_by_axis, draw_values, {"cycle": np.arange(self.n_cycles)}]
+
+    @property
+    def has_navigation(self) -> bool:
+        """True if a cycle has the shots that a velocity vector takes."""
+        return self.shots_per_cycle >= NAVIGATION_SHOTS_MIN
+
+    def flight_block(self, block_in_grid: int) -> FlightBlock:
+        """Return a block of this scanner by its number."""
+        *axis_ranges, draws, cycles = (
+            range(block_slice.start, block_slice.stop)
+            for block_slice in self.block_slices(block_in_grid)
+        )
+        return FlightBlock(
+            self.scanner, tuple(axis_range.start for axis_range in axis_ranges), draws, cycles
+        )
+
+    def first_flight_block(self, axis_indices: tuple[int, ...]) -> FlightBlock:
+        """Return the first block at a place along the axes."""
+        return self.flight_block(self.block_at((*axis_indices, 0, 0)))
+
+
+#: Shots of a scanner times draws and places along axes, at the most.
+DRAWN_SHOTS_MAX = 10**10
+
+
+def _refuse_too_many_shots(spec: SceneSpec, n_shots: int) -> None:
+    """Refuse a flight of more shots than can be handled, before any array of them is made."""
+    n_draws = int(spec.draws.number)
+    all_shots = n_shots * n_draws * math.prod(int(axis.size) for axis in spec.axes)
+    if all_shots > DRAWN_SHOTS_MAX:
+        rule = (
+            f"makes {all_shots:.3g} shots in all draws and places along axes, and a study has at "
+            f"most {DRAWN_SHOTS_MAX:.0e}"
+        )
+        raise SpecError([Mistake("draws.number", rule, f"{n_draws}", "take fewer draws")])
+
+
+class ReusedCloud(NamedTuple):
+    """Results of a flight's block that are there before it is computed."""
+
+    is_reused: np.ndarray  # (shots, draws): which
+    results: Results  # (shots or cycles, draws, ...) by name; (shots, ...) what no draw changes
+
+
+class FlightStudy(ExtendableStudy):
+    """The point clouds of a flight, a group of arrays for each scanner."""
+
+    points_noun = "shots"
+
+    def __init__(
+        self, spec: SceneSpec, store_path: Location, world: BuiltScene | None = None
+    ) -> None:
+        super().__init__(spec)
+        self.store_path = store_path
+        self.get_eyepoint_study = cache(partial(EyepointStudy, spec, world=world))
+        self.scanner_grids = {scanner: ScannerGrid(spec, scanner) for scanner in spec.scanners}
+        self._get_eyepoint_arrays = cache(self._open_eyepoints)
+
+    @property
+    def grids(self) -> list[ScannerGrid]:
+        """Blocks of each scanner."""
+        return list(self.scanner_grids.values())
+
+    def depends_on_tolerance(self, block: int) -> np.ndarray | bool:
+        """Tell whether a tighter tolerance computes shots more closely, effects apart."""
+        return bool(
+            self.spec.is_ray_number_set_by_tolerance or by_tolerance(self.spec.parameters())
+        )
+
+    def locate_flight_block(self, block: int) -> tuple[ScannerGrid, FlightBlock]:
+        """Return the blocks of a block's scanner, and its number; IndexError if there is none."""
+        grid, block_in_grid = self.locate_in_grid(block)
+        scanner_grid = self.scanner_grids[grid.group]
+        return scanner_grid, scanner_grid.flight_block(block_in_grid)
+
+    def first_draw_block(self, block: int) -> int:
+        """Block of the first draws of the same shots, with all that no draw changes."""
+        grid, block_in_grid = self.locate_in_grid(block)
+        *axis_positions, _, cycle_position = grid.block_position(block_in_grid)
+        return block - block_in_grid + grid.block_at((*axis_positions, 0, cycle_position))
+
+    def store_attributes(self) -> dict[str, Any]:
+        """Title, question, spec, meaning of the numbers of scanners and surfaces, and origins.
+
+        ``projection`` is the WKT of the coordinates in the scene's files, or empty. ``origin`` [m]
+        and ``time_origin`` [s], a decimal with all its digits, are where these files have the zero
+        of positions and times in the store.
+        """
+        return {
+            "kind": "scene",
+            "title": self.spec.title,
+            "question": self.spec.question,
+            "spec": self.spec.to_json(),
+            "surfaces": [surface.name for surface in self.surfaces],
+            "scanners": list(self.spec.scanners),
+            "origin": np.asarray(build_world(self.spec).origin, float).tolist(),
+            "projection": scene_projection(self.spec.scene, self.spec.files),
+            "time_origin": f"{self.spec.files.time_origin.normalize():f}",
+        }
+
+    def group_attributes(self) -> dict[str, dict[str, Any]]:
+        """Return a group for each scanner, and one of the map, whose cells are none of theirs."""
+        coordinate_names = " ".join(
+            member.coordinate for axis in self.spec.axes for member in axis.parameters
+        )
+        return {
+            scanner: {
+                "shots_a_cycle": scanner_grid.shots_per_cycle,
+                "geometry_id": self.spec.geometry_id(scanner),
+                "coordinates": coordinate_names,
+            }
+            for scanner, scanner_grid in self.scanner_grids.items()
+        } | {MAP_GROUP: {}}
+
+    def constant_arrays(self) -> list[ArrayLayout]:
+        """Return the map of the scene, and every scanner's coordinates."""
+        return height_map_layouts(self.spec) + [
+            replace(layout, name=f"{scanner}/{layout.name}")
+            for scanner in self.scanner_grids
+            for layout in axis_coordinate_layouts(self.spec.axes)
+        ]
+
+    def output_layouts(self) -> list[ArrayLayout]:
+        """Geometry, statistics, points and navigation of each scanner."""
+        axis_names = tuple(axis.name for axis in self.spec.axes)
+        sizes = VECTOR_DIM_SIZES | {"return_number": int(self.spec.draws.returns)}
+        layouts = []
+        for scanner_grid in self.grids:
+            outputs = GEOMETRY_OUTPUTS | STATISTICS | SIMULATED | POINTS
+            outputs = outputs | NAVIGATION if scanner_grid.has_navigation else outputs
+            for name, output in outputs.items():
+                dims = output.dims if name in GEOMETRY_OUTPUTS else axis_names + output.dims
+                layouts.append(
+                    scanner_grid.make_layout(
+                        name, output, dims, sizes, flag_array_attributes().get(name)
+                    )
+                )
+        return layouts
+
+    def evaluate(self, block: int) -> Results:
+        """Point cloud, statistics and navigation of a block; effects are chosen by whole tiles."""
+        scanner_grid, flight_block = self.locate_flight_block(block)
+        first_shot, shots_end = (
+            cycle * scanner_grid.shots_per_cycle
+            for cycle in (flight_block.cycles.start, flight_block.cycles.stop)
+        )
+        first_tile_shot, tiles_end = (
+            first_shot // SHOTS_PER_TILE * SHOTS_PER_TILE,
+            -(-shots_end // SHOTS_PER_TILE) * SHOTS_PER_TILE,
+        )
+        tiles_end = min(tiles_end, scanner_grid.n_cycles * scanner_grid.shots_per_cycle)
+        shot_arrays, eyepoints = self._read_shots_and_eyepoints(
+            flight_block.scanner, range(first_tile_shot, tiles_end)
+        )
+        block_rows, shot_numbers = (
+            slice(first_shot - first_tile_shot, shots_end - first_tile_shot),
+            np.arange(first_shot, shots_end),
+        )
+        selected_effects = self.select_effects(
+            flight_block, eyepoints, np.arange(first_tile_shot, tiles_end)
+        ).subset(block_rows)
+        shot_arrays = {name: values[block_rows] for name, values in shot_arrays.items()}
+        eyepoints = eyepoints.some(block_rows)
+        results = shot_arrays | self._read_eyepoint_arrays(
+            flight_block.scanner, CYCLES, flight_block.cycles
+        )
+        results |= {
+            EFFECTS_ARRAY: selected_effects.effect_flags,
+            EFFECTS_ERROR_ARRAY: selected_effects.error_bound,
+        }
+        reused = self._reused_cloud(block, selected_effects) if self.reuse_source else None
+        results |= self.simulate_shots(
+            flight_block, shot_arrays, eyepoints, selected_effects, shot_numbers, reused
+        )
+        chunks = {}
+        for name in self.chunk_positions(block):
+            values, n_dims = results[name.rpartition("/")[2]], len(self.layout_by_name[name].shape)
+            chunks[name] = values.reshape((1,) * (n_dims - values.ndim) + values.shape)
+        return chunks
+
+    def compile_kernels(self) -> None:
+        """Compile the radiometry and the navigation, on the first cycle of each scanner."""
+        for scanner_grid in self.grids:
+            flight_block = scanner_grid.flight_block(0)._replace(draws=range(1))
+            shot_range = range(scanner_grid.shots_per_cycle)
+            shot_arrays, eyepoints = self._read_shots_and_eyepoints(
+                flight_block.scanner, shot_range
+            )
+            shot_numbers = np.array(shot_range)
+            selected_effects = self.select_effects(flight_block, eyepoints, shot_numbers)
+            self.simulate_shots(
+                flight_block, shot_arrays, eyepoints, selected_effects, shot_numbers
+            )
+
+    def select_effects(
+        self, flight_block: FlightBlock, eyepoints: Eyepoints, shot_numbers: np.ndarray
+    ) -> SelectedEffects:
+        """Effects simulated at shots of these numbers, rising."""
+        n_shots = len(shot_numbers)
+        effect_plan = self.plan_effects(flight_block, eyepoints, shot_numbers // SHOTS_PER_TILE)
+        no_effects = SelectedEffects(np.zeros(n_shots, np.uint32), np.zeros(n_shots))
+        return no_effects if effect_plan is None else effect_plan.selected_effects(n_shots)
+
+    def plan_effects(
+        self, flight_block: FlightBlock, eyepoints: Eyepoints, tile_numbers: np.ndarray
+    ) -> ShotEffectPlan | None:
+        """Plans of shots whose tiles have these numbers, (n,), rising."""
+        return plan_shot_effects(
+            eyepoints,
+            tile_numbers,
+            self.parameters_at(flight_block),
+            self.surfaces,
+            modes=self.spec.effect_modes(),
+            rotating=self.spec.has_rotating_bodies,
+            rays_by_tolerance=self.spec.is_ray_number_set_by_tolerance,
+        )
+
+    def simulate_shots(
+        self,
+        flight_block: FlightBlock,
+        shot_arrays: Results,
+        eyepoints: Eyepoints,
+        selected_effects: SelectedEffects,
+        shot_numbers: np.ndarray,
+        reused: ReusedCloud | None = None,
+    ) -> Results:
+        """Radiometry, draws and navigation of shots in whole cycles, but for what is ``reused``."""
+        scanner_grid = self.scanner_grids[flight_block.scanner]
+        n_draws, shots_per_cycle = len(flight_block.draws), scanner_grid.shots_per_cycle
+        is_reused, results = reused or self._empty_cloud(
+            scanner_grid, selected_effects.effect_flags.size, n_draws
+        )
+        for rows, draw_slice in _iter_missing(~is_reused):
+            simulate_cloud = partial(self._simulate_cloud, flight_block, draw_slice)
+            for shot_rows, part_results in self.iter_clouds(
+                flight_block.scanner,
+                eyepoints,
+                selected_effects,
+                shot_numbers,
+                rows,
+                simulate_cloud,
+            ):
+                _insert_results(results, shot_rows, draw_slice, part_results)
+        if scanner_grid.has_navigation:
+            is_missing = (~is_reused).reshape(-1, shots_per_cycle, n_draws).any(axis=1)
+            for cycles, draw_slice in _iter_missing(np.asarray(is_missing)):
+                rows = (cycles[:, None] * shots_per_cycle + np.arange(shots_per_cycle)).ravel()
+                part_results = self._solve_navigation(
+                    shots_per_cycle, shot_arrays, results, rows, draw_slice
+                )
+                _insert_results(results, cycles, draw_slice, part_results)
+        return results
+
+    def _empty_cloud(self, scanner_grid: ScannerGrid, n_shots: int, n_draws: int) -> ReusedCloud:
+        """Room for the results of some shots."""
+        outputs = STATISTICS | POINTS | (NAVIGATION if scanner_grid.has_navigation else {})
+        sizes = VECTOR_DIM_SIZES | {
+            "shot": n_shots, "cycle": n_shots // scanner_grid.shots_per_cycle, "draw": n_draws,
+            "return_number": int(self.spec.draws.returns),
+        }  # fmt: skip
+        results = {name: output.empty(sizes) for name, output in outputs.items()}
+        return ReusedCloud(np.zeros((n_shots, n_draws), bool), results)
+
+    def iter_clouds(
+        self,
+        scanner: str,
+        eyepoints: Eyepoints,
+        selected_effects: SelectedEffects,
+        shot_numbers: np.ndarray,
+        rows: np.ndarray,
+        simulate_cloud: CloudSimulator,
+    ) -> Iterator[tuple[np.ndarray, Results]]:
+        """Results of some shots, those together that need much the same; with more rays if so."""
+        for members, effect_names, effect_flags in selected_effects.subset(
+            rows
+        ).iter_joint_groups():
+            group_rows, simulate_group = rows[members], partial(simulate_cloud, effect_names)
+            results = simulate_group(
+                eyepoints.some(group_rows), shot_numbers[group_rows], effect_flags
+            )
+            if self.ray_accuracy is not None:
+                n_rays = eyepoints.weight.size
+                self._refine_rays(
+                    scanner, n_rays, shot_numbers[group_rows], effect_flags, results, simulate_group
+                )
+            yield group_rows, results
+
+    def _simulate_cloud(
+        self,
+        flight_block: FlightBlock,
+        draw_slice: slice,
+        effect_names: tuple[str, ...],
+        eyepoints: Eyepoints,
+        shot_numbers: np.ndarray,
+        effect_flags: np.ndarray,
+    ) -> Results:
+        """Points of eyepoints, of shots with these numbers and flags."""
+        from sweep.model.clouds import cloud
+        from sweep.model.error_floor import stray
+        from sweep.model.philox import point_keys
+        from sweep.tasks.studies.user_functions import spectrum_methods
+
+        draws_spectra = self.spec.draws.draws_whole_spectra
+        method_keywords = (
+            {"methods": spectrum_methods(self.parameters_at(flight_block))} if draws_spectra else {}
+        )
+        seed, first_draw = int(self.spec.seed), flight_block.draws.start + draw_slice.start
+        keys = point_keys(shot_numbers[:, None].astype(float), domain=FLIGHT_KEY_DOMAIN, seed=seed)
+        results = cloud(
+            eyepoints,
+            parameters=self.parameters_at(flight_block),
+            surfaces=self.surfaces,
+            keys=keys,
+            first_draw=first_draw,
+            draws=draw_slice.stop - draw_slice.start,
+            method=self.spec.draws.method,
+            **method_keywords,
+            returns=int(self.spec.draws.returns),
+            effects=effect_names,
+            flags=effect_flags,
+            estimates_rays=self.ray_accuracy is not None,
+            priors=self.motion_priors,
+        )
+        if not any(self.error_floor):
+            return results
+        return stray(
+            results, eyepoints, self.error_floor, keys=keys, seed=seed, first_draw=first_draw
+        )
+
+    def _refine_rays(
+        self,
+        scanner: str,
+        n_rays: int,
+        shot_numbers: np.ndarray,
+        effect_flags: np.ndarray,
+        results: Results,
+        simulate_group: Callable[[Eyepoints, np.ndarray, np.ndarray], Results],
+    ) -> None:
+        """Put points of shots that need more rays in the place of their results."""
+        assert self.ray_accuracy is not None
+
+        def cast_more_rays(rows: np.ndarray, n_rays_now: int) -> np.ndarray:
+            row_shots = shot_numbers[rows]
+            finer_results = simulate_group(
+                self.get_eyepoint_study(scanner, n_rays_now).cast_eyepoints(row_shots),
+                row_shots,
+                effect_flags[rows],
+            )
+            for name, values in finer_results.items():
+                results[name][rows] = values
+            return finer_results["beamlets_error"]
+
+        refine_rays(n_rays, results["beamlets_error"], self.ray_accuracy, cast_more_rays)
+
+    def _solve_navigation(
+        self,
+        shots_per_cycle: int,
+        shot_arrays: Results,
+        results: Results,
+        rows: np.ndarray,
+        draw_slice: slice,
+    ) -> Results:
+        """Navigation of cycles, of so many shots each, from the points of these in some draws."""
+        from sweep.model.navigation import solve
+
+        row_index = slice(None) if rows.size == len(results["flags"]) else rows
+        return solve(
+            {name: values[row_index] for name, values in shot_arrays.items() if name in SHOTS},
+            {name: results[name][row_index, draw_slice] for name in POINTS},
+            shots_a_cycle=shots_per_cycle,
+            test_level=self.spec.navigation.test_level,
+            ground_slope=self.spec.navigation.ground_slope,
+            relief=self.spec.navigation.relief,
+            jitter=self.spec.platform.jitter,
+            floor=self.error_floor,
+            priors=self.motion_priors,
+        )
+
+    def _reused_cloud(self, block: int, selected_effects: SelectedEffects) -> ReusedCloud:
+        """Results of a block that a smaller study has, of shots with the same effects."""
+        assert self.reuse_source is not None
+        reuse_source, (scanner_grid, flight_block) = (
+            self.reuse_source,
+            self.locate_flight_block(block),
+        )
+        shots_per_cycle = scanner_grid.shots_per_cycle
+        is_reused, results = reused = self._empty_cloud(
+            scanner_grid, selected_effects.effect_flags.size, len(flight_block.draws)
+        )
+        for shared in reuse_source.iter_shared_points(block):
+            first_draw_results, block_results = (
+                reuse_source.read_block(source_block)
+                for source_block in (
+                    reuse_source.source_study.first_draw_block(shared.source_block),
+                    shared.source_block,
+                )
+            )
+            if first_draw_results is None or block_results is None:
+                continue
+            source_arrays = {
+                name.rpartition("/")[2]: values
+                for name, values in (first_draw_results | block_results).items()
+            }
+            source_results = {
+                name: values.reshape(values.shape[len(reuse_source.source_study.spec.axes) :])
+                for name, values in source_arrays.items()
+                if name not in GEOMETRY_OUTPUTS
+            }
+            (draw_index, cycle_index), (source_draw, source_cycle) = (
+                np.divmod(shared.local_indices, len(flight_block.cycles)),
+                np.divmod(
+                    shared.source_local_indices, len(source_results["flags"]) // shots_per_cycle
+                ),
+            )
+            shot_rows, source_rows = (
+                cycle_numbers[:, None] * shots_per_cycle + np.arange(shots_per_cycle)
+                for cycle_numbers in (cycle_index, source_cycle)
+            )
+            draw_column, source_draw_column = draw_index[:, None], source_draw[:, None]
+            is_reused[shot_rows, draw_column] = (
+                source_results[EFFECTS_ARRAY][source_rows]
+                == selected_effects.effect_flags[shot_rows]
+            )
+            part_results = {name: source_results[name][source_rows] for name in STATISTICS}
+            part_results |= {
+                name: source_results[name][source_rows, source_draw_column] for name in POINTS
+            }
+            _insert_results(results, shot_rows, draw_column, part_results)
+            if scanner_grid.has_navigation:
+                part_results = {
+                    name: source_results[name][source_cycle, source_draw] for name in NAVIGATION
+                }
+                _insert_results(results, cycle_index, draw_index, part_results)
+        reuse_source.reused_points_by_block[block] = int(is_reused.sum())
+        return reused
+
+    def parameters_at(self, flight_block: FlightBlock) -> Mapping[str, Any]:
+        """SI values of all parameters at a block's place along the axes."""
+        scanner_grid = self.scanner_grids[flight_block.scanner]
+        return scanner_grid.fixed_parameters | {
+            path: axis_values[index].item()
+            for values, index in zip(
+                scanner_grid.values_by_axis, flight_block.axis_indices, strict=True
+            )
+            for path, axis_values in values.items()
+        }
+
+    @cached_property
+    def error_floor(self) -> ErrorFloor:
+        """Errors of the instrument that no echo lowers."""
+        from sweep.model.error_floor import ErrorFloor
+
+        stated = self.spec.error_floor
+        return ErrorFloor(
+            stated.pointing_error, stated.clock_error, stated.wavelength_error, stated.vibration,
+            stated.range_noise,
+        )  # fmt: skip
+
+    @cached_property
+    def motion_priors(self) -> MotionPriors:
+        """Deviations of motion that the instrument does not measure, as the spec states them."""
+        from sweep.model.own_motion import MotionPriors
+
+        stated = self.spec.navigation
+        return MotionPriors(stated.terrain_slope, stated.target_speed, stated.target_acceleration)
+
+    @cached_property
+    def surfaces(self) -> tuple[Surface, ...]:
+        """Surfaces by their numbers."""
+        return tuple(self.spec.surfaces())
+
+    @cached_property
+    def ray_accuracy(self) -> Accuracy | None:
+        """Says how many rays a shot needs; None where their number is given."""
+        return (
+            Accuracy.of(self.spec.parameters())
+            if self.spec.is_ray_number_set_by_tolerance
+            else None
+        )
+
+    def _open_eyepoints(self, scanner: str) -> Mapping[str, Any]:
+        """Arrays of a scanner's eyepoints by name, opened once; their weights read."""
+        group = open_array_group(eyepoints_path(self.store_path, self.spec.geometry_id(scanner)))
+        arrays: dict[str, Any] = {name: group[name] for name in SHOTS | BEAMLETS | CYCLES}
+        return arrays | {"weight": np.asarray(group["weight"][...])}  # type: ignore[index]
+
+    def _read_eyepoint_arrays(
+        self, scanner: str, names: Mapping[str, Any], index_range: range
+    ) -> Results:
+        """Arrays of a scanner's eyepoints, of some shots or cycles."""
+        arrays = self._get_eyepoint_arrays(scanner)
+        return {
+            name: np.asarray(arrays[name][index_range.start : index_range.stop]) for name in names
+        }
+
+    def _read_shots_and_eyepoints(
+        self, scanner: str, shot_range: range
+    ) -> tuple[Results, Eyepoints]:
+        """Arrays of some shots, and their eyepoints."""
+        from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
+
+        shot_arrays = self._read_eyepoint_arrays(scanner, SHOTS, shot_range)
+        beamlet_arrays = self._read_eyepoint_arrays(scanner, BEAMLETS, shot_range)
+        return shot_arrays, eyepoints_from_arrays(
+            shot_arrays | beamlet_arrays, self._get_eyepoint_arrays(scanner)["weight"]
+        )
+
+    def eyepoint_studies(self) -> list[EyepointStudy]:
+        """Return the studies that this one looks with."""
+        return [self.get_eyepoint_study(scanner) for scanner in self.scanner_grids]
+
+
+def _iter_missing(is_missing: np.ndarray) -> Iterator[tuple[np.ndarray, slice]]:
+    """Rows and stretches of draws that are lacking; rows that lack the same come together."""
+    patterns, pattern_of_row = np.unique(is_missing, axis=0, return_inverse=True)
+    for pattern_number, pattern in enumerate(patterns):
+        rows = np.flatnonzero(pattern_of_row.ravel() == pattern_number)
+        edges = np.flatnonzero(np.diff(pattern, prepend=False, append=False))
+        for start, stop in edges.reshape(-1, 2).tolist():
+            yield rows, slice(start, stop)
+
+
+def _insert_results(
+    results: Results, rows: np.ndarray, draw_index: slice | np.ndarray, part_results: Results
+) -> None:
+    """Put results of some rows and draws into those of all."""
+    for name, values in part_results.items():
+        results[name][rows if name in STATISTICS else (rows, draw_index)] = values
+
+
+class ShotEffectPlan(NamedTuple):
+    """Plans of shots of a flight."""
+
+    hitting_shots: np.ndarray  # places of the shots that see something
+    tile_index: np.ndarray  # index of the tile of each of these
+    plan: Plan  # Of the tiles
+
+    def selected_effects(self, n_shots: int) -> SelectedEffects:
+        """Effects simulated at that many shots; none where nothing is seen."""
+        selected = SelectedEffects(np.zeros(n_shots, np.uint32), np.zeros(n_shots))
+        selected.effect_flags[self.hitting_shots] = flags_of(self.plan.kept)[self.tile_index]
+        selected.error_bound[self.hitting_shots] = self.plan.error[self.tile_index]
+        return selected
+
+
+def plan_shot_effects(
+    eyepoints: Eyepoints,
+    tile_of_shot: np.ndarray,
+    parameters: Mapping[str, Any],
+    surfaces: Sequence[Surface],
+    *,
+    modes: Mapping[str, str],
+    rotating: bool,
+    rays_by_tolerance: bool = False,
+) -> ShotEffectPlan | None:
+    """Plans of a flight's shots at one place along its axes; None where none sees anything.
+
+    ``tile_of_shot``: the number of the tile of each shot, rising.
+    """
+    from sweep.model.effects.planning import plan
+    from sweep.model.eyepoints import seen_ground
+
+    hitting_shots = eyepoints.seen.nonzero()[0]
+    if not hitting_shots.size:
+        return None
+    hitting_eyepoints = (
+        eyepoints if hitting_shots.size == len(tile_of_shot) else eyepoints.some(hitting_shots)
+    )
+    run_edges, tile_index = _tile_runs(tile_of_shot[hitting_shots])
+    shots, ground = seen_ground(hitting_eyepoints, DEFAULTS | dict(parameters), surfaces)
+    points = Points(shots, of_rays(ground), rotating=rotating)
+
+    def max_per_tile(values: np.ndarray) -> np.ndarray:
+        return np.maximum.reduceat(
+            np.broadcast_to(values, hitting_eyepoints.time.shape), run_edges[:-1]
+        )
+
+    n_rays = 0 if rays_by_tolerance else hitting_eyepoints.offset.shape[1]
+    effect_plan = plan(points, max_per_tile, modes, effects_tolerance(parameters, n_rays))
+    return ShotEffectPlan(hitting_shots, tile_index, effect_plan)
+
+
+def _tile_runs(tile_numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Edges of stretches of the same tile among some, one at least; index of each one's stretch."""
+    starts_new_run = np.diff(tile_numbers) != 0
+    run_edges = np.concatenate([[0], np.flatnonzero(starts_new_run) + 1, [tile_numbers.size]])
+    return run_edges, np.concatenate([[0], np.cumsum(starts_new_run)])

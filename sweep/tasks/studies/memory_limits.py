@@ -1,0 +1,165 @@
+"""Check that a study's memory fits its workers, before anything is computed."""
+
+from __future__ import annotations
+
+from concurrent.futures import CancelledError
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from sweep.messages import option_text
+from sweep.spec import SceneSpec
+from sweep.spec.cluster_config import AnyClusterConfig, LocalClusterConfig, WorkerBounds
+from sweep.spec.rules import Mistake, SpecError
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+    from sweep.spec import GridSpec
+    from sweep.tasks.engine.blocks import BlockStudy
+    from sweep.tasks.studies.flight_study import FlightStudy
+    from sweep.tasks.studies.grid_study import GridStudy
+
+FFT_SIZE_PARAMETER = "instrument.processing.fft_size"
+
+BYTES_PER_BIN = 250
+BYTES_PER_DRAWN_BIN = 300
+"""Peak memory of a point per point of its FFT [bytes], measured at 2^20 and 2^22: for closed-form
+results, and for draws of whole spectra."""
+
+
+def fft_size_max(spec: GridSpec | SceneSpec) -> int:
+    """Return the largest number of points of the FFT in a study."""
+    sizes = [
+        member.values
+        for axis in spec.axes
+        for member in axis.parameters
+        if member.path == FFT_SIZE_PARAMETER
+    ]
+    return int(np.max(sizes[0])) if sizes else int(spec.parameters()[FFT_SIZE_PARAMETER])
+
+
+def point_bytes_max(spec: GridSpec | SceneSpec) -> int:
+    """Return the peak memory of one point, or shot [bytes]."""
+    draws_spectra = getattr(spec.draws, "draws_whole_spectra", False)
+    return fft_size_max(spec) * (BYTES_PER_DRAWN_BIN if draws_spectra else BYTES_PER_BIN)
+
+
+def scene_bytes(spec: SceneSpec) -> int:
+    """Return the size of a scene's triangles and search trees, copied into each process [bytes]."""
+    from sweep.tasks.studies.eyepoint_study import build_world
+
+    return build_world(spec).caster.nbytes
+
+
+class WorkerMemory(NamedTuple):
+    """Memory available to a process that computes points."""
+
+    bytes_max: float
+    """Largest memory that the process may use [bytes]; inf if unknown."""
+    process_name: str
+    """Name of the process in messages, as the subject of a sentence: `this machine`."""
+    workers_sharing: int = 1
+    """Number of workers that share this machine's memory; 1 if each has a limit of its own."""
+
+
+def serial_worker_memory() -> WorkerMemory:
+    """Return the memory available to serial computation in this process."""
+    # Here, as a spec with mistakes is told without the second that this import takes.
+    from distributed.system import MEMORY_LIMIT
+
+    return WorkerMemory(MEMORY_LIMIT, "this machine")
+
+
+def worker_memory(client: Client | None, cluster: AnyClusterConfig | None) -> WorkerMemory:
+    """Return the memory of the smallest worker of a client, or of a cluster to be started."""
+    if client is not None:
+        return WorkerMemory(_least_memory_limit(client), "a worker of the client")
+    if isinstance(cluster, LocalClusterConfig):
+        from sweep.tasks.engine.cluster_connection import cpu_count
+        from sweep.tasks.engine.deploy.local_ssh import worker_memory_limit
+
+        bounds = cluster.workers or WorkerBounds(cpu_count(), cpu_count())
+        workers_sharing = 1 if cluster.worker.memory else bounds.most
+        return WorkerMemory(worker_memory_limit(cluster, bounds), "each worker", workers_sharing)
+    bytes_max = getattr(getattr(cluster, "worker", None), "memory", None)
+    return WorkerMemory(bytes_max or np.inf, "each worker of the cluster")
+
+
+def _least_memory_limit(client: Client) -> float:
+    """Return the least memory of a client's workers [bytes]; inf if there is none, or no limit.
+
+    Of a client that is closed, or whose scheduler is gone, nothing is known: a study with blocks
+    left says so when it reaches for the workers, and a complete one needs none.
+    """
+    if client.status != "running":
+        return np.inf
+    try:
+        workers = client.scheduler_info(n_workers=-1).get("workers", {}).values()
+    except (OSError, RuntimeError, CancelledError):  # gone meanwhile
+        return np.inf
+    return min((worker.get("memory_limit") or np.inf for worker in workers), default=np.inf)
+
+
+def refuse_too_large_point(spec: GridSpec | SceneSpec, worker_memory: WorkerMemory) -> None:
+    """Raise a SpecError if one point needs more memory than a process has."""
+    bytes_needed = point_bytes_max(spec)
+    if bytes_needed > worker_memory.bytes_max:
+        rule = (
+            f"makes a point take about {_gigabytes_text(bytes_needed)} of memory, "
+            f"{_available_phrase(worker_memory)}"
+        )
+        size = f"{fft_size_max(spec):,} points"
+        remedy = f"take fewer points of the FFT{_fewer_workers_remedy(worker_memory, bytes_needed)}"
+        raise SpecError([Mistake(FFT_SIZE_PARAMETER, rule, size, remedy)])
+
+
+def refuse_too_large_study(study: GridStudy | FlightStudy, worker_memory: WorkerMemory) -> None:
+    """Refuse a study of which a point, a block or the scene takes more than a process has."""
+    refuse_too_large_point(study.spec, worker_memory)
+    refuse_too_large_blocks(study, worker_memory)
+    if isinstance(study.spec, SceneSpec):
+        refuse_too_large_scene(study.spec, worker_memory)
+
+
+def refuse_too_large_scene(spec: SceneSpec, worker_memory: WorkerMemory) -> None:
+    """Raise a SpecError if a scene and one point need more memory than a process has."""
+    bytes_needed = point_bytes_max(spec) + scene_bytes(spec)
+    if bytes_needed > worker_memory.bytes_max:
+        rule = (
+            f"takes about {_gigabytes_text(bytes_needed)} of memory in each process that computes, "
+            f"{_available_phrase(worker_memory)}"
+        )
+        remedy = (
+            f"take coarser grounds and meshes{_fewer_workers_remedy(worker_memory, bytes_needed)}"
+        )
+        raise SpecError([Mistake("scene.objects", rule, "", remedy)])
+
+
+def refuse_too_large_blocks(study: BlockStudy, worker_memory: WorkerMemory) -> None:
+    """Raise a SpecError if the results of one block need more memory than a process has."""
+    bytes_needed = 2 * study.block_nbytes_max  # its own, and those being encoded
+    if bytes_needed > worker_memory.bytes_max:
+        rule = (
+            f"makes a block take about {_gigabytes_text(bytes_needed)} of memory, "
+            f"{_available_phrase(worker_memory)}"
+        )
+        raise SpecError([Mistake("storage", rule, "", "lower the number that a block holds")])
+
+
+def _available_phrase(worker_memory: WorkerMemory) -> str:
+    return f"and {worker_memory.process_name} has {_gigabytes_text(worker_memory.bytes_max)}"
+
+
+def _fewer_workers_remedy(worker_memory: WorkerMemory, bytes_needed: float) -> str:
+    """Return a remedy such as ', or --workers 4' if fewer workers would suffice, else ''."""
+    n_workers = int(worker_memory.bytes_max * worker_memory.workers_sharing / bytes_needed)
+    return (
+        f", or {option_text('workers', n_workers)}"
+        if 1 <= n_workers < worker_memory.workers_sharing
+        else ""
+    )
+
+
+def _gigabytes_text(n_bytes: float) -> str:
+    return f"{n_bytes / 1e9:,.1f} GB"

@@ -1,0 +1,213 @@
+"""Spectra of a shot, draw by draw, for code of one's own: with noise, its level, and the truth."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sweep.messages import option_text
+from sweep.model.detectors import taper
+from sweep.model.effects.catalogue import DEFAULTS, EFFECTS
+from sweep.model.looks import NUMBER, Looks
+from sweep.storage.locations import atomic_path, is_free
+from sweep.storage.size_checks import SingleWriterLocalStore
+from sweep.tasks.engine.progress import StoreError
+from sweep.tasks.studies.grid_study import draw_keys
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from sweep.model.preparation import Shots
+    from sweep.spec import GridSpec
+
+SEGMENT_NAMES = ("up", "doppler", "down")
+FILE_SUFFIXES = (".zarr", ".npz")
+
+
+def point_spectra(
+    spec: GridSpec,
+    parameters: Mapping[str, float | int | str],
+    *,
+    n_draws: int,
+    first_draw: int = 0,
+) -> xr.Dataset:
+    """Spectra of one point of a study, by the SI values of its parameters, as the study draws them.
+
+    Complex ``spectrum`` (draw, segment, frequency), ``signal`` without noise, and what is true.
+    Every effect is there that is not off and that the point has anything of. The draws begin at
+    ``first_draw``.
+    """
+    from sweep.model.noisy_spectra import drawn_of, noise_of, signal_of, speckle_of
+    from sweep.model.realisations import random_effects, realise
+
+    if Looks.of(parameters).number > 1:
+        raise ValueError(
+            f"a file of spectra holds one record of each segment, and {NUMBER} takes "
+            f"{Looks.of(parameters).number}: export a point of one look"
+        )
+    effect_modes, key = spec.effect_modes(), draw_keys(spec, parameters, 1)
+    arrays = {path: np.asarray(value) for path, value in (DEFAULTS | dict(parameters)).items()}
+    effect_names = [
+        e.name for e in EFFECTS if effect_modes[e.name] != "off" and not e.absent(arrays).all()
+    ]
+    draw_numbers, has_random_effects = (
+        np.arange(first_draw, first_draw + n_draws),
+        bool(random_effects(effect_names)),
+    )
+    realisations = realise(
+        parameters,
+        effect_names,
+        keys=key,
+        first_draw=first_draw,
+        draws=n_draws if has_random_effects else 1,
+    )
+    drawn_spectra, signals_by_draw, shots = [], [], None
+    for realisation in realisations:
+        shots = realisation.shots
+        for shot, draw in enumerate(realisation.draw):
+            segments = list(map(int, np.flatnonzero(shots.segments)))
+            signals = [signal_of(shots, shot, segment) for segment in segments]
+            draws = np.array([draw]) if has_random_effects else draw_numbers
+            drawn_spectra.append(np.stack([
+                drawn_of(shots, shot, segment, signal, key=key[0], draws=draws)
+                * speckle_of(shots, shot, segment, signal, key=key[0], draws=draws)
+                + noise_of(shots, shot, segment, key=key[0], draws=draws)
+                for segment, signal in zip(segments, signals, strict=True)
+            ], axis=1))  # fmt: skip
+            signals_by_draw.append(signals)
+    assert shots is not None  # one draw is asked for at least
+    return _spectra_dataset(
+        spec, shots, np.concatenate(drawn_spectra), signals_by_draw, draw_numbers
+    )
+
+
+VARIABLE_ATTRIBUTES = {
+    "spectrum": ("V", "X[k] with noise, no 1/N"),
+    "signal": ("V", "X[k] without noise"),
+    "noise_power": ("V^2", "mean |X|^2 of a bin of noise alone"),
+    "threshold": ("V", "fixed threshold on |X|"),
+    "window": ("1", "samples of the window"),
+    "true_frequency": ("Hz", "place of the signal's peak between bins"),
+    "first_bin": ("1", "first bin that the signal occupies"),
+    "last_bin": ("1", "last bin that the signal occupies"),
+    "cnr": ("1", "signal over noise in the record"),
+    "line_frequency": ("Hz", "where each beamlet's line appears"),
+    "line_amplitude": ("V", "amplitude of each beamlet's beat at the ADC"),
+    "range": ("m", "true range"),
+    "radial_velocity": ("m s-1", "true radial velocity, positive when closing"),
+    "draw": ("1", "number of the draw"),
+    "segment": ("", "segment of the waveform"),
+    "frequency": ("Hz", "frequency of the bin"),
+}
+"""Units and meaning of what is written."""
+
+
+def _spectra_dataset(
+    spec: GridSpec,
+    shots: Shots,
+    spectrum: np.ndarray,
+    signals_by_draw: list[list[Any]],
+    draw_numbers: np.ndarray,
+) -> xr.Dataset:
+    import xarray as xr
+
+    bin_width = float(shots.sample_rate[0]) / shots.fft_size
+    segment_names = [
+        name for name, is_there in zip(SEGMENT_NAMES, shots.segments, strict=True) if is_there
+    ]
+    signal_dims = ("draw", "segment") if len(signals_by_draw) > 1 else ("segment",)
+
+    def signal_values(name: str) -> np.ndarray:
+        values = np.array(
+            [[getattr(signal, name) for signal in signals] for signals in signals_by_draw]
+        )
+        return values if len(signals_by_draw) > 1 else values[0]
+
+    line_frequency, line_amplitude = _beamlet_lines(shots, bin_width)
+    variable_contents: dict[str, tuple[tuple[str, ...], Any]] = {
+        "spectrum": (("draw", "segment", "frequency"), spectrum),
+        "signal": ((*signal_dims, "frequency"), signal_values("spectrum")),
+        "noise_power": ((), float(shots.window.energy * shots.noise_variance[-1])),
+        "threshold": ((), float(shots.threshold[-1])),
+        "window": (("sample",), taper(shots.window)),
+        "true_frequency": (signal_dims, signal_values("frequency") * bin_width),
+        "first_bin": (signal_dims, signal_values("first")),
+        "last_bin": (signal_dims, signal_values("last")),
+        "cnr": (signal_dims, signal_values("cnr")),
+        "line_frequency": (("segment", "line"), line_frequency),
+        "line_amplitude": (("line",), line_amplitude),
+        "range": ((), float(shots.range[-1])),
+        "radial_velocity": ((), float(shots.radial_velocity[-1])),
+        "draw": (("draw",), draw_numbers),
+        "segment": (("segment",), np.array(segment_names, dtype=object)),
+        "frequency": (("frequency",), shots.signed_bins * bin_width),
+    }
+    variables = {
+        name: (
+            dims,
+            values,
+            dict(zip(("units", "long_name"), VARIABLE_ATTRIBUTES[name], strict=True)),
+        )
+        for name, (dims, values) in variable_contents.items()
+    }
+    return xr.Dataset(
+        variables,
+        attrs={
+            "title": spec.title, "spec": spec.to_json(), "fft_size": shots.fft_size,
+            "sample_rate": float(shots.sample_rate[0]), "window_name": shots.window.name,
+        },
+    )  # fmt: skip
+
+
+def _beamlet_lines(shots: Shots, bin_width: float) -> tuple[np.ndarray, np.ndarray]:
+    """Frequencies of the beamlets' lines [Hz], (segments, lines), and their amplitudes [V]."""
+    from sweep.model.returns import beamlet_lines
+
+    line_bins = beamlet_lines(shots)[-1, list(shots.segments)]
+    scale = np.broadcast_to(shots.beat_scale, shots.size)[-1]
+    return line_bins * bin_width, shots.amplitude[int(shots.row[-1])] * scale
+
+
+def write_spectra(dataset: xr.Dataset, path: Path, *, overwrite: bool = False) -> None:
+    """Write spectra as a Zarr store or as a numpy archive, by the path's suffix.
+
+    StoreError for another suffix, or something in the way: with `overwrite`, what is no such
+    file.
+    """
+    if path.suffix not in FILE_SUFFIXES:
+        raise StoreError(f"{path} ends in neither {' nor '.join(FILE_SUFFIXES)}")
+    if not is_free(path):
+        if not overwrite:
+            raise StoreError(
+                f"{path} is there already: {option_text('overwrite')} puts the new one in its place"
+            )
+        if not _is_spectra_file(path):
+            raise StoreError(f"{path} holds no spectra of `sweep spectra`: name another file")
+    with atomic_path(path.resolve(), replace=overwrite) as draft_path:
+        if path.suffix == ".zarr":
+            dataset.to_zarr(
+                SingleWriterLocalStore(draft_path), mode="w", zarr_format=3, consolidated=False
+            )
+            return
+        arrays = {str(name): value.values for name, value in dataset.variables.items()}
+        arrays["segment"] = arrays["segment"].astype("U")  # objects would have to be unpickled
+        with open(draft_path, "wb") as file:  # by a name, numpy would give it a suffix
+            np.savez_compressed(file, **arrays, attributes=np.array(json.dumps(dataset.attrs)))  # type: ignore[arg-type]
+
+
+def _is_spectra_file(path: Path) -> bool:
+    """Tell whether a file or folder is what `write` makes, by the names in it."""
+    expected_names = {*VARIABLE_ATTRIBUTES, "attributes"}
+    try:
+        if path.suffix == ".npz":
+            with zipfile.ZipFile(path) as archive:
+                return {name.removesuffix(".npy") for name in archive.namelist()} == expected_names
+        array_names = {entry.name for entry in path.iterdir() if (entry / "zarr.json").is_file()}
+        return array_names == expected_names - {"attributes"}
+    except (OSError, zipfile.BadZipFile):
+        return False

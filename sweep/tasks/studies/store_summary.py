@@ -1,0 +1,485 @@
+"""Stores in numbers: blocks done, detection, what came back in a flight, errors and tolerance.
+
+StoreError where there is no store of sweep's, or one of another kind.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sweep.model.accuracy import Accuracy
+from sweep.model.outputs import PROMISED
+from sweep.model.unsupported import UnsupportedShot
+from sweep.storage.locations import PACKED_ATTRIBUTE, Location, file_sizes_below, parse_location
+from sweep.storage.store_format import read_receipt_totals
+from sweep.storage.verified_store import open_array_group
+from sweep.tasks.engine import journal
+from sweep.tasks.engine.blocks import TOLERANCE_PARAMETER, BlockStudy
+from sweep.tasks.engine.journal import blocks_with_receipt, checkpoint_points
+from sweep.tasks.engine.progress import StoreError
+from sweep.tasks.studies import study_loading
+from sweep.tasks.studies.flight_study import FlightStudy
+from sweep.tasks.studies.grid_study import (
+    GridStudy,
+    evaluate_points,
+    limit_draws,
+    select_parameters,
+)
+
+if TYPE_CHECKING:
+    from sweep.spec import Axis
+
+#: Probability of detection above which a point counts as detected.
+DETECTED_PD_MIN = 0.9
+
+#: Rows of the table beside the one for the whole grid.
+SUMMARY_ROWS_MAX = 10
+
+#: Points and blocks that are looked at; of larger studies, blocks drawn by chance.
+SAMPLED_POINTS_MAX = 1 << 23
+SAMPLED_BLOCKS_MAX = 1000
+
+#: Places along the axes that are told one by one, of a flight.
+AXIS_POINTS_LISTED_MAX = 12
+
+
+@dataclass(frozen=True)
+class DetectionRow:
+    """Detection over one part of the grid; NaN points, not computed, are left out."""
+
+    label: str
+    n_points: int
+    detected_fraction: float  # fraction of points with pd_shot above `DETECTED`
+    median_pd_shot: float  # medians
+    median_pd_doppler: float
+
+    @classmethod
+    def from_points(cls, label: str, pd_shot: np.ndarray, pd_doppler: np.ndarray) -> DetectionRow:
+        """Return the row of some points, (n,) each; there may be no Doppler segment."""
+        is_computed = ~np.isnan(pd_shot)
+        pd_shot, pd_doppler = (
+            pd_shot[is_computed],
+            pd_doppler[is_computed & np.isfinite(pd_doppler)],
+        )
+        if not pd_shot.size:
+            return cls(label, 0, float("nan"), float("nan"), float("nan"))
+        median_doppler = float(np.median(pd_doppler)) if pd_doppler.size else float("nan")
+        detected_fraction = float(np.mean(pd_shot > DETECTED_PD_MIN))
+        return cls(
+            label, pd_shot.size, detected_fraction, float(np.median(pd_shot)), median_doppler
+        )
+
+
+def detection_summary(store: str | Location) -> tuple[str, list[DetectionRow], float]:
+    """Heading of the slowest axis; a row for each part of it and one for all.
+
+    The share of the blocks that are done, of which some are looked at, comes last.
+    """
+    store_path = parse_location(store)
+    _, study = study_loading.read_study(store_path)
+    if not isinstance(study, GridStudy):
+        raise StoreError(f"{store_path} holds no study over a grid")
+    blocks, block_fraction = _sample_blocks(store_path, study, None)
+    axis = study.spec.axes[0] if study.spec.axes else None
+    n_values = (
+        axis.size if axis else 1
+    )  # in parts of a value each, or of several where there are many
+    part_edges = np.linspace(0, n_values, min(n_values, SUMMARY_ROWS_MAX) + 1).astype(int)
+    values_by_part: list[list[np.ndarray]] = [[np.empty((2, 0))] for _ in part_edges[1:]]
+    for region, values in iter_block_values(store_path, study, ("pd_shot", "pd_doppler"), blocks):
+        pd_pair = np.stack(values).reshape(2, -1, *values[0].shape[1:])
+        axis_indices = np.arange(pd_pair.shape[1]) + (region[0].start if region else 0)
+        for part_values, (first, stop) in zip(values_by_part, pairwise(part_edges), strict=True):
+            part_values.append(
+                pd_pair[:, (first <= axis_indices) & (axis_indices < stop)].reshape(2, -1)
+            )
+    pd_by_part = [np.concatenate(values_of_part, axis=1) for values_of_part in values_by_part]
+    total_row = DetectionRow.from_points("all", *np.concatenate(pd_by_part, axis=1))
+    if axis is None:
+        return "", [total_row], block_fraction
+    labels = [_axis_range_label(axis, first, stop) for first, stop in pairwise(part_edges)]
+    rows = [
+        DetectionRow.from_points(label, *values)
+        for label, values in zip(labels, pd_by_part, strict=True)
+    ]
+    units = axis.parameters[0].units if len(axis.parameters) == 1 else ""
+    return f"{axis.name} [{units}]" if units else axis.name, [*rows, total_row], block_fraction
+
+
+def count_unsupported_points(
+    store: str | Location, done_blocks: np.ndarray | None = None
+) -> tuple[int, str]:
+    """Count points beyond the model, of a sample; return the reason for the first."""
+    store_path = parse_location(store)
+    _, study = study_loading.read_study(store_path)
+    if not isinstance(study, GridStudy):
+        return 0, ""
+    (blocks, _), n_unsupported, first_reason = _sample_blocks(store_path, study, done_blocks), 0, ""
+    for block, (_, (pd_shot,)) in zip(
+        blocks, iter_block_values(store_path, study, ("pd_shot",), blocks), strict=True
+    ):
+        points = np.flatnonzero(np.isnan(pd_shot))
+        if points.size and not n_unsupported:
+            first_reason = unsupported_reason(study, int(block), points[:1])
+        n_unsupported += points.size
+    return n_unsupported, first_reason
+
+
+def unsupported_reason(study: GridStudy, block: int, local_index: np.ndarray) -> str:
+    """Reason that the model does not hold for a point of a block."""
+    ((_, effects),) = (
+        study.effect_planner.select_for_block(block).subset(local_index).iter_equal_groups()
+    )
+    try:
+        parameters = select_parameters(study.grid.parameters(block), local_index)
+        evaluate_points(limit_draws(study.spec, 1), parameters, 1, effects)
+    except UnsupportedShot as error:
+        return str(error)
+    return "it is not any more"
+
+
+def _sample_blocks(
+    store: Location, study: BlockStudy, done_blocks: np.ndarray | None
+) -> tuple[np.ndarray, float]:
+    """Blocks to look at, of those done: all, or some by chance but always the same; their share."""
+    done_blocks = (
+        np.flatnonzero(blocks_with_receipt(store, study)) if done_blocks is None else done_blocks
+    )
+    n_sampled = min(
+        SAMPLED_BLOCKS_MAX, max(SAMPLED_POINTS_MAX * study.n_blocks // study.n_points, 1)
+    )
+    if len(done_blocks) <= n_sampled:
+        return done_blocks, 1.0
+    return np.sort(
+        np.random.default_rng(0).choice(done_blocks, n_sampled, replace=False)
+    ), n_sampled / len(done_blocks)
+
+
+def _axis_range_label(axis: Axis, start: int, end: int) -> str:
+    """Values of a part of an axis; numbers of its points where it has several parameters."""
+    values = range(axis.size) if len(axis.parameters) > 1 else axis.parameters[0].display_values
+    return "..".join(dict.fromkeys([_format_value(values[start]), _format_value(values[end - 1])]))
+
+
+def _format_value(value: object) -> str:
+    if not isinstance(value, float):
+        return str(value)
+    return f"{value:.0f}" if 1e4 <= abs(value) < 1e6 else f"{value:.4g}"
+
+
+def iter_block_values(
+    store: Location, study: BlockStudy, array_names: Sequence[str], blocks: np.ndarray
+) -> Iterator[tuple[tuple[slice, ...], list[np.ndarray]]]:
+    """Slices of some arrays, all cut alike, that each block has written, and their values."""
+    group = open_array_group(store)
+    arrays: list[Any] = [group[array_name] for array_name in array_names]
+    for block in blocks:
+        if (region := study.chunk_regions(int(block)).get(array_names[0])) is not None:
+            yield region, [np.asarray(array[region or ...]) for array in arrays]
+
+
+@dataclass
+class ScannerRow:
+    """Echoes of a scanner at one place along the axes, in the blocks that are committed."""
+
+    label: str
+    n_shots: int = 0  # times draws
+    shots_with_true_return: int = 0  # of these, with at least one true return
+    false_points: int = 0  # points that are no true return
+    n_cycles: int = 0  # times draws; 0 where a cycle has too few shots
+    solved_cycles: int = 0  # of these, with a velocity vector
+    pd_of_shots: list[np.ndarray] = field(default_factory=list, repr=False)
+
+    @property
+    def mean_pd(self) -> float:
+        """Mean probability of detection of shots that see something; nan where none does."""
+        all_pd = np.concatenate([*self.pd_of_shots, np.empty(0)])
+        return float(all_pd.mean()) if all_pd.size else float("nan")
+
+    def add(self, block_arrays: Mapping[str, np.ndarray]) -> None:
+        """Count a block, by its part of each array."""
+        from sweep.model.navigation import EXCLUDED
+        from sweep.model.pairing import TRUE
+
+        point_flags = block_arrays["flags"]
+        self.n_shots += point_flags[..., 0].size
+        self.shots_with_true_return += int(((point_flags & TRUE) > 0).any(axis=-1).sum())
+        self.false_points += int(((point_flags > 0) & ((point_flags & TRUE) == 0)).sum())
+        if "pd_shot" in block_arrays:  # with the first draws alone
+            self.pd_of_shots.append(block_arrays["pd_shot"][np.isfinite(block_arrays["pd_shot"])])
+        if "velocity_status" in block_arrays:
+            status = block_arrays["velocity_status"]
+            self.n_cycles += status.size
+            self.solved_cycles += int((status <= EXCLUDED).sum())
+
+
+def scene_summary(store: str | Location) -> list[ScannerRow]:
+    """Return a row for each scanner and place along the axes, or scanner if many."""
+    store_path = parse_location(store)
+    _, study = study_loading.read_study(store_path)
+    if not isinstance(study, FlightStudy):
+        raise StoreError(f"{store_path} holds no study of a scene")
+    axis_points = list(np.ndindex(tuple(int(axis.size) for axis in study.spec.axes)))
+    is_listed_by_axis_point = len(axis_points) <= AXIS_POINTS_LISTED_MAX
+    rows = {
+        (scanner, axis_point): ScannerRow(
+            ", ".join([scanner, *axis_value_labels(study.spec.axes, axis_point)])
+        )
+        for scanner in study.scanner_grids
+        for axis_point in (axis_points if is_listed_by_axis_point else [()])
+    }
+    group: Any = open_array_group(store_path)
+    for block in np.flatnonzero(blocks_with_receipt(store_path, study)).tolist():
+        _, flight_block = study.locate_flight_block(block)
+        regions = study.chunk_regions(block)
+        names = (
+            f"{flight_block.scanner}/{name}" for name in ("flags", "pd_shot", "velocity_status")
+        )
+        block_arrays = {
+            name.rpartition("/")[2]: np.asarray(group[name][regions[name]])
+            for name in names
+            if name in regions
+        }
+        rows[
+            flight_block.scanner, flight_block.axis_indices if is_listed_by_axis_point else ()
+        ].add(block_arrays)
+    return list(rows.values())
+
+
+def axis_value_labels(axes: Sequence[Axis], axis_point: tuple[int, ...]) -> list[str]:
+    """Values at a place along axes; of its first axes, where there are more."""
+    return [
+        f"{member.coordinate} "
+        f"{_format_value(member.display_values[index])}{' ' * bool(member.units)}{member.units}"
+        for axis, index in zip(axes, axis_point, strict=False)
+        for member in axis.parameters
+    ]
+
+
+@dataclass
+class AccuracyRow:
+    """Error of a probability of detection, or of all that depends on a scanner's rays."""
+
+    name: str
+    """Of the probability or the scanner; none for a grid's beamlets, which are counted as rays."""
+    n_points: int = (
+        0  # computed, with a known error; of a flight shots, times places along the axes
+    )
+    n_met: int = 0  # of these, within the tolerance
+    worst_error: float = (
+        math.nan
+    )  # of the point that is furthest above its tolerance: its half-width
+    tolerance_at_worst: float = math.nan  # there
+    worst_label: str = ""
+    samples_at_worst: int = 0  # of draws, or of rays, that it has had there
+    total_samples: int = 0  # the same of all points
+    samples_max: int = 0
+    worst_index: tuple[int, ...] = ()  # place of that point in the array
+    block_fraction: float = 1.0  # share of the blocks, of large studies
+    _worst_excess: float = -math.inf
+
+    @property
+    def excess(self) -> float:
+        """By how much the tolerance is missed at the worst point; 0 where it is met."""
+        return max(0.0, self.worst_error - self.tolerance_at_worst)
+
+    @property
+    def mean_samples(self) -> float:
+        """Draws or rays of a point."""
+        return self.total_samples / max(self.n_points, 1)
+
+    @property
+    def draws_needed(self) -> float:
+        """Draws that would do there, about; nan where these did, inf where none would."""
+        if not self.excess:
+            return math.nan
+        if not self.tolerance_at_worst:
+            return math.inf
+        return math.ceil(self.samples_at_worst * (self.worst_error / self.tolerance_at_worst) ** 2)
+
+    def add(
+        self,
+        errors: np.ndarray,
+        tolerances: np.ndarray,
+        samples: np.ndarray,
+        start_index: tuple[int, ...],
+    ) -> None:
+        """Take in some points, the first of which is at ``start_index``."""
+        is_known = np.isfinite(errors)
+        samples = np.where(is_known, np.nan_to_num(samples), 0)
+        excess = np.where(is_known, errors - tolerances, -np.inf)
+        self.n_points += int(is_known.sum())
+        self.n_met += int((excess <= 0).sum() - (~is_known).sum())
+        self.total_samples += int(samples.sum())
+        self.samples_max = max(self.samples_max, int(samples.max(initial=0)))
+        worst = np.unravel_index(np.argmax(excess), excess.shape)
+        if excess[worst] > self._worst_excess:
+            self._worst_excess, self.worst_error = float(excess[worst]), float(errors[worst])
+            self.tolerance_at_worst, self.samples_at_worst = (
+                float(tolerances[worst]),
+                int(samples[worst]),
+            )
+            self.worst_index = tuple(
+                offset + int(i) for offset, i in zip(start_index, worst, strict=True)
+            )
+
+
+def draw_accuracy_rows(
+    store: str | Location, done_blocks: np.ndarray | None = None
+) -> list[AccuracyRow]:
+    """Return a row for each promised probability; none if nothing is drawn or computed."""
+    store_path = parse_location(store)
+    _, study = study_loading.read_study(store_path)
+    if not isinstance(study, GridStudy) or not study.spec.draws.has_draws:
+        return []
+    error_arrays = {name: f"{name}_half_width" for name in PROMISED}
+    return [
+        row
+        for row in _accuracy_rows(
+            store_path, study, done_blocks, error_arrays, "n_draws", _tolerance_over_grid(study)
+        )
+        if row.n_points
+    ]
+
+
+def ray_accuracy_rows(
+    store: str | Location, done_blocks: np.ndarray | None = None
+) -> list[AccuracyRow]:
+    """Return a row for each scanner; of a grid one where even the most beamlets are too few."""
+    store_path = parse_location(store)
+    _, study = study_loading.read_study(store_path)
+    if isinstance(study, GridStudy):
+        tolerance_limit = np.maximum(
+            Accuracy(_tolerance_over_grid(study)).for_beamlets, Accuracy.least_rays_tolerance
+        )
+        rows = _accuracy_rows(
+            store_path, study, done_blocks, {"": "beamlets_error"}, "beamlets", tolerance_limit
+        )
+        return [row for row in rows if row.excess]
+    if not isinstance(study, FlightStudy) or not study.spec.is_ray_number_set_by_tolerance:
+        return []
+    reported_rows, group = [], open_array_group(store_path)
+    for name in study.scanner_grids:
+        error_arrays, tolerance = {name: f"{name}/beamlets_error"}, study.spec.accuracy.tolerance
+        for row in _accuracy_rows(
+            store_path, study, done_blocks, error_arrays, f"{name}/beamlets", np.asarray(tolerance)
+        ):
+            if row.n_points:
+                shot_times: Any = group[f"{name}/time"]
+                time_label = f"time {float(np.asarray(shot_times[row.worst_index[-1]])):.4g} s"
+                row.worst_label = (
+                    f"{row.worst_label}, {time_label}" if study.spec.axes else time_label
+                )
+                reported_rows.append(row)
+    return reported_rows
+
+
+def _accuracy_rows(
+    store_path: Location,
+    study: GridStudy | FlightStudy,
+    done_blocks: np.ndarray | None,
+    error_arrays: Mapping[str, str],
+    samples_array: str,
+    tolerance: np.ndarray,
+) -> list[AccuracyRow]:
+    """Rows by the names of arrays of errors, and of draws or rays."""
+    (blocks, block_fraction), axes = _sample_blocks(store_path, study, done_blocks), study.spec.axes
+    rows = [AccuracyRow(name, block_fraction=block_fraction) for name in error_arrays]
+    tolerance = np.broadcast_to(tolerance, study.layout_by_name[samples_array].shape)
+    for region, (samples, *error_values) in iter_block_values(
+        store_path, study, [samples_array, *error_arrays.values()], blocks
+    ):
+        for row, errors in zip(rows, error_values, strict=True):
+            row.add(errors, tolerance[region], samples, tuple(part.start for part in region))
+    for row in rows:
+        if row.n_points:
+            row.worst_label = (
+                ", ".join(axis_value_labels(axes, row.worst_index[: len(axes)])) or "the point"
+            )
+    return rows
+
+
+def _tolerance_over_grid(study: GridStudy) -> np.ndarray:
+    """Tolerances that broadcast over the grid."""
+    for n_trailing_axes, values in enumerate(reversed(study.grid.values_by_axis)):
+        if TOLERANCE_PARAMETER in values:
+            return values[TOLERANCE_PARAMETER].reshape(-1, *(1,) * n_trailing_axes)
+    return np.asarray(study.spec.accuracy.tolerance)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Status:
+    """State of a store."""
+
+    store: Location
+    title: str
+    study_id: str
+    unit: str  # what the points are called
+    points: int
+    points_done: int
+    blocks: int
+    blocks_done: int
+    done: np.ndarray  # their numbers
+    points_begun: float  # drawn in part, in blocks that take long
+    failures: dict[int, dict[str, Any]]  # of blocks that are not done, by block
+    holder: journal.LockHolder | None  # who writes to it
+    holder_lives: bool
+    draws_done: int  # where each point has a fixed number; else 0
+    bytes: int  # of all results, as they were stored; of a packed copy all its files
+    rate: float  # points a second in the last run, 0 where none committed anything
+    workers: int  # processes that computed in the last run
+    heartbeat: float  # age of its holder's last sign of life [s]; infinite without one
+
+    @property
+    def complete(self) -> bool:
+        """Tell whether every block is committed."""
+        return self.blocks_done == self.blocks
+
+    @property
+    def left(self) -> float:
+        """Seconds that are left at the rate of the last run; infinite where there is none."""
+        return (self.points - self.points_done) / self.rate if self.rate else float("inf")
+
+
+def status(store: str | Location) -> Status:
+    """State of a store, by its log of receipts; whether all chunks are there is not looked at."""
+    store_path = parse_location(store)
+    attributes, study = study_loading.read_study(store_path)
+    run_start = journal.last_run_start(store_path)
+    receipts = read_receipt_totals(store_path, study.n_blocks, since=run_start)
+    packed_bytes = (
+        sum(file_sizes_below(store_path).values()) if PACKED_ATTRIBUTE in attributes else 0
+    )
+    holder = journal.read_lock_holder(store_path)
+    points_done = study.count_points(receipts.points_by_block > 0)
+    run_seconds = receipts.last_time - run_start
+    return Status(
+        store=store_path,
+        title=attributes.get("title", ""),
+        study_id=attributes["study_id"],
+        unit=study.points_noun,
+        points=study.n_points,
+        points_done=points_done,
+        blocks=study.n_blocks,
+        blocks_done=receipts.n_committed_blocks,
+        done=np.flatnonzero(receipts.points_by_block),
+        points_begun=sum(checkpoint_points(store_path, study.id).values()),
+        failures=journal.permanently_failed(store_path, study.n_blocks),
+        holder=holder,
+        holder_lives=holder is not None and journal.is_holder_alive(store_path, holder),
+        draws_done=points_done * int(study.spec.draws.number)
+        if isinstance(study, GridStudy)
+        else 0,
+        bytes=packed_bytes or int(receipts.bytes_by_block.sum()),
+        rate=receipts.recent_points / run_seconds
+        if receipts.recent_points and run_seconds > 0
+        else 0.0,
+        workers=len(receipts.workers),
+        heartbeat=journal.heartbeat_age(store_path) if holder else float("inf"),
+    )

@@ -1,0 +1,512 @@
+"""Every byte of a store held against its digests; a finished store copied into few large files.
+
+Everything that a store held before there were results follows from the study, so that any of it can
+be made again, to the same bytes. A copy is checked value by value as it is made.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import zarr
+
+from sweep.messages import suggestion
+from sweep.storage import store_format
+from sweep.storage.foreign_files import list_foreign_files
+from sweep.storage.locations import (
+    DRAFT_SUFFIX,
+    JOURNAL_DIR,
+    PACKED_ATTRIBUTE,
+    Location,
+    ObjectPath,
+    atomic_path,
+    atomic_write,
+    eyepoints_path,
+    file_sizes_below,
+    is_free,
+    iter_names_below,
+    parse_location,
+    read_object,
+    recover_interrupted_replace,
+    to_zarr_store,
+    translate_errors,
+)
+from sweep.storage.store_format import (
+    contents_digest,
+    encode_record,
+    has_digest,
+    iter_lines_and_records,
+    iter_records,
+    stored_objects_digest,
+)
+from sweep.storage.verified_store import CHUNK_NAME, chunk_damage, open_array_group
+from sweep.tasks.engine import journal, study_store
+from sweep.tasks.engine.blocks import ArrayLayout, BlockGrid, BlockStudy
+from sweep.tasks.engine.journal import LOG_NAMES, RECIPE_FILE, committed_blocks, read_recipe
+from sweep.tasks.engine.progress import Progress, StoreError, make_progress, raise_as_store_error
+from sweep.tasks.engine.study_store import Damage, damage_or_read_error, template_object_damage
+from sweep.tasks.studies import study_loading
+from sweep.tasks.studies.flight_study import FlightStudy
+from sweep.tasks.studies.study_loading import AnyStudy
+
+if TYPE_CHECKING:
+    from sweep.spec import GridSpec, SceneSpec
+
+#: Blocks that are read at a time, and by how many threads: reading is waiting.
+BLOCKS_PER_BATCH = 256
+READER_THREADS = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """State that a store was found in."""
+
+    store: Location
+    blocks: int
+    whole: int  # blocks that are committed and undamaged
+    damages: tuple[Damage, ...]
+    restored: tuple[str, ...]  # objects of the template that were put back
+    foreign: tuple[str, ...]  # files that users and other programs have put there
+    unmarked: str  # why damaged blocks could not be marked for `resume`; empty where they are
+
+    @property
+    def sound(self) -> bool:
+        """Tell whether nothing is damaged."""
+        return not self.damages
+
+    @property
+    def complete(self) -> bool:
+        """Tell whether every block is committed and undamaged."""
+        return self.whole == self.blocks
+
+
+def verify(
+    path: str | Location,
+    *,
+    repair: bool = False,
+    spec: GridSpec | SceneSpec | None = None,
+    progress: bool | Progress = True,
+) -> list[Report]:
+    """Check every byte of a store, and of the eyepoints that its study looks with.
+
+    Receipts of damaged blocks are withdrawn, so that `resume` computes them again, where nobody
+    writes to the store. `repair` puts back metadata, coordinates and the spec; a `spec` says
+    what the store holds where that no longer says so itself.
+
+    StoreError where there is no store of this program's, or one of another study than `spec`;
+    where it can't be repaired.
+    """
+    path, listener = parse_location(path).absolute(), make_progress(progress)
+    recover_interrupted_replace(path)
+    study = _study_of_store(path, spec if repair else None)
+    studies_by_store: dict[Location, AnyStudy | None] = {path: study}
+    if isinstance(study, FlightStudy):
+        studies_by_store |= {
+            eyepoints_path(path, store_path.id): store_path
+            for store_path in study.eyepoint_studies()
+        }
+    return [
+        _verify_store(store_path, study_or_none, repair, listener)
+        for store_path, study_or_none in studies_by_store.items()
+        if store_path.exists()
+    ]
+
+
+def _study_of_store(store_path: Location, spec: GridSpec | SceneSpec | None) -> AnyStudy | None:
+    """Return the study in a store; None if it holds none, or it can't be told."""
+    try:
+        attributes = _undamaged_attributes(store_path)
+    except StoreError:
+        if spec is None or not store_path.exists():
+            raise
+        return study_loading.make_study(spec, store_path)
+    if spec and attributes["study_id"] != spec.id:
+        raise StoreError(
+            f"{store_path} holds another study than the spec: {suggestion('status', store_path)} "
+            "names it"
+        )
+    if (
+        attributes["kind"] == study_loading.ACCURACY_KIND
+        or (attributes["kind"] == "eyepoints" and not read_recipe(store_path))
+        or PACKED_ATTRIBUTE in attributes
+    ):
+        return None
+    return (
+        study_loading.make_study(spec, store_path)
+        if spec
+        else study_loading.load_study(store_path, attributes)
+    )
+
+
+def _verify_store(
+    store_path: Location, study: AnyStudy | None, repair: bool, progress: Progress
+) -> Report:
+    template_damage, restored = study_store.template_damages(store_path), []
+    if template_damage and study and repair:
+        study_store.refuse_foreign_store(
+            store_path
+        )  # a lock would be the first thing of ours in it
+        with journal.StoreLock(store_path, progress.say):
+            template_damage, restored = [], restore_template(store_path, study)
+    log_damage = _log_damages(store_path)
+    block_damage = list(_iter_block_damages(store_path, study, progress)) if study else []
+    surplus = [] if study_store.template_damages(store_path) else _surplus_chunks(store_path, study)
+    return Report(
+        store=store_path,
+        blocks=study.n_blocks if study else 0,
+        whole=_count_undamaged_blocks(store_path, study, block_damage) if study else 0,
+        damages=(*template_damage, *log_damage, *block_damage, *surplus),
+        restored=tuple(restored),
+        foreign=tuple(_foreign_object_names(store_path)),
+        unmarked=_withdraw_receipts(store_path, block_damage, progress)
+        if log_damage or block_damage
+        else "",
+    )
+
+
+def _count_undamaged_blocks(store_path: Location, study: BlockStudy, damages: list[Damage]) -> int:
+    is_undamaged = journal.blocks_with_receipt(store_path, study)
+    is_undamaged[[damage.block for damage in damages]] = False
+    return int(np.count_nonzero(is_undamaged))
+
+
+def _log_damages(store_path: Location) -> list[Damage]:
+    """Damaged lines of the journal; the last of a log that is being written may be unfinished."""
+    unreadable = store_format.irregular_journal_files(store_path)
+    holder = None if unreadable else journal.read_lock_holder(store_path)
+    holder_lives = holder is not None and journal.is_holder_alive(store_path, holder)
+    return [Damage(name, problem, mended_by="hand") for name, problem in unreadable.items()] + [
+        Damage(f"{JOURNAL_DIR}/{name} line {line_number}", "is damaged or cut short")
+        for name in (*journal.LOG_NAMES, RECIPE_FILE)
+        for line_number, (line, record) in enumerate(
+            iter_lines_and_records(store_path / JOURNAL_DIR / name), start=1
+        )
+        if record is None and not (holder_lives and not line.endswith(b"\n"))
+    ]
+
+
+def _foreign_object_names(store_path: Location) -> list[str]:
+    """Names of what users and other programs have put into a store."""
+    if isinstance(store_path, Path):
+        return list_foreign_files(store_path)
+    manifest = study_store.manifest_digests(store_path)
+    names = (
+        name for name in iter_names_below(store_path) if not name.startswith(f"{JOURNAL_DIR}/")
+    )
+    arrays = {name.removesuffix("/zarr.json") for name in manifest}
+    return [
+        object_name
+        for object_name in names
+        if object_name not in manifest and study_store.array_of_chunk(object_name) not in arrays
+    ]
+
+
+def _surplus_chunks(store_path: Location, study: AnyStudy | None) -> Iterator[Damage]:
+    """Chunks of arrays that are no part of a store; drafts of killed writers are not told."""
+    manifest = study_store.manifest_digests(store_path)
+    chunk_grid_shapes = (
+        {name: owner_blocks.shape for name, owner_blocks in study.chunk_owners().items()}
+        if study
+        else {}
+    )
+    for name in iter_names_below(store_path):
+        if name in manifest or name.startswith(f"{JOURNAL_DIR}/") or name.endswith(DRAFT_SUFFIX):
+            continue
+        chunk = CHUNK_NAME.fullmatch(name)
+        if not (chunk and f"{chunk[1]}/zarr.json" in manifest):
+            continue  # told as foreign
+        if not study:
+            continue  # only who made it could tell which chunks it has
+        array, chunk_index = chunk[1], chunk[2].split("/")[1:]
+        chunk_grid_shape = chunk_grid_shapes.get(array, (0,))
+        if len(chunk_index) != len(chunk_grid_shape) or any(
+            int(index) >= count for index, count in zip(chunk_index, chunk_grid_shape, strict=True)
+        ):
+            yield Damage(name, "is no part of the store", mended_by="hand")
+
+
+def _iter_block_damages(
+    store_path: Location, study: BlockStudy, progress: Progress
+) -> Iterator[Damage]:
+    """Damages of the blocks that were committed."""
+    committed_digests = journal.committed_digests(store_path, study.n_blocks)
+    blocks = np.flatnonzero(committed_digests != b"")
+    progress = (
+        progress if len(blocks) > BLOCKS_PER_BATCH else Progress()
+    )  # what is over soon shows nothing
+    progress.begin(points=len(blocks), done=0, unit="blocks")
+    try:
+        with ThreadPoolExecutor(READER_THREADS) as pool:
+            for start in range(0, len(blocks), BLOCKS_PER_BATCH):
+                batch = [int(block) for block in blocks[start : start + BLOCKS_PER_BATCH]]
+                for damages in pool.map(
+                    lambda block_number: _damages_of_block(
+                        store_path, study, block_number, bytes(committed_digests[block_number])
+                    ),
+                    batch,
+                ):
+                    yield from damages
+                progress.advance(points=len(batch), failed=0)
+    finally:
+        progress.end()
+
+
+def _damages_of_block(
+    store_path: Location, study: BlockStudy, block: int, expected_digest: bytes
+) -> list[Damage]:
+    chunk_paths, bytes_max = (
+        study_store.chunk_names_of_block(study, block),
+        study_store.chunk_size_limits(study),
+    )
+    try:
+        if has_digest(store_path, chunk_paths, expected_digest.decode(), bytes_max):
+            return []
+    except OSError:
+        pass  # told below, object by object
+    damages = []
+    for name in chunk_paths:
+        if problem := damage_or_read_error(
+            partial(_damage_of_chunk, store_path, name, bytes_max(name))
+        ):
+            damages.append(Damage(name, problem, block))
+    description = f"one of its {len(chunk_paths)} chunks"
+    return damages or [Damage(description, "is whole but not the one that was committed", block)]
+
+
+def _damage_of_chunk(store_path: Location, chunk_path: str, bytes_max: int) -> str:
+    """Damage of a chunk in words; read once more from an object store, as an answer may be cut."""
+    problem = chunk_damage(read_object(store_path, chunk_path, bytes_max))
+    if problem and isinstance(store_path, ObjectPath):
+        return chunk_damage(read_object(store_path, chunk_path, bytes_max))
+    return problem
+
+
+def _withdraw_receipts(store_path: Location, damages: list[Damage], progress: Progress) -> str:
+    """Withdraw receipts of damaged blocks; why that can't be, where it can't."""
+    try:
+        with (
+            journal.StoreLock(store_path, progress.say),
+            raise_as_store_error(f"{store_path} can't be written"),
+        ):
+            log = journal.Journal(store_path)
+            for block in sorted({damage.block for damage in damages}):
+                problems = [
+                    f"{block_damage.object} {block_damage.what}"
+                    for block_damage in damages
+                    if block_damage.block == block
+                ]
+                log.withdraw(block, "; ".join(problems))
+            log.flush(force=True)
+    except StoreError as error:
+        return str(error)
+    return ""
+
+
+def _undamaged_attributes(store_path: Location) -> dict[str, Any]:
+    """Attributes that a store was made with, from its list, else from its group, if undamaged."""
+    if manifest_attributes := store_format.read_manifest_attributes(store_path):
+        return store_format.check_attributes(store_path, manifest_attributes)
+    attributes = store_format.read_attributes(store_path)
+    if (
+        expected_digest := study_store.manifest_digests(store_path).get("zarr.json")
+    ) and template_object_damage(store_path, "zarr.json", expected_digest):
+        raise StoreError(
+            f"{store_path / 'zarr.json'} is damaged{store_format.repair_hint(store_path)}"
+        )
+    return attributes
+
+
+def restore_template(store_path: Location, study: BlockStudy) -> list[str]:
+    """Put back, each in one step, what a store held before there were results; names of objects.
+
+    The caller holds the store's lock. StoreError where this machine can't make the same again.
+    """
+    study_store.refuse_links(store_path)
+    try:
+        attributes = _undamaged_attributes(store_path)
+    except StoreError:
+        attributes = {}
+    if attributes:
+        study_store.refuse_other_versions(store_path, attributes, reader="this machine")
+    if attributes.get("study_id", study.id) != study.id:
+        raise StoreError(
+            f"{store_path / 'zarr.json'} is damaged{store_format.repair_hint(store_path)}"
+        )
+    with (
+        raise_as_store_error(f"{store_path} can't be mended"),
+        tempfile.TemporaryDirectory() as directory,
+    ):
+        template_path = Path(directory) / store_path.name
+        study_store.build_template(
+            template_path, study, attributes or study_store.template_attributes(study)
+        )
+        _refuse_unreproducible(store_path, template_path)
+        template_digests = {
+            name: stored_objects_digest(template_path, [name])
+            for name in sorted(iter_names_below(template_path))
+        }
+        altered_names = [
+            name
+            for name, expected_digest in template_digests.items()
+            if template_object_damage(store_path, name, expected_digest)
+        ]
+        if not (attributes or "zarr.json" in study_store.manifest_digests(store_path)):
+            _refuse_unproven_study(store_path, study, template_path, altered_names)
+        for name in altered_names:
+            atomic_write(store_path / name, (template_path / name).read_bytes())
+    return altered_names
+
+
+def _refuse_unreproducible(store_path: Location, template_path: Path) -> None:
+    """Refuse to put back what an undamaged line of the list says is not what was there."""
+    for name, expected_digest in study_store.manifest_digests(store_path).items():
+        if template_object_damage(template_path, name, expected_digest):
+            raise StoreError(
+                f"{name} of {store_path} can't be made again as it was on this machine, or from "
+                "this "
+                "spec: put it back from a copy, or run the study anew into another store"
+            )
+
+
+def _refuse_unproven_study(
+    store_path: Location, study: BlockStudy, template_path: Path, altered_names: list[str]
+) -> None:
+    """Refuse a spec that makes other arrays or results, where all else that could tell is lost."""
+    if other_names := set(altered_names) - {"zarr.json", study_store.MANIFEST_PATH}:
+        raise StoreError(
+            f"{store_path} holds another study, or too little is left: {min(other_names)} differs"
+        )
+    committed_digests = journal.committed_digests(store_path, study.n_blocks)
+    for block in (committed_digests != b"").nonzero()[0][:1].tolist():
+        stored_block = study_store.BlockWriter(template_path, study).write(
+            block, study.evaluate(block)
+        )
+        for name in study_store.chunk_names_of_block(study, block):
+            (template_path / name).unlink()
+        if stored_block.digest.encode() != committed_digests[block]:
+            raise StoreError(
+                f"{store_path} holds another study: its block {block} has other results"
+            )
+
+
+#: Bytes of a shard, before compression, as far as whole chunks allow; one a thread is in memory.
+SHARD_BYTES_MAX = 64 << 20
+
+
+def pack_store(
+    store_path: str | Location, output: str | Location, *, progress: bool | Progress = True
+) -> Location:
+    """Copy a complete store into one of few files, each many chunks: whole, or not at all.
+
+    StoreError where it is not complete, where something is in the way of the copy, or it can't
+    be written or read back as it was.
+    """
+    store_path, output = parse_location(store_path).absolute(), parse_location(output).absolute()
+    attributes, study = study_loading.read_study(store_path)
+    n_missing = study.n_blocks - int(np.count_nonzero(committed_blocks(store_path, study)))
+    if attributes.get(PACKED_ATTRIBUTE) or n_missing:
+        reason = (
+            "is packed already"
+            if attributes.get(PACKED_ATTRIBUTE)
+            else f"lacks {n_missing:,} blocks: resume it"
+        )
+        raise StoreError(f"{store_path} {reason}")
+    if not is_free(output):
+        raise StoreError(f"{output} is there already: name another place")
+    listener = make_progress(progress)
+    with raise_as_store_error(f"{output} can't be made"):
+        if isinstance(output, Path):
+            with atomic_path(output) as draft_path:
+                draft_path.mkdir()
+                _write_packed_store(store_path, draft_path, study, listener)
+                study_store.sync_to_disk(
+                    draft_path
+                )  # else a power cut may leave the name without the values
+        else:
+            with study_store.reserve_object_location(output):
+                _write_packed_store(store_path, output, study, listener)
+    return output
+
+
+def _write_packed_store(
+    store_path: Location, output: Location, study: BlockStudy, progress: Progress
+) -> None:
+    """Write a packed copy, the document of its group last."""
+    attributes = {**study_loading.read_study(store_path)[0], PACKED_ATTRIBUTE: True}
+    with tempfile.TemporaryDirectory() as directory:
+        template = Path(directory) / "template"
+        study_store.build_template(template, study, attributes, shard_shape_of=shard_shape)
+        root_document = (template / "zarr.json").read_bytes()
+        for name in file_sizes_below(template).keys() - {"zarr.json", study_store.MANIFEST_PATH}:
+            atomic_write(output / name, (template / name).read_bytes())
+    names, arrays = sorted(study.chunk_owners()), open_array_group(store_path)
+    progress.begin(points=len(names), done=0, unit="arrays")
+    try:
+        for name in names:
+            with translate_errors(store_path), translate_errors(output):
+                _pack_array(arrays[name], output / name)
+            progress.advance(points=1, failed=0)
+    finally:
+        progress.end()
+    if study_loading.read_study(store_path)[0]["study_id"] != study.id:
+        raise StoreError(f"{store_path} was extended or replaced while it was copied: try again")
+    for name in (*LOG_NAMES, RECIPE_FILE):
+        lines = iter_records(store_path / JOURNAL_DIR / name)
+        # without the machine, as copies are given away
+        anonymous_lines = [
+            {key: value for key, value in line.items() if key not in ("host", "pid")}
+            for line in lines
+        ]
+        if content := b"".join(map(encode_record, anonymous_lines)):
+            atomic_write(output / JOURNAL_DIR / name, content)
+    names = [name for name in file_sizes_below(output) if not name.startswith(f"{JOURNAL_DIR}/")]
+    digests = {name: stored_objects_digest(output, [name]) for name in names}
+    digests["zarr.json"] = contents_digest([("zarr.json", root_document)])
+    study_store.write_manifest(output, attributes, digests)
+    atomic_write(output / "zarr.json", root_document)
+
+
+def _pack_array(source: Any, output: Location) -> None:
+    """Copy an array, shard by shard, and read each back."""
+    target = zarr.open_array(to_zarr_store(output), mode="r+")
+    target = target.with_config({"write_empty_chunks": True})  # else one of fill values is lost
+    dims = tuple(map(str, range(target.ndim)))
+    shard_grid = BlockGrid(dims, target.shape, target.shards or target.chunks)
+    with ThreadPoolExecutor(READER_THREADS) as pool:
+        for _ in pool.map(
+            lambda shard: _copy_region(source, target, shard_grid.block_slices(shard)),
+            range(shard_grid.n_blocks),
+        ):
+            pass
+
+
+def _copy_region(
+    source: zarr.Array[Any], target: zarr.Array[Any], region: tuple[slice, ...]
+) -> None:
+    values = np.asarray(source[region or ...])
+    target[region or ...] = values
+    read_back = np.asarray(target[region or ...])
+    if read_back.tobytes() != values.tobytes():
+        raise OSError(5, f"{target.path} does not read back as it was written")
+
+
+def shard_shape(layout: ArrayLayout) -> tuple[int, ...] | None:
+    """Whole chunks along each axis that make a file, the last axis filled first; or None."""
+    if layout.values is not None:
+        return None
+    chunks_left = SHARD_BYTES_MAX // max(1, layout.nbytes_of(layout.chunks))
+    counts = [1] * len(layout.shape)
+    for k in reversed(range(len(counts))):
+        counts[k] = max(1, min(-(-layout.shape[k] // layout.chunks[k]), chunks_left))
+        chunks_left //= counts[k]
+    if math.prod(counts) == 1:
+        return None
+    return tuple(count * chunk for count, chunk in zip(counts, layout.chunks, strict=True))

@@ -1,0 +1,575 @@
+"""The study in a store, of whatever kind; results of an older one that a larger one has too.
+
+Those are taken from there, bit for bit. A result follows from the parameters at its point, its
+draws and the effects that are simulated. Points are looked up axis by axis. The older store is only
+read; a block of it that does not match the digest in its receipt counts as absent.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterator, Mapping
+from functools import cache, cached_property, lru_cache, partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sweep.messages import NEW_PLACEHOLDER, SPEC_PLACEHOLDER, shell_command, suggestion
+from sweep.scenes.scene_files import SceneError
+from sweep.spec import GridSpec, SceneSpec, SpecError, describe_differences, from_stored
+from sweep.spec.grid_checks import is_detector_or_estimator
+from sweep.spec.rules import Mistake
+from sweep.spec.sections import parameter_rules
+from sweep.storage import store_format
+from sweep.storage.locations import Location, parse_location, resolve_links
+from sweep.storage.verified_store import open_array_group
+from sweep.tasks.engine import study_store
+from sweep.tasks.engine.blocks import (
+    CHUNK_READ_ERRORS,
+    TOLERANCE_PARAMETER,
+    ParameterGrid,
+    ParameterValue,
+    Results,
+)
+from sweep.tasks.engine.journal import EXTENDS_KEY, committed_blocks, committed_digests, read_recipe
+from sweep.tasks.engine.progress import StoreError
+from sweep.tasks.studies.eyepoint_study import EyepointStudy
+from sweep.tasks.studies.flight_study import FlightStudy
+from sweep.tasks.studies.grid_study import GridStudy, canonical_point_rows
+
+AnySpec = GridSpec | SceneSpec
+
+ACCURACY_KIND = "accuracy"
+"""Kind of the stores of `sweep accuracy`, in which there is no study."""
+
+GridOrFlightStudy = GridStudy | FlightStudy
+AnyStudy = GridOrFlightStudy | EyepointStudy
+
+
+def make_study(
+    spec: GridSpec | SceneSpec, store_path: Location, source_path: Location | None = None
+) -> GridOrFlightStudy:
+    """Return the study that a spec declares, to be stored at a path; it may extend another."""
+    study = FlightStudy(spec, store_path) if isinstance(spec, SceneSpec) else GridStudy(spec)
+    if source_path:
+        study.find_reuse_source = partial(_find_reuse_source, source_path, study)
+    return study
+
+
+def _find_reuse_source(
+    source_path: Location, target_study: GridOrFlightStudy
+) -> ReuseSource | None:
+    """Results that the store at a path has of a study; None where it is gone, or has none."""
+    try:
+        attributes = store_format.read_attributes(source_path)
+        study_store.refuse_other_versions(source_path, attributes, reader="this machine")
+        source_spec = _read_spec(
+            source_path, read_recipe(source_path), attributes.get("spec", "{}")
+        )
+        if (
+            type(source_spec) is not type(target_study.spec)
+            or source_spec.seed != target_study.spec.seed
+        ):
+            return None
+        if isinstance(target_study, FlightStudy) and extension_obstacles(
+            source_spec, target_study.spec
+        ):
+            return None  # a grid's points are told apart by their parameters
+        return ReuseSource(source_path, make_study(source_spec, source_path), target_study)
+    except (StoreError, SceneError):
+        return None
+
+
+def read_study(store_path: Location) -> tuple[dict[str, Any], AnyStudy]:
+    """Attributes of a store and the study that it holds; StoreError where it can't be read."""
+    attributes = store_format.read_attributes(store_path)
+    if attributes["kind"] == ACCURACY_KIND:
+        figures_command = shell_command("figures", store_path)
+        raise StoreError(
+            f"{store_path} holds what accuracy costs, no study: `{figures_command}` draws it"
+        )
+    return attributes, load_study(store_path, attributes)
+
+
+def load_study(store_path: Location, attributes: dict[str, Any]) -> AnyStudy:
+    """Read the study of a store from its attributes; StoreError if it can't be read."""
+    recipe = read_recipe(store_path)
+    if attributes["kind"] == "eyepoints":
+        if "spec" not in recipe:
+            raise StoreError(
+                f"{store_path} does not say how its eyepoints were made: run their study again"
+            )
+        return EyepointStudy(_read_spec(store_path, recipe, recipe["spec"]), recipe["scanner"])
+    spec = _read_spec(store_path, recipe, attributes["spec"])
+    source_path = parse_location(recipe[EXTENDS_KEY]) if EXTENDS_KEY in recipe else None
+    return make_study(
+        spec, store_path, source_path if source_path != resolve_links(store_path) else None
+    )
+
+
+def _read_spec(store_path: Location, recipe: dict[str, Any], spec_json: str) -> Any:
+    """Read the spec of a store; StoreError if this program can't read it."""
+    try:
+        return from_stored(spec_json, base=Path(recipe["base"]) if "base" in recipe else None)
+    except (SpecError, ValueError) as error:
+        raise StoreError(
+            f"{store_path} holds a spec that this version of sweep can't read:\n{error}"
+        ) from error
+
+
+#: Fields that may grow, and one that may shrink; blocks may be of any size.
+FIELDS_THAT_MAY_GROW = ("draws.number", "draws.limit")
+FIELDS_THAT_MAY_SHRINK = (TOLERANCE_PARAMETER,)
+FIELDS_THAT_MAY_CHANGE = ("storage.block_points", "storage.block_shots", "storage.block_draws")
+
+#: Values of an axis that are told where they would be lost.
+LOST_VALUES_LISTED_MAX = 5
+
+#: Blocks of the older store that a process keeps in memory.
+CACHED_BLOCKS_MAX = 2
+
+
+class SharedPoints(NamedTuple):
+    """Points of a block that an older block has."""
+
+    source_block: int  # Of the older store
+    local_indices: np.ndarray  # (m,) int64: their numbers in C order over the block
+    source_local_indices: np.ndarray  # (m,) int64: their numbers in the older one
+
+
+class ReuseSource:
+    """Results that the store of an older study has of a larger one."""
+
+    def __init__(
+        self,
+        source_path: Location,
+        source_study: GridOrFlightStudy,
+        target_study: GridOrFlightStudy,
+    ) -> None:
+        self._source_path, self.source_study, self._target_study = (
+            source_path,
+            source_study,
+            target_study,
+        )
+        self.reused_points_by_block: dict[
+            int, int
+        ] = {}  # points of each block that need not be computed
+        self.has_final_results = has_same_results(source_study.spec, target_study.spec)
+        self.has_first_draws = not self.has_final_results and continues_draws(
+            source_study.spec, target_study.spec
+        )
+        self._has_other_tolerance = has_other_tolerance(source_study.spec, target_study.spec)
+        self._committed_digests = committed_digests(source_path, source_study.n_blocks)
+        self.read_block = lru_cache(maxsize=CACHED_BLOCKS_MAX)(self._read_block)
+        self._matching_of_group = cache(self._match_group)
+
+    def iter_shared_points(self, block: int) -> Iterator[SharedPoints]:
+        """Return the committed older blocks that have points of a block of the larger study."""
+        target_grid, block_in_grid = self._target_study.locate_in_grid(block)
+        source_grids = {grid.group: grid for grid in self.source_study.grids}
+        if (
+            not (self.has_final_results or self.has_first_draws)
+            or target_grid.group not in source_grids
+        ):
+            return
+        source_grid, first_source_block = (
+            source_grids[target_grid.group],
+            self.source_study.first_block_of_group(target_grid.group),
+        )
+        source_grid_indices = self._matching_of_group(target_grid.group).match_slices(
+            target_grid.block_slices(block_in_grid)
+        )
+        is_reusable = source_grid_indices >= 0
+        if self._has_other_tolerance:
+            is_reusable = is_reusable & ~np.asarray(self._target_study.depends_on_tolerance(block))
+        local_indices = np.flatnonzero(is_reusable)
+        source_blocks, source_local_indices = source_grid.locate_points(
+            source_grid_indices[local_indices]
+        )
+        for source_block in np.unique(source_blocks).tolist():
+            if (
+                self._committed_digests[first_source_block + source_block]
+                and self._committed_digests[
+                    self.source_study.first_draw_block(first_source_block + source_block)
+                ]
+            ):
+                is_in_block = source_blocks == source_block
+                yield SharedPoints(
+                    first_source_block + source_block,
+                    local_indices[is_in_block],
+                    source_local_indices[is_in_block],
+                )
+
+    def _match_group(self, group: str) -> PointMatching:
+        source_grid, target_grid = (
+            next(grid for grid in study.grids if grid.group == group)
+            for study in (self.source_study, self._target_study)
+        )
+        return PointMatching(
+            source_grid,
+            target_grid,
+            parameters_to_ignore(self.source_study.spec, self._target_study.spec),
+        )
+
+    def _read_block(self, source_block: int) -> Results | None:
+        """Results of an older block, each with its chunk's shape; None where damaged or lost."""
+        try:
+            chunk_paths = study_store.chunk_names_of_block(self.source_study, source_block)
+            digest = store_format.stored_objects_digest(
+                self._source_path, chunk_paths, study_store.chunk_size_limits(self.source_study)
+            )
+            if digest.encode() != self._committed_digests[source_block]:
+                return None
+            return {
+                name: self.read_chunk(name, source_block)
+                for name in self.source_study.chunk_positions(source_block)
+            }
+        except CHUNK_READ_ERRORS:
+            return None
+
+    def read_chunk(self, name: str, source_block: int) -> np.ndarray:
+        """Return an older block's chunk of an array, whether damaged or not."""
+        return np.asarray(
+            self._source_arrays[name].blocks[self.source_study.chunk_positions(source_block)[name]]
+        )
+
+    @cached_property
+    def _source_arrays(self) -> Any:
+        return open_array_group(self._source_path)
+
+    def reuse_remark(self) -> str:
+        """Remark on what is not simply taken from it; empty where all of it is."""
+        if not (self.has_final_results or self.has_first_draws):
+            return "whole spectra are drawn anew"
+        remarks = ["points that are there are drawn further"] if self.has_first_draws else []
+        spec = self._target_study.spec
+        has_closer_points = self._has_other_tolerance and np.any(
+            self._target_study.depends_on_tolerance(0)
+        )
+        if self._has_other_tolerance and isinstance(spec, SceneSpec) and not has_closer_points:
+            remarks.append("shots that call for more effects with the tolerance are computed anew")
+        elif self._has_other_tolerance:
+            beamlets_field = (
+                "footprint.beamlets, "
+                if getattr(spec, "is_ray_number_set_by_tolerance", True)
+                else ""
+            )
+            remarks.append(
+                "with the tolerance all is computed more closely, and anew, but where "
+                f"{beamlets_field}accuracy.line_error and accuracy.leakage_error are numbers"
+            )
+        return "; ".join(remarks)
+
+
+def reusable_points_text(store_path: Location, study: GridOrFlightStudy) -> str:
+    """Count the points of a larger study that are done, here or in the store it extends."""
+    is_done = committed_blocks(store_path, study)
+    n_points_there, remark = study.count_points(is_done), ""
+    if study.reuse_source is not None:
+        n_points_there += sum(
+            study.count_reusable_points(int(block)) for block in np.flatnonzero(~is_done)
+        )
+        remark = study.reuse_source.reuse_remark()
+    count_text = f"{n_points_there:,} of {study.n_points:,} {study.points_noun} are there; "
+    count_text += f"{study.n_points - n_points_there:,} to compute"
+    return f"{count_text} ({remark})" if remark else count_text
+
+
+def parameters_to_ignore(source_spec: AnySpec, target_spec: AnySpec) -> tuple[str, ...]:
+    """Parameters in which points may differ that are to be taken for the same.
+
+    The tolerance, where neither study varies it, and what looks at spectra where none are
+    drawn.
+    """
+    draws_spectra = target_spec.draws.draws_whole_spectra
+    method_paths = [
+        path
+        for path in target_spec.parameters()
+        if is_detector_or_estimator(path) and not draws_spectra
+    ]
+    has_fixed_tolerances = (
+        _fixed_tolerance(source_spec) is not None and _fixed_tolerance(target_spec) is not None
+    )
+    return (*method_paths, TOLERANCE_PARAMETER) if has_fixed_tolerances else tuple(method_paths)
+
+
+def has_other_tolerance(source_spec: AnySpec, target_spec: AnySpec) -> bool:
+    """Tell whether all points have another tolerance; one on an axis identifies points."""
+    source_tolerance, target_tolerance = (
+        _fixed_tolerance(source_spec),
+        _fixed_tolerance(target_spec),
+    )
+    return (
+        source_tolerance is not None
+        and target_tolerance is not None
+        and source_tolerance != target_tolerance
+    )
+
+
+def has_same_results(source_spec: AnySpec, target_spec: AnySpec) -> bool:
+    """Tell whether points of two studies that are computed as finely have the same results."""
+    if isinstance(target_spec, SceneSpec) or isinstance(source_spec, SceneSpec):
+        return True
+    if not target_spec.draws.has_draws:
+        return not source_spec.draws.has_draws
+    return source_spec.draws == target_spec.draws and _fixed_tolerance(
+        source_spec
+    ) == _fixed_tolerance(target_spec)
+
+
+def continues_draws(source_spec: GridSpec, target_spec: GridSpec) -> bool:
+    """Tell whether the draws of a study, not of whole spectra, are the first ones of another."""
+    draw_counts = {"number": target_spec.draws.number, "limit": target_spec.draws.limit}
+    is_looser = (_fixed_tolerance(source_spec) or 1.0) < (_fixed_tolerance(target_spec) or 0.0)
+    return (
+        target_spec.draws.has_draws
+        and not target_spec.draws.draws_whole_spectra
+        and source_spec.draws.is_adaptive == target_spec.draws.is_adaptive
+        and source_spec.draws.model_copy(update=draw_counts) == target_spec.draws
+        and source_spec.draws.number <= target_spec.draws.number
+        and source_spec.draws.limit <= target_spec.draws.limit
+        and not is_looser
+    )
+
+
+def _fixed_tolerance(spec: AnySpec) -> float | None:
+    """Return the tolerance of all points; None where an axis varies it."""
+    value = spec.parameters_off_axes().get(TOLERANCE_PARAMETER)
+    return None if value is None else float(value)
+
+
+def apply_changes(spec: AnySpec, changes: Mapping[str, Any]) -> AnySpec:
+    """Set values of a study by dotted path: ``{"axes.target.range": ["1 km"]}``; or SpecError."""
+    mapping = spec.to_yaml_mapping()
+    for path, value in changes.items():
+        section_name, _, field_path = path.partition(".")
+        if section_name == "axes" and field_path:
+            mapping[section_name] = {**mapping.get(section_name, {}), field_path: value}
+            continue
+        *sections, field_name = path.split(".")
+        section: Any = mapping
+        for name in sections:
+            section = section.setdefault(name, {}) if isinstance(section, dict) else None
+        if not isinstance(section, dict):
+            parent = ".".join(sections)
+            raise SpecError([Mistake(path, f"is no field: {parent} holds none", str(value))])
+        section[field_name] = value
+    base = spec.base if isinstance(spec, SceneSpec) else "."
+    return type(spec).from_mapping(mapping, base=base)
+
+
+def refuse_not_larger_study(
+    source_path: Location, source_spec: AnySpec, target_spec: AnySpec
+) -> None:
+    """Refuse what is not a larger study than the one in a store, field by field."""
+    if type(source_spec) is not type(target_spec):
+        raise StoreError(
+            f"{source_path} can't be extended to this study: a flight over a scene and a study "
+            "over a "
+            "grid have nothing in common. Run it into a store of its own: "
+            f"{suggestion('run', SPEC_PLACEHOLDER, store=NEW_PLACEHOLDER)}"
+        )
+    obstacles = extension_obstacles(source_spec, target_spec)
+    if obstacles:
+        listed = "\n".join(f"  {obstacle}" for obstacle in obstacles)
+        scanners = " new scanners," if _scanner_names(target_spec) else ""
+        raise StoreError(
+            f"{source_path} can't be extended to this study (in the store -> asked "
+            f"for):\n{listed}\n"
+            f"A store is extended by values on axes, new axes,{scanners} more draws or a tighter "
+            "accuracy.tolerance. Any other study needs a store of its own: "
+            f"{suggestion('run', SPEC_PLACEHOLDER, store=NEW_PLACEHOLDER)}"
+        )
+
+
+def extension_obstacles(source_spec: AnySpec, target_spec: AnySpec) -> list[str]:
+    """Reasons why a study is no larger one than another of its kind, field by field."""
+    return [
+        *_disallowed_changes(source_spec, target_spec),
+        *_lost_axis_values(source_spec, target_spec),
+    ]
+
+
+def _disallowed_changes(source_spec: AnySpec, target_spec: AnySpec) -> Iterator[str]:
+    """Fields that are not as they must be."""
+    on_axes = {
+        member.path
+        for any_spec in (source_spec, target_spec)
+        for axis in any_spec.axes
+        for member in axis.parameters
+    }
+    for line in describe_differences(source_spec, target_spec):
+        path = line.partition(": ")[0]
+        section, _, field_path = path.partition(".")
+        if path in on_axes or path in FIELDS_THAT_MAY_CHANGE or section == "axes":
+            continue
+        if section == "scanners" and field_path.partition(".")[0] not in _scanner_names(
+            source_spec
+        ):
+            continue
+        increase = (
+            _field_value(target_spec, path) - _field_value(source_spec, path)
+            if path in FIELDS_THAT_MAY_GROW + FIELDS_THAT_MAY_SHRINK
+            else 0
+        )
+        if path in FIELDS_THAT_MAY_GROW and not increase > 0 < _field_value(source_spec, path):
+            yield f"{line}, and may only grow"
+        elif path in FIELDS_THAT_MAY_SHRINK and not increase < 0:
+            yield f"{line}, and may only become tighter"
+        elif path not in FIELDS_THAT_MAY_GROW + FIELDS_THAT_MAY_SHRINK:
+            yield f"{line}, and must stay as it is"
+
+
+def _scanner_names(spec: AnySpec) -> Collection[str]:
+    """Names of a flight's scanners; a study over a grid has none."""
+    return getattr(spec, "scanners", ())
+
+
+def _field_value(spec: AnySpec, path: str) -> float:
+    section, _, name = path.partition(".")
+    return float(getattr(getattr(spec, section), name))
+
+
+def _lost_axis_values(source_spec: AnySpec, target_spec: AnySpec) -> Iterator[str]:
+    """Values of the store that the study lacks."""
+    source_grid, target_grid = ParameterGrid(source_spec), ParameterGrid(target_spec)
+    varying_paths = {
+        path
+        for any_grid in (source_grid, target_grid)
+        for values in any_grid.values_by_axis
+        for path in values
+    }
+    for lookup in PointMatching(
+        target_grid, source_grid, parameters_to_ignore(source_spec, target_spec)
+    ).lookups:
+        if (lookup.index_along_axis >= 0).all() or varying_paths.isdisjoint(lookup.paths):
+            continue
+        lost_indices = np.argwhere(lookup.index_along_axis < 0).T
+        values_text = ", ".join(
+            _lost_values_text(source_grid, path, lost_indices) for path in lookup.paths
+        )
+        yield f"{values_text}: lost, and must stay among the values"
+
+
+def _lost_values_text(grid: ParameterGrid, path: str, indices: np.ndarray) -> str:
+    """Values of a parameter at places of a grid, (axes, places)."""
+    values: list[object] = [grid.fixed_parameters[path]]
+    for axis_values, index in zip(grid.values_by_axis, indices, strict=True):
+        if path in axis_values:
+            values = axis_values[path][np.unique(index)].tolist()
+    value_texts = [f"{value:g}" if isinstance(value, float) else str(value) for value in values]
+    more = ["..."] if len(value_texts) > LOST_VALUES_LISTED_MAX else []
+    units = parameter_rules()[path].value_unit
+    return (
+        f"{path}: "
+        f"{', '.join(value_texts[:LOST_VALUES_LISTED_MAX] + more)}{f' {units}' if units else ''}"
+    )
+
+
+class AxisLookup(NamedTuple):
+    """Places of the values of some parameters of one study along an axis of another."""
+
+    paths: tuple[str, ...]
+    axis: int | None  # axis that is looked in; None for parameters that are fixed there
+    index_along_axis: np.ndarray
+    """int64, of the shape that is looked from, but 1 along axes without any of these parameters:
+    index along the axis, -1 where it lacks the values."""
+
+
+class PointMatching:
+    """Points along the axes of one study by the points of another.
+
+    Axes may be longer, in another order, new, or zipped otherwise; paths that are
+    ``parameters_to_ignore`` may differ.
+    """
+
+    def __init__(
+        self, other_grid: ParameterGrid, grid: ParameterGrid, ignored: Collection[str] = ()
+    ) -> None:
+        self._other_grid = other_grid
+        self.lookups = [
+            _axis_lookup(
+                grid, axis, {path: array for path, array in values.items() if path not in ignored}
+            )
+            for axis, values in _parameter_groups(other_grid, grid)
+        ]
+
+    def match_slices(self, grid_slices: tuple[slice, ...]) -> np.ndarray:
+        """Numbers, in C order over the other axes, of points in slices of its own; -1 for none."""
+        grid_indices = np.zeros((1,) * len(grid_slices), np.int64)
+        is_missing = np.zeros((1,) * len(grid_slices), bool)
+        for lookup in self.lookups:
+            is_varying = [size > 1 for size in lookup.index_along_axis.shape]
+            lookup_slices = (
+                axis_slice if varies else slice(None)
+                for axis_slice, varies in zip(grid_slices, is_varying, strict=True)
+            )
+            index = lookup.index_along_axis[tuple(lookup_slices)]
+            is_missing = is_missing | (index < 0)
+            if lookup.axis is not None:
+                grid_indices = grid_indices + index * math.prod(
+                    self._other_grid.shape[lookup.axis + 1 :]
+                )
+        grid_indices = np.where(is_missing, -1, grid_indices)
+        return np.broadcast_to(
+            grid_indices, [axis_slice.stop - axis_slice.start for axis_slice in grid_slices]
+        ).ravel()
+
+
+def _parameter_groups(
+    other_grid: ParameterGrid, grid: ParameterGrid
+) -> Iterator[tuple[int | None, dict[str, np.ndarray]]]:
+    """Parameters that are looked up together: those of each axis, and all that are fixed."""
+    yield from enumerate(other_grid.values_by_dim())
+    on_axes = {path for values in other_grid.values_by_dim() for path in values}
+    fixed_values = {
+        path: np.array([value])
+        for path, value in other_grid.fixed_parameters.items()
+        if path not in on_axes
+    }
+    for values in grid.values_by_dim():
+        yield None, {path: fixed_values.pop(path) for path in values if path in fixed_values}
+    yield None, fixed_values
+
+
+def _axis_lookup(
+    grid: ParameterGrid, axis: int | None, other_values: dict[str, np.ndarray]
+) -> AxisLookup:
+    """Places of a grid's values among others of the same parameters, which go together."""
+    varying_axes = [
+        axis_number
+        for axis_number, axis_values in enumerate(grid.values_by_dim())
+        if not axis_values.keys().isdisjoint(other_values)
+    ]
+    shape = tuple(
+        size if axis_number in varying_axes else 1 for axis_number, size in enumerate(grid.shape)
+    )
+    axis_indices = [
+        i.ravel() for i in np.indices([grid.shape[axis_number] for axis_number in varying_axes])
+    ]
+    values_by_dim = grid.values_by_dim()
+    parameters: dict[str, ParameterValue] = {
+        path: grid.fixed_parameters[path] for path in other_values if path in grid.fixed_parameters
+    }
+    for axis_number, i in zip(varying_axes, axis_indices, strict=True):
+        parameters |= {
+            path: array[i]
+            for path, array in values_by_dim[axis_number].items()
+            if path in other_values
+        }
+    n_values = len(next(iter(other_values.values()))) if other_values else 1
+    rows = canonical_point_rows(other_values, n_values)
+    row_indices = _find_rows(rows, canonical_point_rows(parameters, math.prod(shape)))
+    return AxisLookup(tuple(other_values), axis, row_indices.reshape(shape))
+
+
+def _find_rows(known_rows: np.ndarray, wanted_rows: np.ndarray) -> np.ndarray:
+    """Index of each wanted row, (m,), among rows (n, columns); -1 of those that are not there."""
+    if not known_rows.shape[1]:
+        return np.zeros(len(wanted_rows), np.int64)
+    all_rows = np.concatenate([known_rows, wanted_rows]).view(np.uint64)
+    row_codes = np.unique(all_rows, axis=0, return_inverse=True)[1].ravel()
+    index_of_code = np.full(len(all_rows), -1)
+    index_of_code[row_codes[: len(known_rows)]] = np.arange(len(known_rows))
+    return index_of_code[row_codes[len(known_rows) :]]

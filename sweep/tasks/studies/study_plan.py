@@ -1,0 +1,757 @@
+"""Plans of studies, before anything runs: points, blocks, bytes, time, memory, effects."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import compress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import psutil
+
+from sweep.model.effects.catalogue import EFFECTS, NAMES
+from sweep.model.outputs import SHOTS
+from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
+from sweep.storage.locations import Location, eyepoints_path
+from sweep.tasks.engine import cluster_connection
+from sweep.tasks.engine.blocks import SHOTS_PER_TILE, ParameterValue
+from sweep.tasks.studies.eyepoint_study import EyepointStudy
+from sweep.tasks.studies.flight_study import FlightBlock, FlightStudy
+from sweep.tasks.studies.grid_study import (
+    EffectPlanner,
+    GridStudy,
+    SelectedEffects,
+    evaluate_points,
+    limit_draws,
+    select_parameters,
+)
+from sweep.tasks.studies.memory_limits import (
+    point_bytes_max,
+    refuse_too_large_blocks,
+    refuse_too_large_point,
+    refuse_too_large_scene,
+    serial_worker_memory,
+)
+from sweep.tasks.studies.study_loading import make_study
+
+if TYPE_CHECKING:
+    from sweep.model.eyepoints import Eyepoints
+    from sweep.spec import GridSpec, SceneSpec
+    from sweep.tasks.engine.blocks import Results
+
+#: Time that measuring may take [s], and places of the grid that it looks at.
+POINT_TIMING_SECONDS = 1.0
+TIMED_BLOCKS_MAX = 16
+
+#: Time that measuring a scanner may take [s], about.
+SCANNER_TIMING_SECONDS = 0.5
+
+#: Draws of a point while measuring.
+TIMED_DRAWS_MAX = 1000
+
+#: The same, of whole spectra.
+TIMED_SPECTRA_MAX = 10
+
+#: What a worker takes to start [s], and to write a chunk [s].
+WORKER_START_SECONDS = 3.0
+CHUNK_WRITE_SECONDS = 2e-3
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScannerPlan:
+    """Plan of one scanner."""
+
+    name: str
+    n_cycles: int
+    n_shots: int
+    n_rays: int
+    is_cast: bool  # eyepoints are there already
+    seconds_per_ray: float  # on one worker, measured
+    seconds_per_draw: float  # of one shot, with radiometry and navigation
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyPlan:
+    """Plan of a study; scanners and reports are those of a flight."""
+
+    n_points: int
+    n_blocks: int
+    block_shape: dict[str, int]  # points along each axis; none of a flight
+    n_chunks: int
+    nbytes: int  # before compression, of all results
+    n_workers: int
+    seconds_per_point: float  # on one worker, measured
+    wall_seconds: float  # of the whole study, estimated
+    worker_bytes: int  # bytes, estimated
+    scanners: tuple[ScannerPlan, ...] = ()
+    scene_reports: tuple[str, ...] = ()  # what was mended as the scene was loaded
+
+    @property
+    def cpu_seconds(self) -> float:
+        """Time on one core [s]."""
+        return self.n_points * self.seconds_per_point
+
+
+def plan_study(
+    spec: GridSpec | SceneSpec, *, store_path: Location | None = None, n_workers: int | None = None
+) -> StudyPlan:
+    """Plan a study to be stored at a place, by its size and a second of measuring points."""
+    refuse_too_large_point(spec, serial_worker_memory())
+    study = make_study(spec, (store_path or Path("nowhere.zarr")).absolute())
+    refuse_too_large_blocks(study, serial_worker_memory())
+    scanners: tuple[ScannerPlan, ...] = ()
+    scene_reports: tuple[str, ...] = ()
+    block_shape = {}
+    if isinstance(study, FlightStudy):
+        eyepoints = study.eyepoint_studies()
+        scanners = tuple(_plan_scanner(study, seconds_per_point) for seconds_per_point in eyepoints)
+        ray_seconds = sum(
+            0 if scanner_plan.is_cast else scanner_plan.n_rays * scanner_plan.seconds_per_ray
+            for scanner_plan in scanners
+        )
+        draw_seconds = sum(
+            grid.n_points * scanner_plan.seconds_per_draw
+            for grid, scanner_plan in zip(study.grids, scanners, strict=True)
+        )
+        refuse_too_large_scene(study.spec, serial_worker_memory())
+        seconds_per_point, scene_reports = (
+            (ray_seconds + draw_seconds) / study.n_points,
+            eyepoints[0].world.mesh_reports,
+        )
+    else:
+        seconds_per_point = measure_seconds_per_point(study)
+        block_shape = dict(zip(study.grid.dims, study.grid.block_shape, strict=True))
+    n_workers = n_workers or spec.execution.workers or cluster_connection.cpu_count()
+    cpu_seconds = study.n_points * seconds_per_point + study.n_chunks * CHUNK_WRITE_SECONDS
+    return StudyPlan(
+        n_points=study.n_points,
+        n_blocks=study.n_blocks,
+        block_shape=block_shape,
+        n_chunks=study.n_chunks,
+        nbytes=study.nbytes,
+        n_workers=n_workers,
+        seconds_per_point=seconds_per_point,
+        wall_seconds=WORKER_START_SECONDS + cpu_seconds / min(n_workers, study.n_blocks),
+        # with the model loaded, and a block's results twice: its own, and those being encoded
+        worker_bytes=psutil.Process().memory_info().rss
+        + 2 * study.block_nbytes_max
+        + point_bytes_max(spec),
+        scanners=scanners,
+        scene_reports=scene_reports,
+    )
+
+
+def measure_seconds_per_point(study: GridStudy) -> float:
+    """Processor time of a point [s], measured on points spread over the grid.
+
+    Whole sets of points that share a geometry are taken, so that sharing shows as it will.
+    Points that miss an accuracy after few draws are taken to reach their limit.
+    """
+    study.compile_kernels()
+    blocks = _blocks_to_time(study)
+
+    def time_round(n_geometries: int) -> TimedRound:
+        for block in blocks:  # effects are planned once for many points, and are not timed
+            study.effect_planner.select_for_block(
+                block, _sample_points_of_block(study, block, n_geometries)
+            )
+        start = time.process_time()
+        samples = [_evaluate_sample(study, block, n_geometries) for block in blocks]
+        measured_seconds = time.process_time() - start
+        points, extrapolated_seconds = (sum(column) for column in zip(*samples, strict=True))
+        return TimedRound(points, (measured_seconds + extrapolated_seconds,))
+
+    timed_round = _time_growing_rounds(time_round, study.grid.n_points, POINT_TIMING_SECONDS)
+    return timed_round.seconds_by_part[0] / timed_round.n_points
+
+
+def _blocks_to_time(study: GridStudy) -> list[int]:
+    """Blocks spread over the grid, fewer where points take long: looked at once.
+
+    That loads what is compiled, which takes longer than many points.
+    """
+    blocks: list[int] = []
+    last_block, start = study.grid.n_blocks - 1, time.process_time()
+    for k in sorted(
+        range(TIMED_BLOCKS_MAX), key=lambda k: -math.gcd(k, TIMED_BLOCKS_MAX)
+    ):  # 0, the middle, quarters
+        block = k * last_block // (TIMED_BLOCKS_MAX - 1)
+        if block not in blocks:
+            _evaluate_sample(study, block, 1)
+            blocks.append(block)
+        if time.process_time() - start > 2 * POINT_TIMING_SECONDS:
+            break
+    return blocks
+
+
+class TimedRound(NamedTuple):
+    """A look at some points."""
+
+    n_points: int
+    seconds_by_part: tuple[float, ...]  # time of each kind of work [s]
+
+
+def _time_growing_rounds(
+    time_round: Callable[[int], TimedRound], n_points_max: int, seconds_max: float
+) -> TimedRound:
+    """Compute so much of a study that the time can be measured, or all of it."""
+    from numba.core.event import install_recorder
+
+    n_samples, start = 1, time.perf_counter()
+    while True:  # once at the least, however long this process has been held up
+        with install_recorder("numba:compile") as compile_events:
+            timed_round = time_round(n_samples)
+        now = time.perf_counter()
+        if compile_events.buffer:  # a round that compiles tells nothing of those that do not
+            start = now
+            continue
+        if timed_round.n_points >= n_points_max or now - start > seconds_max / 3:
+            return timed_round
+        n_samples *= 4
+
+
+def _sample_points_of_block(study: GridStudy, block: int, n_geometries: int) -> np.ndarray:
+    """Points of a block, by number within it: so many whole sets that share a geometry."""
+    grid, points_per_geometry = study.grid, 1
+    for length, is_geometric in zip(grid.block_extent(block), grid.is_geometric_axis, strict=True):
+        points_per_geometry *= 1 if is_geometric else length
+    geometry_groups = grid.geometry_order(block).reshape(-1, points_per_geometry)
+    sampled_groups = np.unique(
+        np.linspace(0, len(geometry_groups) - 1, n_geometries).astype(np.int64)
+    )
+    return geometry_groups[sampled_groups].ravel()
+
+
+def _evaluate_sample(study: GridStudy, block: int, n_geometries: int) -> tuple[int, float]:
+    """Return the number of points evaluated, and the time [s] of their skipped draws."""
+    spec, extrapolated_seconds = study.spec, 0.0
+    local_indices = _sample_points_of_block(study, block, n_geometries)
+    parameters = study.grid.parameters(block)
+    for members, effects in study.effect_planner.select_for_block(
+        block, local_indices
+    ).iter_equal_groups():
+        group_parameters = select_parameters(parameters, local_indices[members])
+        draws_max = TIMED_SPECTRA_MAX if spec.draws.draws_whole_spectra else TIMED_DRAWS_MAX
+        extrapolated_seconds += time_points(
+            spec, group_parameters, len(members), effects, draws_max=draws_max
+        ).extrapolated
+    return len(local_indices), extrapolated_seconds
+
+
+class PointTimes(NamedTuple):
+    """Time of some points on one core."""
+
+    measured: float  # measured
+    extrapolated: float
+    """Of draws that were left out: of all up to their limit, of points that are not settled."""
+
+
+def time_points(
+    spec: GridSpec,
+    parameters: Mapping[str, ParameterValue],
+    n_points: int,
+    effects: Collection[str],
+    *,
+    draws_max: int,
+) -> PointTimes:
+    """Time of some points, each drawn so many times at the most; as of :func:`evaluate_points`."""
+    limited_spec = limit_draws(spec, draws_max)
+    if spec.draws.draws_whole_spectra:
+        evaluate_points(limit_draws(spec, 1), parameters, n_points, effects)  # makes tables once
+    start = time.process_time()
+    results = evaluate_points(limited_spec, parameters, n_points, effects)
+    measured_seconds = time.process_time() - start
+    n_draws, n_draws_timed = (
+        max(draws_spec.draws.number, draws_spec.draws.limit) for draws_spec in (spec, limited_spec)
+    )
+    if n_draws == n_draws_timed:
+        return PointTimes(measured_seconds, 0.0)
+    if (
+        spec.draws.draws_whole_spectra
+    ):  # a point's spectrum without noise costs as much as many draws
+        start = time.process_time()
+        evaluate_points(limit_draws(spec, 1), parameters, n_points, effects)
+        single_draw_seconds = time.process_time() - start
+        seconds_per_draw = max(measured_seconds - single_draw_seconds, 0.0) / (n_draws_timed - 1)
+        return PointTimes(measured_seconds, seconds_per_draw * (n_draws - n_draws_timed))
+    unsettled_fraction = (
+        float(np.mean(results["accuracy_missed"] > 0)) if spec.draws.is_adaptive else 1.0
+    )
+    return PointTimes(
+        measured_seconds, measured_seconds * unsettled_fraction * (n_draws / n_draws_timed - 1)
+    )
+
+
+def _plan_scanner(study: FlightStudy, eyepoints: EyepointStudy) -> ScannerPlan:
+    scanner_grid = study.scanner_grids[eyepoints.scanner]
+    flight_block = scanner_grid.flight_block(0)
+    flight_block = flight_block._replace(draws=flight_block.draws[:TIMED_DRAWS_MAX])
+
+    def time_round(n_tiles: int) -> TimedRound:
+        start = time.process_time()
+        shot_numbers = eyepoints.sample_cycles(n_tiles)
+        shot_arrays = eyepoints.cast_cycles(shot_numbers)
+        cast_at = time.process_time()
+        shot_eyepoints = eyepoints_from_arrays(shot_arrays, eyepoints.beamlet_weights)
+        study.simulate_shots(
+            flight_block,
+            shot_arrays,
+            shot_eyepoints,
+            study.select_effects(flight_block, shot_eyepoints, shot_numbers),
+            shot_numbers,
+        )
+        simulated_at = time.process_time()
+        return TimedRound(len(shot_numbers), (cast_at - start, simulated_at - cast_at))
+
+    time_round(1)  # loads what is compiled, which takes longer than many points
+    timed_round = _time_growing_rounds(time_round, eyepoints.n_points, SCANNER_TIMING_SECONDS)
+    casting_seconds, draw_seconds = timed_round.seconds_by_part
+    return ScannerPlan(
+        name=eyepoints.scanner,
+        n_cycles=eyepoints.n_cycles,
+        n_shots=eyepoints.n_points,
+        n_rays=eyepoints.n_rays,
+        is_cast=eyepoints_path(study.store_path, eyepoints.id).exists(),
+        seconds_per_ray=casting_seconds / eyepoints.count_rays(timed_round.n_points),
+        seconds_per_draw=draw_seconds / (timed_round.n_points * len(flight_block.draws)),
+    )
+
+
+#: Tiles that are looked at; of larger grids as many as these, spread over them.
+GRID_TILES_SAMPLED_MAX = 1024
+
+#: Tiles of a flight that are looked at, of each scanner, and places along its axes.
+SCANNER_TILES_SAMPLED, AXIS_POINTS_SAMPLED = 16, 12
+
+#: Tiles on which an effect's cost is measured, points of each, and draws of a point; in flights
+#: scanners and places along the axes, and shots of each. Rounds: of short work, and of long.
+COST_TILES_MAX, COST_POINTS_MAX, COST_DRAWS_MAX, COST_SCANNER_SAMPLES_MAX = 4, 24, 20, 3
+COST_ROUNDS_MAX, COST_ROUNDS_MIN = 5, 3
+
+#: Spread of an effect's cost over the rounds, relative to it, up to which the cost is known. It is
+#: about twice the error of the median.
+COST_SPREAD_MAX = 0.1
+
+#: Time [s] of a round of measuring an effect's cost that is long enough.
+COST_ROUND_SECONDS = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class EffectRow:
+    """An effect in a study."""
+
+    name: str
+    mode: str
+    simulated_fraction: float  # of the points at which it is simulated
+    simulated_at: str  # the part of the study that holds these
+    change_bound: float  # largest change that it may make anywhere: of pd, log10 pfa or a magnitude
+    largest_change_at: str  # where that is
+    time_fraction: (
+        float  # share of a point's time that it takes where it is simulated; nan: not known
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class EffectsTable:
+    """All effects in a study."""
+
+    rows: tuple[EffectRow, ...]
+    tolerance: float
+    error_bound: float  # largest sum of what is left out
+    tile_fraction: float  # share of the tiles
+
+    def warnings(self) -> Iterator[str]:
+        """Effects that are forced off though they matter."""
+        for row in self.rows:
+            if row.mode == "off" and row.change_bound > self.tolerance:
+                yield (
+                    f"effects.{row.name} is off and may change pd, log10 pfa or |X| by up to "
+                    f"{row.change_bound:.2g} ({row.largest_change_at}); the tolerance is "
+                    f"{self.tolerance:g}: "
+                    "say auto to have it where it matters"
+                )
+
+
+def effects_table(study: GridStudy | FlightStudy, *, costs: bool = True) -> EffectsTable:
+    """Effects of a study, by the plans of its tiles, and what they cost, if asked."""
+    if isinstance(study, GridStudy):
+        return _grid_effects_table(study, costs)
+    return _flight_effects_table(study, costs)
+
+
+def _grid_effects_table(study: GridStudy, costs: bool) -> EffectsTable:
+    spec, effect_planner = study.spec, study.effect_planner
+    n_tiles = effect_planner.tiles.n_blocks
+    tiles = np.unique(
+        np.linspace(0, n_tiles - 1, min(n_tiles, GRID_TILES_SAMPLED_MAX)).astype(np.int64)
+    )
+    is_kept = np.empty((len(EFFECTS), len(tiles)), bool)
+    change_bounds, error_bounds = np.empty(is_kept.shape), np.empty(len(tiles))
+    for members, effect_plan in effect_planner.iter_plans(tiles):
+        is_kept[:, members], change_bounds[:, members], error_bounds[members] = (
+            effect_plan.kept,
+            effect_plan.change,
+            effect_plan.error,
+        )
+    points_by_tile = [_tile_grid_indices(effect_planner, tile) for tile in tiles.tolist()]
+    n_points_by_tile = np.array([len(tile_points) for tile_points in points_by_tile])
+    inactive_flags = effect_planner.inactive_flags(
+        study.grid.parameters_at(np.concatenate(points_by_tile)), int(n_points_by_tile.sum())
+    )
+    first_points = np.cumsum(n_points_by_tile) - n_points_by_tile
+    n_active_points = np.array(
+        [
+            np.add.reduceat((inactive_flags >> bit & 1) == 0, first_points)
+            for bit in range(len(EFFECTS))
+        ]
+    )
+    timed_spec = spec
+    if spec.draws.draws_whole_spectra:  # what an effect costs does not go by what looks at spectra
+        draws = spec.draws.model_copy(update={"method": "probabilities"})
+        timed_spec = spec.model_copy(update={"draws": draws})
+    sample_tile = _make_tile_sampler(timed_spec, effect_planner)
+    return _make_effects_table(
+        spec,
+        _TileEffects(is_kept * n_active_points, change_bounds, error_bounds),
+        n_points=int(n_points_by_tile.sum()),
+        region_text=lambda is_in_region: _region_text(spec, effect_planner, tiles[is_in_region]),
+        effect_cost=lambda name, is_simulated: (
+            _grid_effect_cost(timed_spec, sample_tile, tiles[is_simulated], name)
+            if costs
+            else math.nan
+        ),
+        tile_fraction=len(tiles) / n_tiles,
+    )
+
+
+def _flight_effects_table(study: FlightStudy, costs: bool) -> EffectsTable:
+    tile_effects, tile_times, n_shots = [], [], 0
+    axes = tuple(int(axis.size) for axis in study.spec.axes)
+    axis_points = list(np.ndindex(axes))
+    for eyepoints in study.eyepoint_studies():
+        shot_numbers = eyepoints.sample_tiles(SCANNER_TILES_SAMPLED)
+        sample_eyepoints = eyepoints_from_arrays(
+            eyepoints.cast_shots(shot_numbers), eyepoints.beamlet_weights
+        )
+        for place in np.unique(
+            np.linspace(0, len(axis_points) - 1, AXIS_POINTS_SAMPLED).astype(int)
+        ).tolist():
+            n_shots += len(shot_numbers)
+            flight_block = study.scanner_grids[eyepoints.scanner].first_flight_block(
+                axis_points[place]
+            )
+            shot_plan = study.plan_effects(
+                flight_block, sample_eyepoints, shot_numbers // SHOTS_PER_TILE
+            )
+            if shot_plan is not None:
+                effect_plan, n_hitting_by_tile = shot_plan.plan, np.bincount(shot_plan.tile_index)
+                tile_effects.append(
+                    _TileEffects(
+                        effect_plan.kept * n_hitting_by_tile, effect_plan.change, effect_plan.error
+                    )
+                )
+                first_shots = np.searchsorted(
+                    shot_plan.tile_index, np.arange(n_hitting_by_tile.size)
+                )
+                tile_times.append(sample_eyepoints.time[shot_plan.hitting_shots][first_shots])
+    if not tile_effects:
+        tolerance = float(study.spec.accuracy.tolerance)
+        return EffectsTable(rows=(), tolerance=tolerance, error_bound=0.0, tile_fraction=1.0)
+    time_of_tile, shot_samples = np.concatenate(tile_times), _sample_flight(study) if costs else []
+    return _make_effects_table(
+        study.spec,
+        _TileEffects(
+            *(np.concatenate(column, axis=-1) for column in zip(*tile_effects, strict=True))
+        ),
+        n_points=n_shots,
+        region_text=lambda is_in_region: _time_range_text(time_of_tile[is_in_region]),
+        effect_cost=lambda name, is_in_region: _flight_effect_cost(study, shot_samples, name),
+        tile_fraction=n_shots * study.spec.draws.number / study.n_points,
+    )
+
+
+class _TileEffects(NamedTuple):
+    """Plans of m tiles."""
+
+    n_simulated: np.ndarray  # (effects, m): points at which each effect is simulated
+    change_bounds: np.ndarray  # (effects, m)
+    error_bounds: np.ndarray  # (m,)
+
+
+def _make_effects_table(
+    spec: GridSpec | SceneSpec,
+    tile_effects: _TileEffects,
+    *,
+    n_points: int,
+    region_text: Callable[[np.ndarray], str],
+    effect_cost: Callable[[str, np.ndarray], float],
+    tile_fraction: float,
+) -> EffectsTable:
+    """Return the table, from what is kept and changed in tiles."""
+    effect_modes = spec.effect_modes()
+    rows = tuple(
+        EffectRow(
+            name=effect.name,
+            mode=effect_modes[effect.name],
+            simulated_fraction=float(n_simulated.sum() / n_points),
+            simulated_at=region_text(n_simulated > 0) if n_simulated.any() else "",
+            change_bound=float(bounds.max()),
+            largest_change_at=region_text(np.arange(bounds.size) == bounds.argmax()),
+            time_fraction=effect_cost(effect.name, n_simulated > 0)
+            if n_simulated.any()
+            else math.nan,
+        )
+        for effect, n_simulated, bounds in zip(
+            EFFECTS, tile_effects.n_simulated, tile_effects.change_bounds, strict=True
+        )
+    )
+    tolerance, error_bound = float(spec.accuracy.tolerance), float(tile_effects.error_bounds.max())
+    return EffectsTable(
+        rows=rows, tolerance=tolerance, error_bound=error_bound, tile_fraction=tile_fraction
+    )
+
+
+def _time_range_text(times: np.ndarray) -> str:
+    first, last = times.min(), times.max()
+    return f"time {first:.4g} s" if first == last else f"time {first:.4g}..{last:.4g} s"
+
+
+def _region_text(spec: GridSpec, effect_planner: EffectPlanner, tiles: np.ndarray) -> str:
+    """Return the smallest box of the grid that holds some tiles, in the user's units."""
+    slices = [effect_planner.tiles.block_slices(tile) for tile in tiles.tolist()]
+    words = []
+    for k, axis in enumerate(spec.axes):
+        first, stop = (
+            min(tile_slices[k].start for tile_slices in slices),
+            max(tile_slices[k].stop for tile_slices in slices),
+        )
+        for member in axis.parameters:
+            values = list(dict.fromkeys(member.display_values[first:stop].tolist()))
+            unit = f" {member.units}" if member.units else ""
+            if isinstance(values[0], str):
+                words.append(f"{member.coordinate} {', '.join(values)}")
+            elif len(values) == 1:
+                words.append(f"{member.coordinate} {values[0]:g}{unit}")
+            else:
+                words.append(f"{member.coordinate} {min(values):g}..{max(values):g}{unit}")
+    return ", ".join(words) or "the point"
+
+
+class _PointSample(NamedTuple):
+    """Points of a tile, with all effects of its plan."""
+
+    parameters: Mapping[str, ParameterValue]
+    n_points: int
+    effect_names: tuple[str, ...]
+
+
+def _make_tile_sampler(
+    spec: GridSpec, effect_planner: EffectPlanner
+) -> Callable[[int], _PointSample]:
+    """Choice of points of a tile, made once: of few, or of one where that takes long."""
+
+    @cache
+    def sample_tile(tile: int) -> _PointSample:
+        ((_, effect_plan),) = effect_planner.iter_plans(np.array([tile]))
+        effect_names = tuple(compress(NAMES, effect_plan.kept[:, 0]))
+        sampled_indices, single_index = (
+            _tile_grid_indices(effect_planner, tile, n_points) for n_points in (COST_POINTS_MAX, 1)
+        )
+        parameters = effect_planner.tiles.grid.parameters_at(single_index)
+        if _seconds_of_points(spec, parameters, 1, effect_names) < COST_ROUND_SECONDS / 2:
+            return _PointSample(
+                effect_planner.tiles.grid.parameters_at(sampled_indices),
+                len(sampled_indices),
+                effect_names,
+            )
+        return _PointSample(parameters, 1, effect_names)
+
+    return sample_tile
+
+
+def _seconds_of_points(
+    spec: GridSpec,
+    parameters: Mapping[str, ParameterValue],
+    n_points: int,
+    effect_names: Collection[str],
+) -> float:
+    """Time of some points [s] with some effects."""
+    return sum(time_points(spec, parameters, n_points, effect_names, draws_max=COST_DRAWS_MAX))
+
+
+Stopwatch = Callable[[], float]
+"""Measure some work once: its time [s]."""
+
+
+def _grid_effect_cost(
+    spec: GridSpec, sample_tile: Callable[[int], _PointSample], tiles: np.ndarray, effect_name: str
+) -> float:
+    """Share of the time of points that an effect takes, from points with it and without."""
+
+    def stopwatches_of_tile(tile: int) -> tuple[Stopwatch, Stopwatch]:
+        parameters, n_points, effect_names = sample_tile(tile)
+        without = tuple(other for other in effect_names if other != effect_name)
+        return (
+            lambda: _seconds_of_points(spec, parameters, n_points, effect_names),
+            lambda: _seconds_of_points(spec, parameters, n_points, without),
+        )
+
+    return reproducible_share(
+        map(stopwatches_of_tile, _evenly_spaced(tiles.tolist(), COST_TILES_MAX))
+    )
+
+
+def reproducible_share(stopwatches: Iterable[tuple[Stopwatch, Stopwatch]]) -> float:
+    """Share of the time that an effect takes; nan where rounds of measuring disagree on it.
+
+    Parameters
+    ----------
+    stopwatches
+        Clocks of the same work with the effect and without. As many are read as take
+        :data:`COST_ROUND_SECONDS` together.
+
+    Returns
+    -------
+    float
+        Median over rounds, each of which takes one reading with the effect and one without by
+        turns. nan if the rounds differ by more than :data:`COST_SPREAD_MAX` of it.
+    """
+    timed_pairs, total_seconds = [], 0.0
+    for time_with, time_without in stopwatches:
+        time_without()  # loads what is compiled
+        total_seconds += time_with()
+        timed_pairs.append((time_with, time_without))
+        if total_seconds > COST_ROUND_SECONDS:
+            break
+    fractions, start = [], time.process_time()
+    for round_number in range(COST_ROUNDS_MAX):
+        if (
+            round_number >= COST_ROUNDS_MIN
+            and time.process_time() - start > COST_ROUNDS_MAX * COST_ROUND_SECONDS
+        ):
+            break
+        times = np.array([(time_with(), time_without()) for time_with, time_without in timed_pairs])
+        seconds_with, seconds_without = times.sum(axis=0) if timed_pairs else (0.0, 0.0)
+        fractions.append(
+            (seconds_with - seconds_without) / seconds_with if seconds_with > 0 else math.nan
+        )
+    median = float(np.median(fractions))
+    return median if np.ptp(fractions) <= COST_SPREAD_MAX * median else math.nan
+
+
+class _ShotSample(NamedTuple):
+    """Arguments of :meth:`FlightStudy.simulate_shots`, of whole cycles of a scanner."""
+
+    flight_block: FlightBlock
+    shot_arrays: Results
+    eyepoints: Eyepoints
+    selected_effects: SelectedEffects
+    shot_numbers: np.ndarray
+
+    def subset(self, rows: np.ndarray, *, removed_flags: np.uint32) -> _ShotSample:
+        """Select shots, without the effects of some flags."""
+        shot_arrays = {name: self.shot_arrays[name][rows] for name in SHOTS}
+        effect_flags = self.selected_effects.effect_flags[rows] & ~removed_flags
+        selected_effects = SelectedEffects(effect_flags, self.selected_effects.error_bound[rows])
+        return _ShotSample(
+            self.flight_block,
+            shot_arrays,
+            self.eyepoints.some(rows),
+            selected_effects,
+            self.shot_numbers[rows],
+        )
+
+
+def _sample_flight(study: FlightStudy) -> list[_ShotSample]:
+    """Cycles spread over each scanner's flight, at the ends of its axes, with few draws."""
+    axis_corners = {
+        tuple(end_factor * (int(axis.size) - 1) for axis in study.spec.axes)
+        for end_factor in (0, 1)
+    }
+    samples = []
+    for eyepoints in study.eyepoint_studies():
+        shot_numbers = eyepoints.sample_cycles(SCANNER_TILES_SAMPLED)
+        shot_arrays = eyepoints.cast_cycles(shot_numbers)
+        shot_eyepoints = eyepoints_from_arrays(shot_arrays, eyepoints.beamlet_weights)
+        for corner in sorted(axis_corners):
+            flight_block = study.scanner_grids[eyepoints.scanner].first_flight_block(corner)
+            flight_block = flight_block._replace(
+                draws=range(min(len(flight_block.draws), COST_DRAWS_MAX))
+            )
+            selected_effects = study.select_effects(flight_block, shot_eyepoints, shot_numbers)
+            samples.append(
+                _ShotSample(
+                    flight_block, shot_arrays, shot_eyepoints, selected_effects, shot_numbers
+                )
+            )
+    return samples
+
+
+def _flight_effect_cost(
+    study: FlightStudy, shot_samples: Sequence[_ShotSample], effect_name: str
+) -> float:
+    """Share of the time of shots that an effect takes, from cycles with it and without."""
+    no_flags, effect_flag = np.uint32(0), np.uint32(1 << NAMES.index(effect_name))
+
+    def stopwatches_of_sample(sample: _ShotSample) -> tuple[Stopwatch, Stopwatch]:
+        shots_per_cycle = study.scanner_grids[sample.flight_block.scanner].shots_per_cycle
+        cycles_with_effect = np.flatnonzero(
+            (sample.selected_effects.effect_flags & effect_flag)
+            .reshape(-1, shots_per_cycle)
+            .any(axis=1)
+        )
+        for n_cycles in (1, -(-COST_POINTS_MAX // shots_per_cycle)):
+            cycles = np.array(_evenly_spaced(cycles_with_effect, n_cycles))
+            if (
+                _seconds_of_cycles(study, sample, cycles, removed_flags=no_flags)
+                > COST_ROUND_SECONDS / 2
+            ):  # so few tell enough
+                break
+        return (
+            lambda: _seconds_of_cycles(study, sample, cycles, removed_flags=no_flags),
+            lambda: _seconds_of_cycles(study, sample, cycles, removed_flags=effect_flag),
+        )
+
+    samples_with_effect = [
+        sample
+        for sample in shot_samples
+        if (sample.selected_effects.effect_flags & effect_flag).any()
+    ]
+    return reproducible_share(
+        map(stopwatches_of_sample, _evenly_spaced(samples_with_effect, COST_SCANNER_SAMPLES_MAX))
+    )
+
+
+def _evenly_spaced(sequence: Sequence[Any] | np.ndarray, n_max: int) -> list[Any]:
+    """Select some items, from the first to the last."""
+    positions = np.linspace(0, len(sequence) - 1, min(n_max, len(sequence))).astype(int)
+    return [sequence[k] for k in positions]
+
+
+def _seconds_of_cycles(
+    study: FlightStudy, sample: _ShotSample, cycles: np.ndarray, *, removed_flags: np.uint32
+) -> float:
+    """Time of some cycles [s] without the effects of some flags."""
+    shots_per_cycle = study.scanner_grids[sample.flight_block.scanner].shots_per_cycle
+    cycle_sample = sample.subset(
+        (cycles[:, None] * shots_per_cycle + np.arange(shots_per_cycle)).ravel(),
+        removed_flags=removed_flags,
+    )
+
+    start = time.process_time()
+    study.simulate_shots(*cycle_sample)
+    return time.process_time() - start
+
+
+def _tile_grid_indices(
+    effect_planner: EffectPlanner, tile: int, n_max: int | None = None
+) -> np.ndarray:
+    """Numbers of the points of a tile, or of some, in C order over the grid."""
+    tile_size = effect_planner.tiles.block_size(tile)
+    local_indices = np.unique(np.linspace(0, tile_size - 1, n_max or tile_size).astype(np.int64))
+    return effect_planner.tiles.grid_indices(tile, local_indices)

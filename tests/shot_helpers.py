@@ -1,0 +1,130 @@
+"""Shots of one category, keys of points, and bins and lines as detection and leakage see them."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+
+from sweep.model import line_shape, philox
+from sweep.model.effects.catalogue import CORE
+from sweep.model.lines import BLOCK, IM, PLACE, RE, place_lines
+from sweep.model.segments import runs_of
+from sweep.model.shot import prepare
+from sweep.model.spectrum import IMAGED
+
+DRAWS = 10_000
+"""5 sigma of a proportion are at most 5 sqrt(1/4 / 10,000) = 0.025: an error of 5 % of pd shows.
+
+A sample variance of as many is known to sqrt(2/10,000) = 1.4 %: at 5 sigma 7 % in a variance show.
+"""
+
+
+def parametrize_product(fast_step, *choice_lists):
+    """All combinations of some choices; all but every `step`-th of them are slow.
+
+    With a step that has no divisor in common with their numbers, each choice is taken.
+    """
+    return [
+        pytest.param(*case, marks=[pytest.mark.slow] * (case_number % fast_step > 0))
+        for case_number, case in enumerate(product(*choice_lists))
+    ]
+
+
+def prepare_single_category(parameters, effects=CORE):
+    """Shots of parameters that are all of one category."""
+    ((_, shots),) = prepare(parameters, effects)
+    return shots
+
+
+def make_point_keys(n, seed=5):
+    """Keys of n points."""
+    return philox.point_keys(np.arange(float(n))[:, None], domain="tests", seed=seed)
+
+
+def is_within_5_sigma(counts, probability, extra_allowance=0.0):
+    """Counts of as many draws that a chance explains, True for each."""
+    count_deviation = np.sqrt(DRAWS * probability * (1 - probability))
+    return np.abs(counts - DRAWS * probability) <= 5 * count_deviation + extra_allowance + 1e-9
+
+
+def intersect_level_plane(axis_range, grazing, pointing_errors):
+    """Range and grazing angle of jittered rays that are followed down to the plane z = 0."""
+    origin = np.array([0.0, 0.0, axis_range * np.sin(grazing)])
+    axis_direction = np.array([np.cos(grazing), 0.0, -np.sin(grazing)])
+    up, side_direction = (
+        np.array([np.sin(grazing), 0.0, np.cos(grazing)]),
+        np.array([0.0, 1.0, 0.0]),
+    )
+    angle = np.hypot(*pointing_errors.T)[:, None]
+    sideways = pointing_errors[:, :1] * up + pointing_errors[:, 1:] * side_direction
+    direction = axis_direction * np.cos(angle) + sideways * np.sinc(angle / np.pi)
+    ranges = -origin[2] / direction[:, 2]
+    return ranges, np.arcsin(-direction[:, 2]), direction
+
+
+def detected_window(shots, segment):
+    """First bin and |X| of those that are looked at one by one, of the first point."""
+    (windows,) = runs_of(shots, points=np.zeros(1, np.int64))
+    return int(windows.low[segment, 0]), windows.run(segment, 0).copy()
+
+
+def magnitude_error(shots, magnitude, exact_magnitude, peak=None):
+    """Largest difference of |X|, over the peak.
+
+    Where lines add as powers |X|^2 is the sum, to some roundings of its largest terms: 1e-13 of the
+    peak's power count as no more than 1e-9 of the peak, which they exceed where |X| is 86 dB down.
+    """
+    peak = exact_magnitude.max() if peak is None else peak
+    error = np.abs(magnitude - exact_magnitude) / peak
+    if shots.incoherent:
+        error = np.minimum(error, 1e4 * np.abs(magnitude**2 - exact_magnitude**2) / peak**2)
+    return error.max()
+
+
+def segment_lines(shots, i, segment):
+    """Origin of a segment's lines, places beside it [bins], weights C_b."""
+    n, row = shots.offset.shape[1], int(shots.row[i])
+    scratch = np.empty((BLOCK + 1, n))
+    sizes = np.array([shots.fft_size, shots.window.length, 0, 0, 0, 0])
+    point = np.ascontiguousarray(shots.point_table()[:, i])
+    origin = place_lines(point, segment, shots.footprint, row, sizes, scratch)
+    return origin, scratch[PLACE], scratch[RE] + 1j * scratch[IM]
+
+
+def line_shape_of_window(window, fft_size, *, power=False, phase=None, view=IMAGED):
+    """Line shape of a window with a phase error [cycles], a function of x = -1 .. 1.
+
+    Its table; envelope and ends, as `spectrum` takes them; sizes; shift of the line [bins]; and
+    modes, 0 of a table of all bins.
+    """
+    phase, table, n_modes = phase or np.zeros_like, None, 0
+    for tier, (modes_max, _, _) in enumerate(line_shape.TIERS):
+        if not line_shape.has_modes(window, fft_size):
+            break
+        centre, modes = np.zeros((1, 1)), np.zeros((1, 1, 2, modes_max))
+        mode_counts = np.zeros((1, 1), np.int64)
+        phase_at_nodes = phase(line_shape.record_places(2 * modes_max))[None, None]
+        line_shape.find_modes(
+            phase_at_nodes,
+            np.empty((0, 0, 0)),
+            line_shape.to_modes(2 * modes_max),
+            centre,
+            modes,
+            mode_counts,
+        )
+        n_modes = int(mode_counts[0, 0])
+        if n_modes:
+            shapes = line_shape.shapes(window, fft_size, power, tier)
+            table = np.empty((2, line_shape.places_of(shapes.sizes)))
+            outline = np.zeros((7, shapes.reach.shape[1]))
+            mode_parts = centre, modes, mode_counts, np.empty((1, 2, 0))
+            line_shape.build(0, (0, -1), mode_parts, shapes, table, outline)
+            break
+    if table is None:
+        x = 2 * np.arange(window.length) / window.length - 1
+        shapes, centre = line_shape.whole_shapes(window, fft_size, power, phase(x)[None]), None
+        table, outline = shapes.whole[0], np.zeros((7, shapes.reach.shape[1]))
+        outline[1:3] = shapes.outlines[0]
+    outline[0] = shapes.reach[0]
+    shift = 0.0 if centre is None else centre[0, 0] * fft_size / window.length
+    return table, outline, np.append(shapes.sizes, (view, 0)), shift, n_modes
