@@ -107,7 +107,7 @@ class GridResults:
         chart_options: dict[str, Any] = {
             "x": figure_spec.x,
             "variable": figure_spec.variable,
-            "words": label,
+            "label": label,
         }
         if isinstance(figure_spec, SurfaceFigure):
             return charts.surface_chart(

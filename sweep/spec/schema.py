@@ -57,7 +57,7 @@ def json_schema() -> Json:
         "title": "sweep study",
         "if": {"required": ["scene"]},
         "then": {"$ref": "#/$defs/SceneSpec"},
-        "else": {"$ref": "#/$defs/Spec"},
+        "else": {"$ref": "#/$defs/GridSpec"},
         "$defs": definitions,
     }
 

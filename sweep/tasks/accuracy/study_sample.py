@@ -563,7 +563,7 @@ class FlightSample(StudySample):
         self, setting: AccuracySetting, flight_block: FlightBlock, shot_numbers: np.ndarray
     ) -> tuple[Eyepoints, float]:
         """Eyepoints of shots, cast once for rungs of a geometry, and the time that it took [s]."""
-        eyepoint_study = self.study_with(setting).caster(flight_block.scanner)
+        eyepoint_study = self.study_with(setting).get_eyepoint_study(flight_block.scanner)
         cache_key = eyepoint_study.id, shot_numbers.tobytes()
         if cache_key not in self._cast_eyepoints:
             start = thread_time()
