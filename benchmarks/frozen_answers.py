@@ -54,7 +54,7 @@ def sampled_mapping(
             member.path: value_text(member, int(index))
             for axis in spec.axes
             for index in [rng.integers(axis.size)]
-            for member in axis.members
+            for member in (axis.parameters if hasattr(axis, "parameters") else axis.members)
         }
         for _ in range(points)
     ]
@@ -63,7 +63,8 @@ def sampled_mapping(
 
 def value_text(member: Any, index: int) -> str:
     """A value of an axis as a spec has it."""
-    value = member.display_values[index]
+    values = member.display_values if hasattr(member, "display_values") else member.display
+    value = values[index]
     return str(value) if isinstance(value, str) else f"{float(value)!r} {member.units}".strip()
 
 

@@ -490,17 +490,21 @@ def _maximum_range_chart(
     ][:1]
     parts: list[tuple[str, PointSelection]] = []
     for part_label, max_range in max_ranges:
-        own, n_omitted_parts = split_by_coordinates(
+        subparts, n_omitted_parts = split_by_coordinates(
             max_range, max_range.distinguishing_coordinates([x, *line_coordinates]), CHART_PARTS_MAX
         )
         parts += [
             (", ".join(filter(None, (part_label, subpart_label))), part)
-            for subpart_label, part in own
+            for subpart_label, part in subparts
         ]
         n_omitted += n_omitted_parts
     n_omitted += max(0, len(parts) - CHART_PARTS_MAX)
     named_points, _ = charts.split_into_lines(parts[:CHART_PARTS_MAX], line_coordinates)
-    pairs = [(own, answer) for answer in ANSWER_BY_LABEL.values() for _, _, own in named_points]
+    pairs = [
+        (line_points, answer)
+        for answer in ANSWER_BY_LABEL.values()
+        for _, _, line_points in named_points
+    ]
     drawn_lines, remarks = charts.lines_along(pairs, x)
     x_axis = CoordinateAxis.from_points(first_points, x)
     y_axis = ChartAxis(range_label, LINEAR, (0.0, None))

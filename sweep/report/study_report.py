@@ -151,7 +151,7 @@ def _answer_section(
     lazy_counts = []
     for group in groups:
         pd = group["pd_shot"]
-        exceedances = [group[name] > most for name, most in limits.items() if name in group]
+        exceedances = [group[name] > limit for name, limit in limits.items() if name in group]
         missed = sum(exceedances, xr.DataArray(0)) > 0
         unchecked = pd.notnull() & group["beamlets_error"].isnull()
         lazy_counts.append(
@@ -168,8 +168,8 @@ def _answer_section(
         *further_sentences,
     ]
     if alarms := alarm_probabilities(spec):
-        most = max(alarm_probability for alarm_probability, _ in alarms)
-        alarm_text = f"{most:.3g}" + " at the most" * (len(alarms) > 1)
+        alarm_probability_max = max(alarm_probability for alarm_probability, _ in alarms)
+        alarm_text = f"{alarm_probability_max:.3g}" + " at the most" * (len(alarms) > 1)
         sentences.append(
             f"Noise alone raises a false alarm in either chirp with probability {alarm_text}."
         )
@@ -457,14 +457,27 @@ def _effect_table(flag_arrays: Sequence[xr.DataArray], modes: Mapping[str, str])
     for k in range(len(EFFECTS)):
         presence = [array // 2**k % 2 > 0 for array in flag_arrays]
         lazy_counts.append(
-            [(own.sum(), [own.any(set(own.dims) - {dim}) for dim in own.dims]) for own in presence]
+            [
+                (
+                    effect_presence.sum(),
+                    [
+                        effect_presence.any(set(effect_presence.dims) - {dim})
+                        for dim in effect_presence.dims
+                    ],
+                )
+                for effect_presence in presence
+            ]
         )
     (effect_counts,) = dask.compute(lazy_counts)
     n_points = sum(array.size for array in flag_arrays)
     rows = []
     for effect, group_counts in zip(EFFECTS, effect_counts, strict=True):
-        n_with_effect = sum(int(own) for own, _ in group_counts)
-        extent_texts = [_describe_presence(along) for _, own in group_counts for along in own]
+        n_with_effect = sum(int(n_in_group) for n_in_group, _ in group_counts)
+        extent_texts = [
+            _describe_presence(along)
+            for _, presence_by_dim in group_counts
+            for along in presence_by_dim
+        ]
         where_text = (
             ", ".join(dict.fromkeys(filter(None, extent_texts)))
             if n_with_effect < n_points

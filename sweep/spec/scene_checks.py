@@ -24,8 +24,7 @@ from sweep.scenes.map_frames import metres_per_height_unit
 from sweep.scenes.scene_files import SceneError
 from sweep.spec.axes import parameter_location
 from sweep.spec.fields import SpecFiles, iter_file_paths, read_or_none
-from sweep.spec.grid_checks import GridValues
-from sweep.spec.grid_checks import raw_value_at as raw_value_at
+from sweep.spec.grid_checks import GridValues, raw_value_at
 from sweep.spec.ground_sections import Craters, Ground, JacksboroGround, RasterGround
 from sweep.spec.rules import Finding, Location, suggest_similar_name
 from sweep.spec.sections import default_value

@@ -59,10 +59,10 @@ from sweep.spec.grid_checks import (
     flight_effect_findings,
     grid_findings,
     is_detector_or_estimator,
+    raw_value_at,
     spectra_findings,
     undrawn_effect_findings,
 )
-from sweep.spec.grid_checks import raw_value_at as raw_value_at
 from sweep.spec.ground_sections import OPTICAL_FIELDS
 from sweep.spec.rules import (
     CustomRule,

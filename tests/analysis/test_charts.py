@@ -42,7 +42,7 @@ def points_on(x, y, values):
 
 
 def surface(found, **changes):
-    options = {"x": "range", "y": "grazing_angle", "variable": "pd_shot", "words": "pd"}
+    options = {"x": "range", "y": "grazing_angle", "variable": "pd_shot", "label": "pd"}
     return charts.surface_chart(found, **(options | changes))
 
 

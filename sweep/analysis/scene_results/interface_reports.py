@@ -120,18 +120,21 @@ def _read_shots(recording: Recording, draw: int, ranges: str) -> ColumnArrays:
         for name in (*MEASURED_QUANTITIES, *map(_standard_error_name, MEASURED_QUANTITIES))
     }
     column_parts: list[ColumnArrays] = []
-    for part in recording.shot_slices():
-        is_computed = recording.computed_shots(part, draw)
+    for shot_slice in recording.shot_slices():
+        is_computed = recording.computed_shots(shot_slice, draw)
         names = ("time", "beam", *_TRUTH_VARIABLES.values())
-        column_arrays = {name: recording.read(name, part)[is_computed] for name in names}
+        column_arrays = {name: recording.read(name, shot_slice)[is_computed] for name in names}
         for name, stored_name in (stored_by_name | {"flags": "flags"}).items():
-            column_arrays[name] = recording.read(stored_name, part, draw)[is_computed, 0]
+            column_arrays[name] = recording.read(stored_name, shot_slice, draw)[is_computed, 0]
         column_parts.append(column_arrays)
-    if not any(part["time"].size for part in column_parts):
+    if not any(column_part["time"].size for column_part in column_parts):
         problem = f"holds no shot of {recording.scanner} and draw {draw} yet"
         remedy = f"{suggestion('resume', STORE_PLACEHOLDER)} goes on with it"
         raise SpecError([Mistake("store", problem, "", remedy)])
-    return {name: np.concatenate([part[name] for part in column_parts]) for name in column_parts[0]}
+    return {
+        name: np.concatenate([column_part[name] for column_part in column_parts])
+        for name in column_parts[0]
+    }
 
 
 def make_reports(shot_columns: ColumnArrays, interface: Interface) -> ColumnArrays:

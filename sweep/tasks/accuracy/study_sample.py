@@ -357,7 +357,7 @@ class GridSample(StudySample):
             return np.full(point_indices.size, self._line_effect_flags), 0.0
         effect_planner = self.study_with(setting).effect_planner
         tiles, tile_of_point = np.unique(
-            effect_planner.tiles.locate(point_indices)[0], return_inverse=True
+            effect_planner.tiles.locate_points(point_indices)[0], return_inverse=True
         )
         effect_flags = np.empty(tiles.size, np.uint32)
         start = thread_time()
@@ -501,7 +501,9 @@ class FlightSample(StudySample):
             effect_flags = np.where(eyepoints.seen, self._line_effect_flags, 0)
         else:
             effect_flags = (
-                self.study_with(setting).select(flight_block, eyepoints, shot_numbers).flags
+                self.study_with(setting)
+                .select_effects(flight_block, eyepoints, shot_numbers)
+                .effect_flags
             )
         seconds = thread_time() - start if setting.plans_effects else 0.0
         return effect_flags[np.searchsorted(tile_rows, point_indices)], seconds / tile_rows.size
