@@ -10,7 +10,9 @@ from sweep.analysis.scene_results.navigation_errors import ErrorTally, merge_tal
 from sweep.model.geometry.scanner import corners
 from sweep.model.navigation import velocity
 
-FIELDS = ("attempts", "count", "mean", "deviation", "predicted")
+FIELDS = (
+    "attempts", "n_solutions", "mean_error", "squared_deviation", "mean_stated_variance",
+)  # fmt: skip
 
 
 def _draws(n, *, bias=(3.0, -2.0, 0.5), seed=1):

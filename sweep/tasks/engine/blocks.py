@@ -604,7 +604,7 @@ class ExtendableStudy(BlockStudy):
         """Points of a block that the smaller study has, if nothing is damaged."""
         shared = self.reuse_source.iter_shared_points(block) if self.reuse_source else ()
         return (
-            sum(shared_points.points.size for shared_points in shared)
+            sum(shared_points.local_indices.size for shared_points in shared)
             * self.locate_in_grid(block)[0].fine_steps
         )
 
