@@ -553,7 +553,7 @@ def test_figures_go_beside_the_store_or_where_asked(ran):
 
 def test_schema_prints_a_json_schema_that_names_the_sections():
     schema = json.loads(sweep("schema").stdout)
-    grid, scene = (schema["$defs"][name]["properties"] for name in ("Spec", "SceneSpec"))
+    grid, scene = (schema["$defs"][name]["properties"] for name in ("GridSpec", "SceneSpec"))
     assert {"instrument", "target", "axes"} <= grid.keys()
     assert {"instrument", "scene", "platform", "scanners"} <= scene.keys()
 

@@ -221,7 +221,7 @@ CALLS = [
     (lambda: sweep.resume("foreign.zarr", spec="good.yaml"), "give `sweep.load('good.yaml')`"),
     (lambda: sweep.extend("foreign.zarr", "good.yaml"), "give `sweep.load('good.yaml')`"),
     (lambda: sweep.open(None), "and not by a NoneType"),
-    (lambda: sweep.open(good()), "and not by a Spec"),
+    (lambda: sweep.open(good()), "and not by a GridSpec"),
     (lambda: sweep.open("good.yaml"), "`sweep.run(spec, store=store)` computes a spec into one"),
     (lambda: sweep.open("empty"), "`sweep.run(spec, store=store)` computes a spec into one"),
     (lambda: GridSpec.from_mapping("title"), "must be a mapping (you wrote 'title')"),

@@ -37,7 +37,7 @@ def arrays(scene_store):
 
 def drawn(found, tree, **options):
     wanted = {
-        "quantity": "range", "surfaces": ["ground", "block"], "view": "above", "ground": None,
+        "quantity": "range", "surfaces": ["ground", "block"], "view": "above", "height_map": None,
         "title": "A cloud", "remarks": [],
     }  # fmt: skip
     sheet = cloud_figures.draw_cloud_sheet(found, **(wanted | options))
@@ -56,12 +56,12 @@ def small_cloud(points, **changes):
     parts = {
         "points": table,
         "path": {},
-        "rows": ThinnedRows(number),
-        "lost": ThinnedRows(0),
-        "outside": 0,
+        "thinned_points": ThinnedRows(number),
+        "thinned_dropouts": ThinnedRows(0),
+        "n_outside": 0,
         "box": box,
     }
-    parts["rows"].append(table)
+    parts["thinned_points"].append(table)
     return PointCloud(**(parts | changes))
 
 
@@ -145,7 +145,7 @@ def test_many_points_are_thinned_and_the_foot_says_so(weak, tree):
 )
 def test_views_along_an_axis_show_the_other_two_to_one_scale(weak, tree, view, axes):
     found = gather_cloud(weak, ["range"], ranges="quantised", with_dropouts=True, with_path=True)
-    sheet = drawn(found, tree, view=view, ground=HeightMap.from_tree(tree))
+    sheet = drawn(found, tree, view=view, height_map=HeightMap.from_tree(tree))
     picture = sheet.axes[0]
     true = (found.points["flags"] & TRUE) > 0
     (shown,) = (c.get_offsets() for c in picture.collections if c.zorder == 3)

@@ -52,7 +52,7 @@ def test_a_quantity_of_shots_is_shown_for_every_shot_and_one_of_points_for_every
 ):
     weak = find_axis_position(spec, {"power": "0.3 mW"}).recording(open_tree(scene_store), "pair")
     arrays = xr.open_zarr(scene_store, group="pair", chunks=None).isel(power=0, draw=0).load()
-    options = {"draw": 0, "ranges": "quantised", "time": None}
+    options = {"draw": 0, "ranges": "quantised", "time_limits": None}
     shots = weak.thinned_rows(["time", "pd_shot", "beam"], 10**6, **options)
     assert np.array_equal(shots.to_columns()["pd_shot"], arrays.pd_shot.values)
     points = weak.thinned_rows(["time", "radial_velocity", "beam"], 10**6, **options)
@@ -65,7 +65,8 @@ def test_a_quantity_of_shots_is_shown_for_every_shot_and_one_of_points_for_every
     shots = less.thinned_rows(["time", "pd_shot", "beam"], 10**6, **options)
     assert np.array_equal(shots.to_columns()["pd_shot"], arrays.pd_shot.values[:256])
     interval = 2.0, 3.0
-    some = weak.thinned_rows(["time", "pd_shot", "beam"], 10**6, **(options | {"time": interval}))
+    limited = options | {"time_limits": interval}
+    some = weak.thinned_rows(["time", "pd_shot", "beam"], 10**6, **limited)
     inside = (arrays.time.values >= 2) & (arrays.time.values <= 3)
     assert np.array_equal(some.to_columns()["pd_shot"], arrays.pd_shot.values[inside])
 

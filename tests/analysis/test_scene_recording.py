@@ -36,7 +36,7 @@ def arrays(scene_store):
 
 
 def all_points(recording, names, **options):
-    parts = [recording.points(names, part, **options) for part in recording.shot_slices()]
+    parts = [recording.point_columns(names, part, **options) for part in recording.shot_slices()]
     return {name: np.concatenate([part[name] for part in parts]) for name in names}
 
 
@@ -70,9 +70,9 @@ def test_points_are_those_with_flags_in_the_order_of_shots_and_returns(weak, arr
 
 
 def test_altitude_is_the_height_over_the_slope_at_the_start_of_the_cycle(weak, arrays):
-    part = slice(0, weak.shots)
+    part = slice(0, weak.n_shots)
     position = arrays.platform_position.values
-    start = np.arange(weak.shots) // 4 * 4
+    start = np.arange(weak.n_shots) // 4 * 4
     below = GROUND_SLOPE * position[:, 0]
     beside = np.abs(position[start, 0] - 20) > 20.5  # not over the block
     found = weak.shot_values("altitude", part)
@@ -81,7 +81,7 @@ def test_altitude_is_the_height_over_the_slope_at_the_start_of_the_cycle(weak, a
 
 
 def test_beams_aim_at_the_slope_or_at_the_block(weak):
-    x, y, z = weak.aim_points(slice(0, weak.shots)).T
+    x, y, z = weak.aim_points(slice(0, weak.n_shots)).T
     on_slope = np.abs(z - GROUND_SLOPE * x) < 0.5
     on_block = (np.abs(x - 20) < 20.01) & (np.abs(y) < 15.01) & (np.abs(z) < 20.01)
     assert (on_slope | on_block).all() and on_slope.any() and on_block.any()
@@ -104,7 +104,7 @@ def test_stretches_outside_of_an_interval_of_time_are_not_read(weak, monkeypatch
     every = module.read_slices
     monkeypatch.setattr(module, "read_slices", lambda array, dim: every(array, dim, 64))
     assert [part.start for part in weak.shot_slices()] == [0, 128, 256]
-    time = weak.read("time", slice(0, weak.shots))
+    time = weak.read("time", slice(0, weak.n_shots))
     asked = float(time[130]), float(time[200])
     assert [part.start for part in weak.shot_slices(asked)] == [128]
 

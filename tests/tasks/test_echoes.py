@@ -80,7 +80,7 @@ def test_points_that_fold_are_flagged_in_the_store(tmp_path):
     )  # fmt: skip
     assert run_serially(spec, tmp_path / "far.zarr").complete
     found = sweep.open(tmp_path / "far.zarr")
-    assert found.is_misread.values.tolist() == [0, 0, 1, 1]
+    assert found.misread.values.tolist() == [0, 0, 1, 1]
     assert (np.abs(found.range_error.values[2:]) > 1e3).all()
 
 

@@ -154,7 +154,7 @@ def test_a_kill_at_any_renaming_loses_none(undisturbed, tmp_path, monkeypatch, n
         monkeypatch.setattr(os, "rename", counted)
         succeed(new, path)
 
-    monkeypatch.setattr("sweep.tasks.driver.take_place", watched)
+    monkeypatch.setattr("sweep.tasks.driver.replace_path", watched)
     with suppress(Killed):
         extend(store, small_spec(axes=POWERS), progress=False, scheduler="none")
     monkeypatch.undo()

@@ -94,7 +94,8 @@ class Losing(WrapperStore):
 
 def test_a_copy_that_does_not_read_back_is_not_kept(undisturbed, tmp_path, monkeypatch):
     monkeypatch.setattr(
-        "sweep.tasks.studies.store_verification.zarr_store", lambda place: Losing(LocalStore(place))
+        "sweep.tasks.studies.store_verification.to_zarr_store",
+        lambda place: Losing(LocalStore(place)),
     )
     with pytest.raises(StoreError, match="does not read back as it was written"):
         pack_store(undisturbed, tmp_path / "final.zarr")

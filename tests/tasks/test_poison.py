@@ -56,7 +56,7 @@ def test_a_block_that_takes_longer_than_it_may_is_given_up(undisturbed, tmp_path
     assert outcome.blocks_done == 11
     (failure,) = outcome.failures
     assert failure.block == 4
-    assert failure.error == "Overtime: took longer than the 2 s that a block may take"
+    assert failure.error == "BlockTimeoutError: took longer than the 2 s that a block may take"
     assert "time.sleep(0.01)" in failure.traceback  # where it was
     assert logged_blocks(log).count(4) == 2
     assert resume(path, progress=False, scheduler="none").left_out == 1

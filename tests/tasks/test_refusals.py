@@ -129,10 +129,10 @@ def test_a_worker_with_other_software_writes_nothing(undisturbed, tmp_path, monk
     assert file_digests(store) == before
 
 
-def refusing_on_workers(path, attributes, *, where):
+def refusing_on_workers(path, attributes, *, reader):
     """As if the workers, and only they, had other software."""
-    if where.startswith("worker"):
-        raise StoreError(f"other versions on the {where}")
+    if reader.startswith("worker"):
+        raise StoreError(f"other versions on the {reader}")
 
 
 def test_a_scheduler_that_does_not_answer_leaves_no_store_behind(tmp_path, monkeypatch):

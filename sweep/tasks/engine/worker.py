@@ -248,7 +248,7 @@ class _TimeoutInterruption(SystemExit):
 def run_with_timeout(
     function: Callable[[], T], timeout: float | None, seconds_spent: float = 0.0
 ) -> T:
-    """Do some work, for no longer than some seconds less those spent before; Overtime where it was.
+    """Call a function; BlockTimeoutError if it takes longer than the timeout less what was spent.
 
     It is done in a thread, in which Python code is interrupted. A worker process whose thread is
     still in compiled code `GRACE` seconds later ends itself; any other waits for it to return.
