@@ -37,7 +37,7 @@ def drawn(tmp_path_factory):
 
 def drawn_lines(chart, **choices):
     """Lines of a chart that are shown at some choices, by name."""
-    (panel, *_) = (p for p in chart.panels if choices.items() <= p.when.items())
+    (panel, *_) = (p for p in chart.panels if choices.items() <= p.facet_choices.items())
     return {line.name: line for line in panel.lines}
 
 

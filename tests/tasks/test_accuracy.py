@@ -435,14 +435,14 @@ def test_storing_is_the_making_of_the_store_and_the_writing_of_each_block(
 class Broken(progress.Progress):
     """Ctrl-C after so many trials."""
 
-    stopping = False
+    is_stopping = False
 
     def __init__(self, after):
         self.left = after
 
     def advance(self, *, points, failed):
         self.left -= points
-        self.stopping = self.left <= 0
+        self.is_stopping = self.left <= 0
 
 
 @pytest.mark.parametrize(
