@@ -64,7 +64,7 @@ def faults(server, monkeypatch):
         monkeypatch.setenv("AWS_ACCESS_KEY_ID", "key")
         monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "secret")
         monkeypatch.setenv("AWS_REGION", "us-east-1")
-        for name in ("RETRIES", "FIRST_RETRIES"):  # as often as ever, without the long waits
+        for name in ("RETRY_CONFIG", "FIRST_CONTACT_RETRY_CONFIG"):  # without the long waits
             monkeypatch.setattr(
                 locations, name, {**getattr(locations, name), "backoff": SHORT_BACKOFF}
             )

@@ -212,7 +212,7 @@ except (DamagedChunkError, StoreReplacedError) as error:
 """
 
 
-@pytest.mark.parametrize("happens", ["DamagedChunkError", "ReplacedError"])
+@pytest.mark.parametrize("happens", ["DamagedChunkError", "StoreReplacedError"])
 def test_a_reader_that_meets_an_error_ends_without_further_words(copy, drawn, happens):
     """Zarr leaves reads that nobody waits for, of which asyncio would print a traceback each."""
     for chunk in (copy / "pd_shot/c/0").glob("*/0"):
