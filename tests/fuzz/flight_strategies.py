@@ -33,7 +33,7 @@ FILE_BY_FIELD = {
     "ImageGround.file": "ground.png",
     "MeshObject.file": "box.stl",
     "WaypointPath.file": "path.csv",
-    "Tracked.file": "path.csv",
+    "TabulatedAttitude.file": "path.csv",
 }
 
 
@@ -71,13 +71,13 @@ FLIGHT_BOUNDS: dict[str, Any] = {
     "SceneStorage.block_draws": {"at_most": "3", "example": "2"},
     "Ground.factor": {"at_most": "3", "example": "2"},
     "SquareGround.size": {"at_least": "500 m", "at_most": "5 km", "example": "2 km"},
-    "Plane.spacing": {"at_least": "100 m", "at_most": "10 km", "example": "200 m"},
+    "PlaneGround.spacing": {"at_least": "100 m", "at_most": "10 km", "example": "200 m"},
     "ReliefGround.spacing": {"at_least": "100 m", "at_most": "10 km", "example": "200 m"},
-    "Hills.spacing": {"at_least": "100 m", "at_most": "10 km", "example": "200 m"},
-    "Hills.correlation_length": {"example": "900 m"},
+    "HillsGround.spacing": {"at_least": "100 m", "at_most": "10 km", "example": "200 m"},
+    "HillsGround.correlation_length": {"example": "900 m"},
     "Craters.smallest": {"at_least": "200 m", "example": "650 m"},
     "Craters.largest": {"example": "900 m"},
-    "Jacksboro.size": {"at_most": "6 km"},
+    "JacksboroGround.size": {"at_most": "6 km"},
     "Trees.number": {"at_most": "3", "example": "2"},
     "TreeMeasures.crown_diameter": {"at_most": "8 m", "example": "6 m"},
     "TreeMeasures.leaf_length": {"at_least": "60 cm", "example": "80 cm"},
@@ -88,20 +88,21 @@ FLIGHT_BOUNDS: dict[str, Any] = {
     "Boulders.subdivisions": {"at_most": "1", "example": "1"},
     "PowerLaw.density": {"at_most": "0.01 m^-2", "example": "0.01 m^-2"},
     "Sphere.subdivisions": {"at_most": "2", "example": "2"},
-    "Cone.beams": {"at_most": "5"},
-    "RasterScan.columns": {"at_most": "4", "example": "3"},
-    "RasterScan.rows": {"at_most": "4", "example": "2"},
-    "Straight.begin": _position_strategy(200, 2000),
-    "Straight.to": _position_strategy(50, 1500),
-    "Still.position": _position_strategy(20, 2000),
-    "Acceleration.position": _position_strategy(200, 2000),
+    "ConeScanner.beams": {"at_most": "5"},
+    "RasterScanner.columns": {"at_most": "4", "example": "3"},
+    "RasterScanner.rows": {"at_most": "4", "example": "2"},
+    "StraightPath.begin": _position_strategy(200, 2000),
+    "StraightPath.to": _position_strategy(50, 1500),
+    "StationaryPath.position": _position_strategy(20, 2000),
+    "AccelerationPath.position": _position_strategy(200, 2000),
 }
 """Tighter bounds of what decides how many triangles, rays and shots there are; and flights that
 mostly see something."""
 
 COSTLY_DEFAULTS = {
-    "Footprint.beamlets", "Jacksboro.size", "Boulders.within", "Sphere.subdivisions", "Trees.tree",
-    "TreeMeasures.leaf_length", "TreeMeasures.leaf_width", "Still.duration",
+    "Footprint.beamlets", "JacksboroGround.size", "Boulders.within", "Sphere.subdivisions",
+    "Trees.tree",
+    "TreeMeasures.leaf_length", "TreeMeasures.leaf_width", "StationaryPath.duration",
     "SceneDraws.number",
 }  # fmt: skip
 SECTION_STRATEGIES = SectionStrategies(STUDY_BOUNDS | FLIGHT_BOUNDS, FILE_BY_FIELD, COSTLY_DEFAULTS)

@@ -179,7 +179,7 @@ def test_boulders_lie_within_their_square_on_a_ground_of_one_cell():
         {"objects": {"ground": {"kind": "plane", "size": "4 km", "reflectance": 0.1},
                      "rocks": rocks}}
     ).objects  # fmt: skip
-    facets = thing["rocks"].build_facets(thing["ground"].terrain(SpecFiles(".")))
+    facets = thing["rocks"].build_facets(thing["ground"].build_terrain(SpecFiles(".")))
     corners = facets.vertices + facets.origin
     corners = corners.reshape(len(facets.faces) // 96, -1, 3)  # 96 faces each
     middles = corners.mean(axis=1)
