@@ -178,7 +178,7 @@ def _statistics(shots: Shots, found: Groups) -> dict[str, np.ndarray]:
     noise = at_least_one(one, shots.counted_bins(found.exempted.T).T[:, [0, 2]])
     leakage = found.leakage[:, [0, 2]]
     alarm = leakage + noise * (1 - leakage)
-    above = found.magnitude[:, 0] >= shots.threshold[:, None]
+    above = (found.bin[:, 0] >= 0) & (found.magnitude[:, 0] >= shots.threshold[:, None])
     return {
         "pd_up": up,
         "pd_down": down,

@@ -17,7 +17,8 @@ class Groups(NamedTuple):
     """Groups of adjacent bins at or above the threshold in noiseless spectra: up, Doppler, down.
 
     Each is a target or a strong one's sidelobe. Strongest first; bin -1 and nan where there is
-    none. If no bin crosses the threshold the strongest is listed, as noise may lift it.
+    none. If no bin crosses the threshold the strongest is listed, as noise may lift it. Echoes that
+    are not searched for, or arrive after the record, have no group, but |X| of a strongest bin.
     """
 
     bin: np.ndarray
@@ -81,6 +82,9 @@ def add_groups(shots: Shots, runs: Runs, bins: np.ndarray, found: Groups) -> Non
         seen, middle = found.bin[runs.part], found.magnitude[runs.part]
         chances = shots.detected(middle.T, seen.T, runs.part)[0]
         pd[runs.part] = chances.T
+    no_group = (found.bin[runs.part, :, 0] < 0) & shots.segments
+    strongest = found.neighbours[runs.part, :, 0, 1]
+    found.neighbours[runs.part, :, 0, 1] = np.where(no_group, runs.magnitude.T, strongest)
     pd[runs.part, :, 0] = np.where(runs.inside.T | (count.T > 0), pd[runs.part, :, 0], 0.0)
     some = np.where((runs.bins > 0) | ~runs.inside, runs.exempted, np.nan)
     found.exempted[runs.part], found.leakage[runs.part] = some.T, runs.leakage.T

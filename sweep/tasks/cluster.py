@@ -23,6 +23,7 @@ from sweep.spec.clusters import (
 )
 from sweep.tasks.clusters import kubernetes, machines
 from sweep.tasks.progress import ClusterError
+from sweep.tasks.streams import make_dask_logs_patient
 
 if TYPE_CHECKING:
     from distributed import Client, Security
@@ -57,6 +58,7 @@ def connected(
     """
     from distributed import Client
 
+    make_dask_logs_patient()
     if isinstance(cluster, Address):
         with _reached(cluster.address, cluster) as client:
             say(f"scheduler {cluster.address}: dashboard {client.dashboard_link}")

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
 from judging import Verdict, kind_of, look_at_mistake, strictly
 
+from sweep.model.detectors import FIXED
+from sweep.model.estimators import DETECTOR
 from sweep.model.outputs import CYCLES, NAVIGATION, POINTS, SHOTS, STATISTICS
 from sweep.model.unsupported import UnsupportedShot
+from sweep.model.waveform import PEAKS, STRONGEST, order_of
 from sweep.scenes.eyepoint_arrays import from_arrays
 from sweep.scenes.files import SceneError
 from sweep.spec import SceneSpec, SpecError, from_stored, load
 from sweep.tasks.eyepoint_study import EyepointStudy
-from sweep.tasks.flight_study import FlightStudy
+from sweep.tasks.flight_study import FlightStudy, Part
 from sweep.tasks.plan import plan
 from sweep.tasks.study import Results
 
@@ -59,8 +63,26 @@ def _look_through(study: FlightStudy, eyepoints: EyepointStudy) -> None:
         selected = study.select(part, shots, np.arange(len(shots.time)))
         assert np.isfinite(selected.error).all() and (selected.error >= 0).all(), "effects_error"
         found = study.look(part, seen, shots, selected, numbers)
-        architecture = study.parameters_at(part)["instrument.receiver.architecture"]
-        look_at_cloud(seen, found, navigates=stretches.navigates, direct=architecture == "direct")
+        look_at_cloud(
+            seen, found, navigates=stretches.navigates, missing=_without_values(study, part)
+        )
+
+
+def _without_values(study: FlightStudy, part: Part) -> set[str]:
+    """Names of statistics that no shot of a part has."""
+    parameters, missing = study.parameters_at(part), set()
+    architecture, order = (
+        str(parameters[f"instrument.{name}"])
+        for name in ("receiver.architecture", "chirp.segments")
+    )
+    if "doppler" not in order_of(architecture, order):
+        missing.add("pd_doppler")
+    if study.rays_accuracy is None:
+        missing.add("beamlets_error")
+    of_threshold = parameters.get(DETECTOR + "kind", FIXED) == FIXED
+    if study.spec.draws.whole_spectra and not (of_threshold and parameters.get(PEAKS) != STRONGEST):
+        missing |= {name for name in STATISTICS if name.startswith(("pd_", "pfa_"))}
+    return missing
 
 
 OF_HITS = ("beam_radial_velocity", "beam_acceleration", "beam_approach", "beam_turn_rate")
@@ -83,7 +105,9 @@ def look_at_shots(seen: Results) -> None:
     assert np.isfinite(seen["offset"][hit]).all(), "offset"
 
 
-def look_at_cloud(seen: Results, found: Results, *, navigates: bool, direct: bool) -> None:
+def look_at_cloud(
+    seen: Results, found: Results, *, navigates: bool, missing: Collection[str]
+) -> None:
     """Statistics, points and navigation: nan where there is nothing, and nowhere else."""
     wanted = {*STATISTICS, *POINTS, *(NAVIGATION if navigates else ())}
     assert set(found) == wanted, "outputs are missing, or too many"
@@ -93,7 +117,7 @@ def look_at_cloud(seen: Results, found: Results, *, navigates: bool, direct: boo
         if values.dtype.kind != "f":
             continue
         there = sees | name.startswith("pfa_")
-        if name == "pd_doppler" and direct:
+        if name in missing:
             there = np.zeros_like(sees)
         assert np.isfinite(values[there]).all(), f"{name} is nan for no reason"
         assert np.isnan(values[~there]).all(), f"{name} of nothing"
