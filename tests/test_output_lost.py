@@ -189,6 +189,46 @@ def test_a_run_whose_terminal_is_stopped_goes_on_to_its_end(tmp_path, where):
     os.close(master)
 
 
+LOGGING_CLUSTER = """
+import logging, sys
+from pathlib import Path
+from sweep.spec.cluster_config import LocalClusterConfig
+from sweep.tasks.engine.cluster_connection import connect_cluster
+
+def log_and_print():
+    for name in ("distributed.core", "distributed.client", "tornado.application"):
+        logging.getLogger(name).warning("the event loop was unresponsive " * 100)
+    print("text " * 100, flush=True)
+    return 1
+
+if __name__ == "__main__":
+    cluster = LocalClusterConfig(kind="local")
+    with connect_cluster(cluster, max_workers=1, processes=True, say=lambda text: None) as reached:
+        client = reached.client
+        number = sum(client.submit(log_and_print, pure=False).result() for _ in range(5))
+        sys.stdout = open("/dev/null", "w")  # what a program prints is its own to wait for
+        number += sum(client.run_on_scheduler(log_and_print) for _ in range(5)) + log_and_print()
+    Path(sys.argv[1]).write_text(str(number))
+"""
+
+
+def test_nothing_that_dask_logs_waits_for_a_terminal_that_is_stopped(tmp_path):
+    """Log and print in workers, log in the scheduler's loop and in the main thread."""
+    said, script = tmp_path / "said", tmp_path / "script.py"
+    script.write_text(LOGGING_CLUSTER)
+    master, slave = pty.openpty()
+    termios.tcflow(slave, termios.TCOOFF)
+    command = [sys.executable, "-W", "ignore", str(script), str(said)]
+    started = subprocess.Popen(command, stdin=slave, stdout=slave, stderr=slave)
+    try:
+        assert started.wait(120) == 0
+    finally:
+        started.kill()
+    assert said.read_text() == "11"
+    os.close(slave)
+    os.close(master)
+
+
 def test_a_stream_whose_reader_stops_takes_no_time_and_goes_on_with_it():
     reading, writing = os.pipe()
     room = fcntl.fcntl(writing, fcntl.F_SETPIPE_SZ, 4096)

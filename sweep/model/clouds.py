@@ -21,7 +21,7 @@ from sweep.model.eyepoints import Eyepoints, seen_ground
 from sweep.model.geometry.mesh import Surface
 from sweep.model.ground import Footprints
 from sweep.model.groups import Groups, groups
-from sweep.model.leaked_peaks import LeakedPeaks, leaked_peaks
+from sweep.model.leaked_peaks import LeakedPeaks, groups_with_leaks, leaked_peaks
 from sweep.model.marcum import at_least_one
 from sweep.model.noisy_spectra import Methods
 from sweep.model.outputs import POINTS, STATISTICS
@@ -149,15 +149,19 @@ def _groups(
         if effect.draw is not None:
             shots = effect.draw(shots, scene, Realisation(keys, np.zeros(shots.size, np.int64)))
     fades = shots.fading is not None and bool(shots.leakage)
-    found = groups(shots, most=most, leakage=not fades)
+    listed: list[tuple[np.ndarray, LeakedPeaks]] | None = None
+    at_once = fades and shots.leak_amplitude is None and shots.band is None
+    if at_once:
+        found, listed = groups_with_leaks(shots, most)
+    else:
+        found = groups(shots, most=most, leakage=not fades)
     if not seen.all():
         blind = ~seen
         for bins in found[:3]:
             bins[blind] = -1
         found.neighbours[blind] = found.pd[blind] = np.nan
         found.exempted[blind] = found.leakage[blind] = 0.0
-    listed: list[tuple[np.ndarray, LeakedPeaks]] | None = None
-    if fades:
+    if fades and not at_once:
         listed = [] if shots.leak_amplitude is None else None  # a line has a great many bins
         for part, leaks in leaked_peaks(shots, found, np.flatnonzero(seen)):
             found.leakage[part] = leaks.mean_leakage()
@@ -174,7 +178,7 @@ def _statistics(shots: Shots, found: Groups) -> dict[str, np.ndarray]:
     noise = at_least_one(one, shots.counted_bins(found.exempted.T).T[:, [0, 2]])
     leakage = found.leakage[:, [0, 2]]
     alarm = leakage + noise * (1 - leakage)
-    above = found.magnitude[:, 0] >= shots.threshold[:, None]
+    above = (found.bin[:, 0] >= 0) & (found.magnitude[:, 0] >= shots.threshold[:, None])
     return {
         "pd_up": up,
         "pd_down": down,

@@ -519,7 +519,7 @@ def _any_on_pedestal(magnitude, echo, low, rule, levels):
         deviation = levels.quiet * math.sqrt(1.0 + pedestal[k])
         steady[0, k], steady[1, k] = magnitude[k] / deviation, levels.threshold / deviation
         steady[2, k], steady[3, k] = rule.correlation, 0.0
-    return _any_steady(steady, 1.0, echo, low, rule.ends)
+    return _any_steady(steady, 1.0, echo, low, rule.ends, np.inf, 0.0)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
@@ -622,6 +622,8 @@ _ORDER = 7
 _REACH = 4.5
 _Z_MAX = 6.0
 _RARE = 1e-6
+_NEGLIGIBLE, _NEGLIGIBLE_PART = 1e-8, 1e-6
+"""Probability, and part of pd and of 1 - pd, below which what a bin adds may be left out."""
 _NODE, _WEIGHT = np.polynomial.legendre.leggauss(_ORDER)
 _PAIR_NODE, _PAIR_WEIGHT = np.polynomial.legendre.leggauss(4)
 
@@ -633,6 +635,10 @@ def _stretch_faded(magnitude, echo, bounds, low, rule, levels, speckle):
     As of :func:`any_faded`.
     """
     begin, end = bounds
+    while begin < end - 1 and not echo[begin]:
+        begin += 1
+    while end > begin + 1 and not echo[end - 1]:
+        end -= 1
     nearest = begin
     for i in range(begin, end):
         if echo[i] and not (echo[nearest] and magnitude[i] <= magnitude[nearest]):
@@ -718,12 +724,13 @@ def _mean_over_mode(steady, echo, low, ends):
     over that of the rest. Given z the signal is z times row 0. The average is over |z| with the
     density 2 z e^(-z^2).
     """
-    first, last, middle, pedestal = _Z_MAX, _Z_MAX, _Z_MAX, 0.0
+    first, last, middle, pedestal, strongest = _Z_MAX, _Z_MAX, _Z_MAX, 0.0, -1
     for k in range(echo.size):
         pedestal = max(pedestal, steady[3, k])
         if echo[k] and steady[0, k] > 0.0:
             wide = _REACH * math.sqrt(steady[3, k])
-            middle = min(middle, steady[1, k] / steady[0, k])
+            if steady[1, k] < middle * steady[0, k]:
+                middle, strongest = steady[1, k] / steady[0, k], k
             first = min(first, max(steady[1, k] - _REACH, 0.0) / (steady[0, k] + wide))
             if steady[0, k] > wide:
                 last = min(last, (steady[1, k] + _REACH) / (steady[0, k] - wide))
@@ -734,24 +741,47 @@ def _mean_over_mode(steady, echo, low, ends):
         last = max(first, min(last, 4.5))  # what is beyond is 2e-9
         half_way = middle if first < middle < last else 0.5 * (first + last)
         ends_of_pieces = (first, half_way, last)
-    found, missed = math.exp(-last * last), 0.0
-    if first > 0.0:
-        weight = -math.expm1(-first * first)
-        one = _any_steady(steady, 0.6 * first, echo, low, ends)
-        found, missed = found + weight * one[0], weight * one[1]
-    for piece in range(2):
+    is_real = is_end(low + strongest, ends)
+    # From the largest |z| on, so that bins that add nothing to what there is can be left out.
+    found, missed, faintest = math.exp(-last * last), 0.0, -math.expm1(-first * first)
+    for piece in range(1, -1, -1):
         half = 0.5 * (ends_of_pieces[piece + 1] - ends_of_pieces[piece])
-        for j in range(_ORDER if half > 0.0 else 0):
+        for j in range(_ORDER - 1 if half > 0.0 else -1, -1, -1):
             z = ends_of_pieces[piece] + half * (_NODE[j] + 1.0)
             weight = half * _WEIGHT[j] * 2.0 * z * math.exp(-z * z)
-            one = _any_steady(steady, z, echo, low, ends)
+            counts = min(_NEGLIGIBLE, _NEGLIGIBLE_PART * min(found, missed + faintest)) / weight
+            reach = math.inf if pedestal > 0.0 else _reach_at(z, steady, strongest, is_real, counts)
+            one = _any_steady(steady, z, echo, low, ends, reach, counts)
             found, missed = found + weight * one[0], missed + weight * one[1]
+    if first > 0.0:
+        counts = min(_NEGLIGIBLE, _NEGLIGIBLE_PART * min(found, faintest)) / faintest
+        reach = (
+            math.inf
+            if pedestal > 0.0
+            else _reach_at(0.6 * first, steady, strongest, is_real, counts)
+        )
+        one = _any_steady(steady, 0.6 * first, echo, low, ends, reach, counts)
+        found, missed = found + faintest * one[0], missed + faintest * one[1]
     whole = found + missed  # 1 but for the quadrature
     return found / whole, missed / whole
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
-def _any_steady(steady, z, echo, low, ends):
+def _reach_at(z, steady, strongest, is_real, counts):
+    """Return the squared distance below the threshold from which on bins do not count, given z.
+
+    A bin adds at most e^(-(b - a)^2 / 2) to what the strongest one leaves, which is missed with
+    less than e^(-(a - b)^2 / 2), or the root of it where noise is real. Bins that add less than
+    ``counts`` do not count.
+    """
+    if not counts > 0.0 or strongest < 0:
+        return math.inf
+    above = max(steady[0, strongest] * z - steady[1, strongest], 0.0)
+    return -2.0 * math.log(counts) - above * above * (0.5 if is_real else 1.0)
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def _any_steady(steady, z, echo, low, ends, reach, counts):
     """Return the probabilities that any, and that no, bin crosses, given the mode's magnitude z.
 
     As :func:`any_pair`, with a noise correlation r of each pair of neighbours. Their powers then
@@ -760,6 +790,9 @@ def _any_steady(steady, z, echo, low, ends):
         (r^2 + r a b) / sqrt((1 + a^2) (1 + b^2)),
 
     with their signals a and b over the noise: r^2 for noise alone, r for strong signals.
+
+    Bins that are further below the threshold than the root of ``reach`` are left out. Bins that add
+    less than ``counts`` to the probability count as independent of their neighbours.
     """
     found, missed, before, t_before, a_before = 0.0, 1.0, -1.0, 0.0, 0.0
     for k in range(echo.size):
@@ -768,10 +801,15 @@ def _any_steady(steady, z, echo, low, ends):
             continue
         scale = 1.0 / math.sqrt(1.0 + steady[3, k] * z * z)
         a = steady[0, k] * z * scale
-        crosses, stays = crossing_pair(a, steady[1, k] * scale, is_end(low + k, ends))
+        below = steady[1, k] * scale - a
+        real = is_end(low + k, ends)
+        if below > 0.0 and below * below > (2.0 * reach if real else reach):
+            before = -1.0
+            continue
+        crosses, stays = crossing_pair(a, steady[1, k] * scale, real)
         if not stays > 0.0:
             return 1.0, 0.0
-        if crosses < _RARE:  # so is that both of a pair cross
+        if crosses < _RARE or missed * crosses < counts:  # so is that both of a pair cross
             found, missed, before = found + missed * crosses, missed * stays, -1.0
             continue
         t = _deviate(crosses) if crosses < stays else -_deviate(stays)

@@ -17,7 +17,8 @@ class Groups(NamedTuple):
     """Groups of adjacent bins at or above the threshold in noiseless spectra: up, Doppler, down.
 
     Each is a target or a strong one's sidelobe. Strongest first; bin -1 and nan where there is
-    none. If no bin crosses the threshold the strongest is listed, as noise may lift it.
+    none. If no bin crosses the threshold the strongest is listed, as noise may lift it. Echoes that
+    are not searched for, or arrive after the record, have no group, but |X| of a strongest bin.
     """
 
     bin: np.ndarray
@@ -46,26 +47,47 @@ def groups(shots: Shots, *, most: int = 4, every_bin: bool = False, leakage: boo
 
     ``every_bin`` as of :func:`sweep.model.shot.find`. Without ``leakage`` its probability is 0.
     """
-    n = shots.size
-    bins = np.full((3, n, 3, most), -1, np.int64)
-    neighbours, pd = np.full((n, 3, most, 3), np.nan), np.full((n, 3, most), np.nan)
-    exempted, leaked = np.full((n, 3), np.nan), np.full((n, 3), np.nan)
-    levels = shots.bin_levels
-    mirror = 0 if shots.complex_record else shots.fft_size // 2
+    bins, found = room_for_groups(shots.size, most)
     for runs in runs_of(shots, every_bin=every_bin, leakage=leakage, chances=False):
-        count, magnitudes = (runs.bins, runs.magnitudes) if shots.band is None else _echoes(runs)
-        _find_groups(
-            runs.part, (runs.low, count, runs.peak, runs.start), (magnitudes, runs.exempt), levels,
-            (mirror, shots.echo_rule, shots.speckle_table), bins, neighbours, pd,
-        )  # fmt: skip
-        if shots.looks.several:
-            seen, middle = bins[BIN][runs.part], neighbours[runs.part][..., 1]
-            chances = shots.detected(middle.T, seen.T, runs.part)[0]
-            pd[runs.part] = chances.T
-        pd[runs.part, :, 0] = np.where(runs.inside.T | (count.T > 0), pd[runs.part, :, 0], 0.0)
-        some = np.where((runs.bins > 0) | ~runs.inside, runs.exempted, np.nan)
-        exempted[runs.part], leaked[runs.part] = some.T, runs.leakage.T
-    return Groups(bins[BIN], bins[FIRST], bins[LAST], neighbours, pd, exempted, leaked)
+        add_groups(shots, runs, bins, found)
+    return found
+
+
+def room_for_groups(points: int, most: int) -> tuple[np.ndarray, Groups]:
+    """Return no groups of ``points`` points, and the array of which their bins are parts.
+
+    This is (3, points, 3, most), by BIN, FIRST and LAST.
+    """
+    bins = np.full((3, points, 3, most), -1, np.int64)
+    return bins, Groups(
+        bins[BIN], bins[FIRST], bins[LAST], np.full((points, 3, most, 3), np.nan),
+        np.full((points, 3, most), np.nan), *np.full((2, points, 3), np.nan),
+    )  # fmt: skip
+
+
+def add_groups(shots: Shots, runs: Runs, bins: np.ndarray, found: Groups) -> None:
+    """Find the groups of some points by the runs of their bins.
+
+    ``bins`` and ``found``, those of :func:`room_for_groups`, take them.
+    """
+    pd = found.pd
+    mirror = 0 if shots.complex_record else shots.fft_size // 2
+    count, magnitudes = (runs.bins, runs.magnitudes) if shots.band is None else _echoes(runs)
+    _find_groups(
+        runs.part, (runs.low, count, runs.peak, runs.start), (magnitudes, runs.exempt),
+        shots.bin_levels, (mirror, shots.echo_rule, shots.speckle_table), bins, found.neighbours,
+        pd,
+    )  # fmt: skip
+    if shots.looks.several:
+        seen, middle = found.bin[runs.part], found.magnitude[runs.part]
+        chances = shots.detected(middle.T, seen.T, runs.part)[0]
+        pd[runs.part] = chances.T
+    no_group = (found.bin[runs.part, :, 0] < 0) & shots.segments
+    strongest = found.neighbours[runs.part, :, 0, 1]
+    found.neighbours[runs.part, :, 0, 1] = np.where(no_group, runs.magnitude.T, strongest)
+    pd[runs.part, :, 0] = np.where(runs.inside.T | (count.T > 0), pd[runs.part, :, 0], 0.0)
+    some = np.where((runs.bins > 0) | ~runs.inside, runs.exempted, np.nan)
+    found.exempted[runs.part], found.leakage[runs.part] = some.T, runs.leakage.T
 
 
 def _echoes(runs: Runs) -> tuple[np.ndarray, np.ndarray]:
@@ -73,7 +95,7 @@ def _echoes(runs: Runs) -> tuple[np.ndarray, np.ndarray]:
 
     Sidelobes of what is not searched are no groups, and leak.
     """
-    count, magnitudes = runs.bins.copy(), runs.magnitudes
+    count, magnitudes = runs.bins.copy(), runs.magnitudes.copy()
     for s, j in np.argwhere(~runs.inside):
         start, end = runs.start[s, j] + np.array([0, runs.bins[s, j]])
         exempt = runs.exempt[start:end]

@@ -30,6 +30,7 @@ import numpy as np
 
 from sweep.kernel_cache import njit
 from sweep.model.crossings import (
+    JOINED_CHANCE_MIN,
     added_crossings,
     any_crossing,
     largest,
@@ -38,6 +39,15 @@ from sweep.model.crossings import (
     weighted_silence,
 )
 from sweep.model.detection import mark
+from sweep.model.faded_rates import (
+    FINER_POWERS,
+    LOUDEST,
+    OCTAVES,
+    POWERS,
+    SPECKLE_POWERS,
+    add_rates,
+    brightest_rate,
+)
 from sweep.model.marcum import excess_crossing
 from sweep.model.spectrum import (
     AFAR,
@@ -81,17 +91,25 @@ WHOLE, HALF = np.bool_(False), np.bool_(True)
 """Arguments of :func:`_cotangent`: at a bin, or half a bin beyond. NumPy booleans, because numba
 would compile the function anew for Python's."""
 
-LOUDEST = 16.0
-"""Largest speckle power (mean 1) in averages of leakage; a fraction e^-16 of draws exceeds it."""
-OCTAVES = 9
-"""Octaves of speckle power below LOUDEST at which leakage is computed."""
-FINER_POWERS = 2
-"""Number of powers an octave where runs of bins join the echo in bright speckle, else 1."""
 BRIGHTEST_MAX = 0.5
 """Leakage of the brightest speckle up to which one power an octave is enough."""
-_SPECKLE_STEPS = 160
 FAINTEST_RATE = 1e-30
 """Rate R below which leakage is taken to be 0."""
+SURE_RATE = 34.5
+"""Rate R from which on leakage is certain."""
+
+_SPECKLE_STEPS = 160
+_ROOT = np.arange(1, _SPECKLE_STEPS + 1) / _SPECKLE_STEPS
+_POWER = np.concatenate([[0.0], LOUDEST * _ROOT**2])
+"""Nodes of the mean over speckle: closer together where powers are small."""
+_OCTAVE = -2 * np.log2(_ROOT)
+"""Octaves from LOUDEST down to these nodes but the first."""
+_SPECKLE_WEIGHT = (
+    np.exp(-_POWER[1:]) * 0.5 * np.append(_POWER[2:] - _POWER[:-2], np.diff(_POWER[-2:]))
+)
+
+_END_TERMS = 1.0 / 24.0, -17.0 / 5760.0, 367.0 / 967680.0
+"""Factors of the first, third and fifth difference in the correction of an integral's near end."""
 
 _LARGEST_ORDER = 12
 _GAUSS = np.zeros((2, _LARGEST_ORDER + 1, _LARGEST_ORDER))
@@ -100,7 +118,7 @@ for _n in range(1, _LARGEST_ORDER + 1):
 
 
 @njit(cache=True, error_model="numpy")
-def inspect(origin, lines, noise, table, form, sizes, tangent, room, exempt, series):
+def inspect(origin, lines, noise, table, form, sizes, tangent, room, exempt, series, rates):
     """Evaluate a segment: a run of bins around its lines, detection, and leakage of all bins.
 
     Parameters and results are those of :func:`sweep.model.spectrum.detect`, with these differences.
@@ -113,6 +131,8 @@ def inspect(origin, lines, noise, table, form, sizes, tangent, room, exempt, ser
         noise in phase with the signal.
     series
         :func:`sweep.model.crossings.crossing_series` of the threshold over sigma.
+    rates
+        :class:`sweep.model.faded_rates.FadedRates` of it if the echo is in developed speckle.
 
     Returns
     -------
@@ -151,7 +171,7 @@ def inspect(origin, lines, noise, table, form, sizes, tangent, room, exempt, ser
         chance = 0.0
         if not (left > 0.0 and _at_most(count, bright, exempt, room) <= left):
             if loudest > 1.0:
-                chance = _faded_bins(count, noise, room, exempt, series)
+                chance = _faded_bins(count, noise, room, exempt, rates)
             else:
                 chance = _any_further(count, noise, room, exempt, series)
         return low, count, peak, exempted, chance
@@ -167,7 +187,7 @@ def inspect(origin, lines, noise, table, form, sizes, tangent, room, exempt, ser
         run = low, count, peak, origin
         leakage, settled = _leakage(
             run, (n, lowest, highest), place, noise, form, sizes, tangent, room, exempt, series,
-            loudest,
+            rates, loudest,
         )  # fmt: skip
         if settled:
             return low, count, peak, exempted, leakage
@@ -185,10 +205,13 @@ def of_bins(count, noise, floor, room, exempt, series):
 
 
 @njit(cache=True, error_model="numpy")
-def of_fading_bins(count, noise, floor, room, exempt, series):
-    """Return the mean of :func:`of_bins` over developed speckle."""
+def of_fading_bins(count, noise, floor, room, exempt, rates):
+    """Return the mean of :func:`of_bins` over developed speckle.
+
+    ``rates``: :class:`sweep.model.faded_rates.FadedRates` of the threshold.
+    """
     _leave_out_faint(count, noise[0], floor, room, exempt)
-    return _faded_bins(count, noise, room, exempt, series)
+    return _faded_bins(count, noise, room, exempt, rates)
 
 
 @njit(cache=True, error_model="numpy")
@@ -211,37 +234,105 @@ def _any_further(count, noise, room, exempt, series):
 
 
 @njit(cache=True, error_model="numpy")
-def _faded_bins(count, noise, room, exempt, series):
+def _faded_bins(count, noise, room, exempt, rates):
     """Return the mean leakage of a run's bins over developed speckle."""
-    per_octave, log_rates, k = 1, np.empty(FINER_POWERS * OCTAVES + 1), 0
-    while k <= per_octave * OCTAVES:
-        root = math.sqrt(LOUDEST * 2.0 ** (-k / per_octave))
-        faded = noise[0] / root, noise[1] / root
-        _chances(count, faded, room, exempt, series)
-        if k == 0:
-            brightest = any_crossing(room[CHANCE], ZERO, count)
-            if brightest < 1e-12:
-                return 0.0
-            per_octave = _powers_per_octave(brightest)
-        leave_out_joined(room[CHANCE], ZERO, count, room[OUT], exempt, faded, noise[3])
-        log_rates[k] = _log_rate(any_crossing(room[CHANCE], ZERO, count))
-        k += 1
-    return fading_mean(log_rates[:k], per_octave)
+    return _mean_leakage(ZERO, count, noise, room, exempt, rates, np.zeros(POWERS))
+
+
+@njit(cache=True, error_model="numpy")
+def _mean_leakage(first, last, noise, room, exempt, rates, beyond):
+    """Return the mean leakage, over developed speckle, of bins first .. last - 1 and of others.
+
+    ``noise``: sigma, threshold, tolerance, and correlation of neighbours' noise. ``beyond``: of the
+    others the sum of rates at each speckle power, over this power.
+    """
+    sigma, level, _, correlation = noise
+    joining = _mark_joining(first, last, sigma, room, exempt, rates)
+    sums, scale = np.zeros(POWERS), 1.0 / (sigma * sigma)
+    # Bins that may join an echo, the echo's bins next to them, and one for all that lie between.
+    of_joining, chances = np.zeros((joining, POWERS)), np.zeros(joining)
+    magnitude, is_echo = np.zeros(joining), np.zeros(joining, np.bool_)
+    number, is_gap = 0, True
+    for i in range(first, last):
+        square = room[OUT, i] * room[OUT, i] * scale
+        if exempt[i]:
+            if (i > first and not exempt[i - 1]) or (i + 1 < last and not exempt[i + 1]):
+                magnitude[number], is_echo[number] = room[OUT, i], True
+                number, is_gap = number + 1, False
+        elif room[CHANCE, i] > 0.0:
+            add_rates(square, 1.0, rates, of_joining[number])
+            magnitude[number], number, is_gap = room[OUT, i], number + 1, False
+        else:
+            add_rates(square, 1.0, rates, sums)
+            if not is_gap:
+                number, is_gap = number + 1, True
+    brightest = sums[POWERS - 1] + max(beyond[POWERS - 1], 0.0)
+    for i in range(number):
+        brightest += of_joining[i, POWERS - 1]
+    brightest *= LOUDEST
+    if brightest < 1e-12:
+        return 0.0
+    per_octave = _powers_per_octave(brightest)
+    every = FINER_POWERS // per_octave
+    log_rates = np.empty(per_octave * OCTAVES + 1)
+    for k in range(log_rates.size):
+        j = POWERS - 1 - k * every
+        power = SPECKLE_POWERS[j]
+        rate = power * (sums[j] + max(beyond[j], 0.0))
+        if number > 0:
+            for i in range(number):
+                chances[i] = -math.expm1(-power * of_joining[i, j])
+            root = math.sqrt(power)
+            faded = sigma / root, level / root
+            leave_out_joined(chances, ZERO, number, magnitude, is_echo, faded, correlation)
+            for i in range(number):
+                rate += silence(chances[i])
+        log_rates[k] = math.log(min(max(rate, FAINTEST_RATE), SURE_RATE))
+    return fading_mean(log_rates, per_octave)
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def _mark_joining(first, last, sigma, room, exempt, rates):
+    """Mark bins first .. last - 1 that may join an echo in row CHANCE, by 1; others by 0.
+
+    Return their number, with that of the bins next to them and of those that set them apart.
+    """
+    number, end = 0, first
+    for i in range(first, last):
+        room[CHANCE, i] = 0.0
+    while end < last:
+        begin = end
+        while end < last and not exempt[end]:
+            end += 1
+        if end > begin and begin > first:
+            number += 2 + _mark_row(begin, 1, end - begin, sigma, room, rates)
+        if end > begin and end < last:
+            number += 2 + _mark_row(end - 1, -1, end - begin, sigma, room, rates)
+        end += 1
+    return number
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def _mark_row(begin, step, count, sigma, room, rates):
+    """Mark bins from ``begin`` on as long as all of them may cross; return their number."""
+    number, all_cross = 0, 1.0
+    while number < count and all_cross > JOINED_CHANCE_MIN:
+        i = begin + number * step
+        ratio = room[OUT, i] / sigma
+        if number > 0:
+            all_cross *= -math.expm1(-brightest_rate(ratio * ratio, rates))
+        room[CHANCE, i] = 1.0
+        number += 1
+    return number
 
 
 @njit(cache=True, error_model="numpy")
 def _powers_per_octave(brightest):
-    """Return how many speckle powers an octave leakage is computed at, by that of the brightest.
+    """Return how many speckle powers an octave leakage is computed at, by the brightest's rate.
 
     Where runs of bins join the echo in bright speckle, leakage does not rise with the power.
     """
-    return FINER_POWERS if brightest > BRIGHTEST_MAX else 1
-
-
-@njit(cache=True, error_model="numpy")
-def _log_rate(chance):
-    """Return ln R of a leakage probability, R = -ln(1 - chance), at least ln FAINTEST_RATE."""
-    return math.log(max(silence(min(chance, 1.0 - 1e-15)), FAINTEST_RATE))
+    return FINER_POWERS if -math.expm1(-brightest) > BRIGHTEST_MAX else 1
 
 
 @njit(cache=True, error_model="numpy")
@@ -257,28 +348,27 @@ def fading_mean(log_rates, per_octave):
     ``per_octave`` is the number of these in a factor of 2. Below the smallest of these powers R is
     proportional to u; above LOUDEST nothing is added.
     """
-    last = log_rates.size - 1
-    mean, before, chance_before = 0.0, 0.0, 0.0
-    for i in range(1, _SPECKLE_STEPS + 1):
-        # Places closer together where powers are small, up to LOUDEST.
-        share = i / _SPECKLE_STEPS
-        power = LOUDEST * share * share
-        place = -per_octave * math.log2(share * share)
+    last, mean, at = log_rates.size - 1, 0.0, -1
+    low, high, rest = 0.0, 0.0, 0.0
+    for i in range(_SPECKLE_STEPS - 1, -1, -1):
+        place = per_octave * _OCTAVE[i]
         k = int(place)
         if k >= last:
             log_rate = log_rates[last] - (place - last) * math.log(2.0) / per_octave
         else:
-            x, rest = place - k, log_rates[k + 1] - log_rates[k]
-            before_it = log_rates[k] - log_rates[k - 1] if k > 0 else rest
-            after_it = log_rates[k + 2] - log_rates[k + 1] if k + 2 <= last else rest
-            # A monotone cubic [Fritsch and Butland, SIAM J. Sci. Stat. Comput. 5, 300, 1984].
-            low, high = _common_slope(before_it, rest), _common_slope(rest, after_it)
+            if k != at:
+                # A monotone cubic [Fritsch and Butland, SIAM J. Sci. Stat. Comput. 5, 300, 1984].
+                at, rest = k, log_rates[k + 1] - log_rates[k]
+                before = log_rates[k] - log_rates[k - 1] if k > 0 else rest
+                after = log_rates[k + 2] - log_rates[k + 1] if k + 2 <= last else rest
+                low, high = _common_slope(before, rest), _common_slope(rest, after)
+            x = place - k
             log_rate = log_rates[k] + x * (
                 low + x * (3.0 * rest - 2.0 * low - high + x * (low + high - 2.0 * rest))
             )
-        chance = -math.expm1(-math.exp(min(log_rate, 4.0))) * math.exp(-power)
-        mean += 0.5 * (chance + chance_before) * (power - before)
-        before, chance_before = power, chance
+        rate = math.exp(min(log_rate, 4.0))
+        chance = rate * (1.0 - rate * (0.5 - rate / 6.0)) if rate < 1e-4 else -math.expm1(-rate)
+        mean += _SPECKLE_WEIGHT[i] * chance
     return mean
 
 
@@ -382,7 +472,9 @@ def _least_reach(weight, spread, noise, crossing, form, sizes):
 
 
 @njit(cache=True, error_model="numpy")
-def _leakage(run, lines, place, noise, form, sizes, tangent, room, exempt, series, loudest):
+def _leakage(
+    run, lines, place, noise, form, sizes, tangent, room, exempt, series, rates, loudest
+):  # fmt: skip
     """Return the leakage of the run and of all bins beyond it, and whether the run is long enough.
 
     If ``loudest`` is above 1 the echo fades, and the leakage is the mean over its speckle.
@@ -394,7 +486,7 @@ def _leakage(run, lines, place, noise, form, sizes, tangent, room, exempt, serie
     below, above = low > 0, low + count - 1 < half
     if not below and not above:
         if loudest > 1.0:
-            return _faded_bins(count, noise, room, exempt, series), True
+            return _faded_bins(count, noise, room, exempt, rates), True
         return _any_further(count, noise, room, exempt, series), True
     _chances(count, noise, room, exempt, series)
     centre = abs(math.floor(0.5 * (place[0] + place[1]) + 0.5))
@@ -432,42 +524,33 @@ def _leakage(run, lines, place, noise, form, sizes, tangent, room, exempt, serie
     if not (largest_beyond <= most and rest <= SMOOTHNESS * (some + tail)):
         return 0.0, False
     if loudest > 1.0:
-        return _faded(run, points, noise, below, above, sizes, room, exempt, series), True
+        return _faded(count, points, noise, below, above, room, exempt, rates), True
     return some - (1.0 - some) * math.expm1(-tail), True
 
 
 @njit(cache=True, error_model="numpy")
-def _faded(run, points, noise, below, above, sizes, room, exempt, series):
+def _faded(count, points, noise, below, above, room, exempt, rates):
     """Return the mean leakage, over developed speckle, of a run and of the integral beyond it."""
-    count = run[1]
-    sigma, level, _, correlation = noise
-    per_octave, log_rates, k = 1, np.empty(FINER_POWERS * OCTAVES + 1), 0
+    beyond, scale = np.zeros(POWERS), 1.0 / (noise[0] * noise[0])
+    for side in (-1, 1):
+        if not (below if side < 0 else above):
+            continue
+        near = count - APRON - 1 if side > 0 else APRON  # the last bin before the integral
+        for k in range(-2, 4):
+            loud = room[OUT, near + side * k]
+            add_rates(loud * loud * scale, _end_factor(k), rates, beyond)
+    for i in range(points):
+        add_rates(2.0 * room[AFAR, i], room[WEIGHT, i], rates, beyond)
     first, last = APRON if below else ZERO, count - APRON if above else count
-    while k <= per_octave * OCTAVES:
-        power = LOUDEST * 2.0 ** (-k / per_octave)
-        root, tail = math.sqrt(power), 0.0
-        faded = sigma / root, level / root
-        _chances(count, faded, room, exempt, series)
-        for side in (-1, 1):
-            if below if side < 0 else above:
-                tail += _near_end(side, count, room[CHANCE], exempt)[0]
-        if k == 0:
-            brightest = any_crossing(room[CHANCE], first, last)
-        leave_out_joined(room[CHANCE], first, last, room[OUT], exempt, faded, correlation)
-        some = any_crossing(room[CHANCE], first, last)
-        for i in range(points):
-            room[HALF_SQUARE, i] = room[AFAR, i] * power
-        added_crossings(room[HALF_SQUARE], points, level / sigma, series, room[CHANCE])
-        tail += weighted_silence(room[CHANCE, :points], room[WEIGHT, :points])
-        beyond = -math.expm1(-max(tail, 0.0))
-        if k == 0:
-            brightest += (1.0 - brightest) * beyond
-            if brightest < 1e-12:
-                return 0.0
-            per_octave = _powers_per_octave(brightest)
-        log_rates[k] = _log_rate(some + (1.0 - some) * beyond)
-        k += 1
-    return fading_mean(log_rates[:k], per_octave)
+    return _mean_leakage(first, last, noise, room, exempt, rates, beyond)
+
+
+@njit(cache=True, error_model="numpy", borrows=True)
+def _end_factor(k):
+    """Return the factor of bin ``k`` in the correction of :func:`_near_end`, k = -2 .. 3."""
+    one, three, five = _END_TERMS
+    factors = one - 3.0 * three + 10.0 * five, three - 5.0 * five, five
+    return factors[k - 1] if k > 0 else -factors[-k]
 
 
 @njit(cache=True, error_model="numpy")

@@ -37,19 +37,22 @@ the magnitudes that it has there at one of some phases.
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from sweep.kernel_cache import njit
 from sweep.model import philox
 from sweep.model.crossings import edge_crossing, silence
 from sweep.model.draws import Seen, seen_spectra
 from sweep.model.effects.circulator_leak import PHASES, bins_of_line, line_of
-from sweep.model.groups import Groups
+from sweep.model.groups import Groups, add_groups, room_for_groups
 from sweep.model.looks import Looks
 from sweep.model.marcum import excess_crossing, marcum_q1_pair
 from sweep.model.preparation import Shots
+from sweep.model.segments import Runs, runs_of
 
 RATES = 2048
 """Number of amplitudes at which rates are tabulated."""
@@ -89,6 +92,17 @@ JOINED_RATE_MIN = 1e-2
 """Rate at the power e^(2 BRIGHT) of bins in a row below which the next one joins no echo."""
 BRIGHT = math.log(4.0)
 
+FAINT_LEAKAGE = 1e-5
+"""Probability of leakage up to which its mean over speckle is the sum of the means of its bins.
+
+Two bins then hardly ever cross together, nor a bin with the echo that it would join."""
+
+MEAN_STEP = 8
+"""Tabulated amplitudes from one to the next at which a bin's mean over speckle is integrated."""
+
+OCTAVES = 5
+"""Speckle powers 1, 2, 4 .. at which bounds of the rates' sum are kept."""
+
 EDGE_STEP = 0.75
 """Step in ln(power) at which the probability that an echo's outermost bin crosses is computed."""
 EDGE_DEPTH = 3.0
@@ -114,7 +128,11 @@ class LeakedPeaks(NamedTuple):
     side: np.ndarray
     """int64: 1 where that bin is above, else -1."""
     total: np.ndarray
-    """(m, 3): sum of the rates of these bins at mean speckle power."""
+    """(m, 3): sum of the rates of these bins at mean speckle power, or somewhat more."""
+    bound: np.ndarray
+    """(m, 3, OCTAVES): the same at speckle powers 1, 2, 4 .."""
+    faint: np.ndarray
+    """(m, 3): sum of the mean probabilities over speckle that these bins cross; nan if unknown."""
     line_stretch: np.ndarray
     """(m, 3, 2) int64: begin and end of each segment in ``line_bin`` and ``line_amplitude``."""
     line_bin: np.ndarray
@@ -144,14 +162,18 @@ class LeakedPeaks(NamedTuple):
         """Return no bins at all, for ``points`` points."""
         none, bins, sums = np.zeros((points, 3, 2), np.int64), np.empty(0, np.int64), (points, 3)
         return cls(
-            none, bins, np.empty(0), bins, np.empty(0), bins, np.zeros(sums), none, bins,
+            none, bins, np.empty(0), bins, np.empty(0), bins, np.zeros(sums),
+            np.zeros((*sums, OCTAVES)), np.full(sums, np.nan), none, bins,
             np.empty((PHASES, 0)), np.zeros(sums), none, bins, np.zeros(points, np.int64),
             np.zeros((1, 1)), np.zeros((1, 2)), np.zeros(1), 1.0, 0.0,
         )  # fmt: skip
 
     def of(self, points: np.ndarray) -> "LeakedPeaks":
         """Bins of some points by their numbers, or a mask; lists of bins stay whole."""
-        by_point = ("stretch", "total", "line_stretch", "line_total", "barred_stretch", "law")
+        by_point = (
+            "stretch", "total", "bound", "faint", "line_stretch", "line_total", "barred_stretch",
+            "law",
+        )  # fmt: skip
         return self._replace(**{name: getattr(self, name)[points] for name in by_point})
 
     def mean_leakage(self) -> np.ndarray:
@@ -195,26 +217,182 @@ def leaked_peaks(
     shots: Shots, found: Groups, points: np.ndarray
 ) -> Iterator[tuple[np.ndarray, LeakedPeaks]]:
     """Yield batches of ``points``: their indices, and the bins of their leaked signal."""
+    if shots.leak_amplitude is None:
+        for runs in _runs_with_leakage(shots, points):
+            yield runs.part, _leaks_of_runs(shots, found, runs)
+        return
     echoes_alone = replace(shots, leak_amplitude=None)
-    step = max(points.size, 1) if shots.leak_amplitude is None else POINTS_WITH_LINE
-    for first in range(0, points.size, step):
-        for part, seen in seen_spectra(echoes_alone, points[first : first + step]):
+    for first in range(0, points.size, POINTS_WITH_LINE):
+        for part, seen in seen_spectra(echoes_alone, points[first : first + POINTS_WITH_LINE]):
             echo = echo_of_bins(shots, found, part, seen)
-            leaks = LeakedPeaks.nothing(part.size)
-            if shots.leak_amplitude is not None:
-                seen, echo, leaks = _with_line(shots, part, seen, echo)
-            level = np.broadcast_to(shots.threshold / shots.bin_deviation, shots.size)[part]
-            levels, law = _laws(level)
-            rates, scale = _rates(shots.looks, levels)
+            seen, echo, leaks = _with_line(shots, part, seen, echo)
             leaks = leaks._replace(
-                stretch=seen.stretch, bin=_leaked_bins(seen)[0],
-                amplitude=np.empty(seen.aside.size), echo=echo, edge=seen.edge, side=seen.side,
-                law=law, rates=rates, scale=scale, level=shots.looks.scaled(levels),
-                sharper=float(shots.looks.sharper),
-                correlation=shots.echo_rule.sidelobe_correlation,
+                stretch=seen.stretch, bin=_leaked_bins(seen)[0], amplitude=np.log(seen.leaked),
+                echo=echo, edge=seen.edge, side=seen.side,
             )  # fmt: skip
-            _sum_rates(seen.leaked, leaks)
-            yield part, leaks
+            yield part, _with_rates(shots, part, leaks)
+
+
+def groups_with_leaks(
+    shots: Shots, most: int
+) -> tuple[Groups, list[tuple[np.ndarray, LeakedPeaks]]]:
+    """Find groups as :func:`sweep.model.groups.groups` does, and list their leaked peaks.
+
+    Of echoes in developed speckle, which are searched for both at once. The probability of leakage
+    is its mean over speckle. A search band, or a line of leaked light, takes two searches.
+    """
+    bins, found = room_for_groups(shots.size, most)
+    listed = []
+    for runs in _runs_with_leakage(shots, np.arange(shots.size)):
+        add_groups(shots, runs, bins, found)
+        leaks = _leaks_of_runs(shots, found, runs)
+        found.leakage[runs.part] = leaks.mean_leakage()
+        listed.append((runs.part, leaks))
+    return found, listed
+
+
+def _runs_with_leakage(shots: Shots, points: np.ndarray) -> Iterator[Runs]:
+    """Yield runs of all bins of points that may leak."""
+    least = np.minimum(shots.threshold, _leaking_from(shots) * shots.bin_deviation)
+    return runs_of(shots, points=points, least=least, leakage=False, chances=False)
+
+
+def _leaking_from(shots: Shots) -> np.ndarray:
+    """|X| / sigma from which bins of points may leak, (n,)."""
+    return np.broadcast_to(shots.floor if shots.leakage else np.inf, shots.size)
+
+
+def _leaks_of_runs(shots: Shots, found: Groups, runs: Runs) -> LeakedPeaks:
+    """List the bins of leaked signal in runs of points."""
+    low, count, peak, start = (
+        np.ascontiguousarray(v) for v in (runs.low, runs.bins, runs.peak, runs.start)
+    )
+    bins, echo, side = np.empty((3, count.sum()), np.int64)
+    amplitude, edge = np.empty((2, bins.size))
+    stretch = np.empty((runs.part.size, 3, 2), np.int64)
+    number = _list_leaked(
+        runs.part, low, count, peak, start, np.ascontiguousarray(runs.inside), runs.magnitudes,
+        runs.exempt, np.array(np.broadcast_to(shots.bin_deviation, shots.size)),
+        np.array(_leaking_from(shots)), np.ascontiguousarray(found.bin),
+        shots.fft_size if shots.complex_record else 0, stretch, bins, amplitude, echo, edge, side,
+    )  # fmt: skip
+    leaks = LeakedPeaks.nothing(runs.part.size)._replace(
+        stretch=stretch, bin=bins[:number], amplitude=amplitude[:number], echo=echo[:number],
+        edge=edge[:number], side=side[:number],
+    )  # fmt: skip
+    return _with_rates(shots, runs.part, leaks)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", borrows=True)
+def _list_leaked(
+    part, low, count, peak, start, inside, magnitudes, exempt, sigma, least, groups, circle,
+    stretch, bins, amplitude, echo, edge, side,
+):  # fmt: skip
+    """List the bins of leaked signal in runs; return their number.
+
+    Parameters
+    ----------
+    part
+        (m,): points of the runs.
+    low, count, peak, start, inside
+        (3, m): first bin, number of bins, place of the largest, begin in ``magnitudes`` and
+        ``exempt``, and whether the largest is searched, by segment.
+    magnitudes, exempt
+        |X| [V] of all bins, and whether they are of an echo.
+    sigma, least
+        (n,): noise per quadrature [V], and |X| / sigma from which bins of points may leak.
+    groups
+        (n, 3, most): strongest bins of groups, -1 for none.
+    circle
+        Number of bins of a complex record, else 0.
+    stretch, bins, amplitude, echo, edge, side
+        Results, as of :class:`LeakedPeaks`.
+    """
+    number = 0
+    for j in range(part.size):
+        i = part[j]
+        for s in range(3):
+            stretch[j, s, 0] = number
+            begin = start[s, j]
+            for k in range(count[s, j]):
+                at = begin + k
+                ratio = magnitudes[at] / sigma[i]
+                if exempt[at] or not ratio >= least[i] or (k == peak[s, j] and inside[s, j]):
+                    continue
+                below, above = 0.0, 0.0
+                if k > 0 and exempt[at - 1]:
+                    below = magnitudes[at - 1] / sigma[i]
+                if k + 1 < count[s, j] and exempt[at + 1]:
+                    above = magnitudes[at + 1] / sigma[i]
+                nearest, group = np.int64(1) << 62, 0
+                for g in range(groups.shape[2]):
+                    if groups[i, s, g] < 0:
+                        continue
+                    apart = abs(low[s, j] + k - groups[i, s, g])
+                    if circle > 0:
+                        apart = min(apart % circle, -apart % circle)
+                    if apart < nearest:
+                        nearest, group = apart, g
+                bins[number], amplitude[number] = low[s, j] + k, math.log(ratio)
+                echo[number], edge[number] = group, max(below, above)
+                side[number] = 1 if above >= below else -1
+                number += 1
+            stretch[j, s, 1] = number
+    return number
+
+
+def _with_rates(shots: Shots, part: np.ndarray, leaks: LeakedPeaks) -> LeakedPeaks:
+    """Complete listed bins of points by the law and the sums of their rates."""
+    level = np.broadcast_to(shots.threshold / shots.bin_deviation, shots.size)[part]
+    levels, law = _laws(level)
+    fades = shots.fading is not None
+    tables = [_rate_tables(shots.looks, float(one), fades) for one in levels]
+    rates, scale, bound, mean = (
+        np.array([table[k] for table in tables]).reshape(levels.size, -1) for k in range(4)
+    )
+    leaks = leaks._replace(
+        law=law, rates=rates, scale=scale, level=shots.looks.scaled(levels),
+        sharper=float(shots.looks.sharper), correlation=shots.echo_rule.sidelobe_correlation,
+    )  # fmt: skip
+    _sum_rates(leaks, bound, mean)
+    return leaks
+
+
+class RateTables(NamedTuple):
+    """Tables of one threshold by ln(amplitude)."""
+
+    rates: np.ndarray
+    """(RATES,): ln(rate)."""
+    scale: np.ndarray
+    """(2,): first ln(amplitude), and their step."""
+    bound: np.ndarray
+    """(RATES,): rate."""
+    mean: np.ndarray
+    """(RATES,): mean probability over speckle that a bin crosses; of no size if not asked for."""
+
+
+@lru_cache(maxsize=64)
+def _rate_tables(looks: Looks, level: float, fades: bool) -> RateTables:
+    """Return the tables of a threshold [sigma]; means over speckle if an echo ``fades``."""
+    rates, scale = _rates(looks, np.array([level]))
+    mean = np.empty(0)
+    if fades:
+        means, place = np.empty(RATES // MEAN_STEP + 1), np.arange(RATES) / MEAN_STEP
+        _fill_means(rates[0], scale[0], means)
+        logarithm = np.log(np.maximum(means, 1e-300))
+        mean = np.exp(CubicSpline(np.arange(means.size), logarithm)(place))
+    return RateTables(rates[0], scale[0], np.exp(rates[0]), mean)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fill_means(log_rates, scale, means):
+    """Fill in the mean over speckle of a bin's probability, at each MEAN_STEP th amplitude."""
+    rule = _speckle_rule(log_rates, scale)
+    sums = np.empty(rule.weights.size)
+    for k in range(means.size):
+        sums[:] = 0.0
+        _add_rates(scale[0] + k * MEAN_STEP * scale[1], scale, rule, sums)
+        means[k] = _faded_leakage(sums, rule.weights)
 
 
 def _leaked_bins(seen: Seen) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -312,7 +490,7 @@ def _fill_rates(level, rates, scale):
             rates[j, k] = math.log(max(rate, 1e-300))
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def _rate(amplitude, rates, scale):
     """Return the rate -ln(1 - c) of a bin.
 
@@ -328,22 +506,33 @@ def _rate(amplitude, rates, scale):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _sum_rates(amplitude, leaks):
-    """Store ln(``amplitude``) and the sums of rates in the fields of ``leaks``, in place.
+def _sum_rates(leaks, bound, mean):
+    """Store the sums of rates in the fields of ``leaks``, in place.
 
-    ``amplitude`` [sigma] is that of all bins of leaked echo, in the order of ``leaks.bin``.
+    ``bound`` and ``mean`` (laws, RATES) are those of :class:`RateTables`.
     """
-    for k in range(amplitude.size):
-        leaks.amplitude[k] = math.log(amplitude[k])
     for p in range(leaks.line_amplitude.shape[0]):
         for k in range(leaks.line_amplitude.shape[1]):
             leaks.line_amplitude[p, k] = math.log(max(leaks.line_amplitude[p, k], 1e-300))
     for j in range(leaks.total.shape[0]):
         rates, scale = leaks.rates[leaks.law[j]], leaks.scale[leaks.law[j]]
+        octave = math.ceil(0.5 * math.log(2.0) / scale[1])
         for s in range(3):
-            leaks.total[j, s] = leaks.line_total[j, s] = 0.0
+            sums, means = leaks.bound[j, s], 0.0
+            sums[:] = 0.0
             for k in range(leaks.stretch[j, s, 0], leaks.stretch[j, s, 1]):
-                leaks.total[j, s] += _rate(leaks.amplitude[k], rates, scale)
+                share, place = 1.0, (leaks.amplitude[k] - scale[0]) / scale[1]
+                if place < 0.0:  # rates go as the amplitude squared
+                    share, place = math.exp(2.0 * (leaks.amplitude[k] - scale[0])), 0.0
+                at = min(int(place), RATES - 2)
+                for p in range(OCTAVES):
+                    sums[p] += share * bound[leaks.law[j], min(at + 1 + p * octave, RATES - 1)]
+                if mean.shape[1] > 0:
+                    one, other = mean[leaks.law[j], at], mean[leaks.law[j], at + 1]
+                    means += share * (one + min(place - at, 1.0) * (other - one))
+            leaks.total[j, s], leaks.line_total[j, s] = sums[0], 0.0
+            if mean.shape[1] > 0:
+                leaks.faint[j, s] = means
             for p in range(leaks.line_amplitude.shape[0]):
                 whole = 0.0
                 for k in range(leaks.line_stretch[j, s, 0], leaks.line_stretch[j, s, 1]):
@@ -515,13 +704,19 @@ def _average(leaks, out):
     Each echo fades independently.
     """
     joined = np.zeros(leaks.bin.size, np.bool_)
+    no_rule = SpeckleRule(1, 0, np.empty(0), np.empty(0))
     for law in range(leaks.scale.shape[0]):
         rates, scale = leaks.rates[law], leaks.scale[law]
-        rule = _speckle_rule(rates, scale)
-        at_nodes, faint = (
-            np.empty((2, rule.weights.size)),
-            int((LOG_POWER_MIN_FAINT - LOG_POWER_MIN) / (2.0 * rule.stride * scale[1])),
-        )
+        loud = False
+        for j in range(out.shape[0]):
+            for s in range(3):
+                loud |= leaks.law[j] == law and not leaks.faint[j, s] <= FAINT_LEAKAGE
+        rule, at_nodes, faint = no_rule, np.empty((2, 0)), 0
+        if loud:
+            rule = _speckle_rule(rates, scale)
+            at_nodes = np.empty((2, rule.weights.size))
+            spacing = 2.0 * rule.stride * scale[1]
+            faint = int((LOG_POWER_MIN_FAINT - LOG_POWER_MIN) / spacing)
         for j in range(out.shape[0]):
             if leaks.law[j] != law:
                 continue
@@ -530,6 +725,8 @@ def _average(leaks, out):
                 first = faint if leaks.total[j, s] <= FAINT_RATES else 0
                 sums, joins = at_nodes[0, first:], at_nodes[1, first:]
                 leakage, echoes = 0.0, 0
+                if leaks.faint[j, s] <= FAINT_LEAKAGE:
+                    leakage, end = leaks.faint[j, s], begin
                 for k in range(begin, end):
                     echoes = max(echoes, leaks.echo[k] + 1)
                 for g in range(echoes):
@@ -552,7 +749,7 @@ def _average(leaks, out):
                 out[j, s] = leakage + alarm * (1.0 - leakage)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def list_peak(peak, bins, ratios, number):
     """Insert a peak (bin, |X| / sigma) into a list sorted by strength; return its new length.
 
@@ -573,7 +770,7 @@ def list_peak(peak, bins, ratios, number):
     return number
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def draw_leaked(address, at, leaks, fading, level, looks, tables, bins, ratios):
     """Draw the leaked peaks of a segment, and insert them into the list of the strongest peaks.
 
@@ -602,24 +799,32 @@ def draw_leaked(address, at, leaks, fading, level, looks, tables, bins, ratios):
     """
     (a, b, draw), (i, s) = address, at
     rates, scale = leaks.rates[leaks.law[i]], leaks.scale[leaks.law[i]]
-    number = _list_raised(
-        address, s, 0, leaks.stretch[i, s], leaks.bin, leaks.amplitude, leaks.echo, leaks.edge,
-        fading[:, s], leaks.total[i, s], rates, scale,
-        (level, looks, tables.sidelobe_correlation), bins, ratios, 0,
-    )  # fmt: skip
+    brightest, octave, total = 0.0, 0, np.inf
+    for g in range(fading.shape[0]):
+        brightest = max(brightest, fading[g, s] * fading[g, s])
+    while octave < OCTAVES and brightest > float(1 << octave):
+        octave += 1
+    if octave < OCTAVES:
+        total = leaks.bound[i, s, octave]
+    number = 0
+    if total > 0.0:
+        number = _list_raised(
+            address, s, 0, leaks.stretch[i, s], leaks.bin, leaks.amplitude, leaks.echo, leaks.edge,
+            fading[:, s], total, rates, scale, (level, looks, tables.sidelobe_correlation), bins,
+            ratios, number,
+        )  # fmt: skip
     if leaks.line_total[i, s] > 0.0:
         turn = philox.uniform(a, b, draw, philox.STREAM_LEAKAGE[s], LINE)
         phase = int(turn * leaks.line_amplitude.shape[0])
         number = _list_raised(
             address, s, LINE + 1, leaks.line_stretch[i, s], leaks.line_bin,
-            leaks.line_amplitude[phase], np.zeros(leaks.line_bin.size, np.int64),
-            np.zeros(leaks.line_bin.size), np.ones(1), leaks.line_total[i, s], rates,
-            scale, (level, looks, 0.0), bins, ratios, number,
+            leaks.line_amplitude[phase], leaks.echo[:0], leaks.edge[:0], fading[:, s],
+            leaks.line_total[i, s], rates, scale, (level, looks, 0.0), bins, ratios, number,
         )  # fmt: skip
     return number
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", borrows=True)
 def _list_raised(
     address, s, first, stretch, bins, amplitude, echo, edge, fading, total, rates, scale, law,
     listed, ratios, number,
@@ -629,22 +834,25 @@ def _list_raised(
     Peaks that join on to a bin of the echo that crosses are the echo's.
 
     Bins are skipped by exponential numbers, as the module says. ``first``: first random number of
-    the segment's stream; ``total``: sum of the rates of all bins at mean speckle power; ``law``:
-    threshold [sigma], number of looks and correlation of neighbours' noise; ``listed``, ``ratios``,
-    ``number``: the list, as of :func:`list_peak`. Returns its new length.
+    the segment's stream; ``echo``, ``edge``: of no size of bins that do not fade and join no echo;
+    ``total``: bound of the sum of the rates of all bins in this draw; ``law``: threshold [sigma],
+    number of looks and correlation of neighbours' noise; ``listed``, ``ratios``, ``number``: the
+    list, as of :func:`list_peak`. Returns its new length.
     """
     (a, b, draw), stream, (level, looks, near) = address, philox.STREAM_LEAKAGE[s], law
     rest = math.sqrt(1.0 - near * near)
-    left, brightest = -math.log1p(-philox.uniform(a, b, draw, stream, first)), 0.0
-    for g in range(fading.size):
-        brightest = max(brightest, fading[g])
-    if brightest <= 1.0 and left > total:
+    chance = philox.uniform(a, b, draw, stream, first)
+    if chance > total:  # and so is -ln(1 - chance)
+        return number
+    left = -math.log1p(-chance)
+    if left > total:
         return number
     many = math.sqrt(float(looks))
     z = level * many
     before, peak, largest, is_echo = np.int64(-2), np.int64(-1), 0.0, False
     for k in range(stretch[0], stretch[1]):
-        own = amplitude[k] + math.log(fading[echo[k]])
+        faded = fading[echo[k]] if echo.size > 0 else 1.0
+        own = amplitude[k] + math.log(faded)
         left -= _rate(own, rates, scale)
         if left > 0.0:
             continue
@@ -653,11 +861,9 @@ def _list_raised(
             peak, largest, is_echo = np.int64(-1), 0.0, False
         before, signal = bins[k], math.exp(own) * many
         chance = philox.uniform(a, b, draw, stream, first + 1) * _added(signal, z)
-        if edge[k] > 0.0:  # its noise is in step with that which raises this bin
+        if edge.size > 0 and edge[k] > 0.0:  # its noise is in step with that which raises this bin
             re, im = philox.normal_pair(a, b, draw, stream, EDGES + k - stretch[0])
-            along = edge[k] * fading[echo[k]] * many + near * (
-                _exceeded(signal, z, chance) - signal
-            )
+            along = edge[k] * faded * many + near * (_exceeded(signal, z, chance) - signal)
             is_echo |= math.hypot(along + rest * re, rest * im) >= z
         least = max(largest, ratios[number - 1] if number == ratios.size else 0.0)
         if least * many < z or _added(signal, least * many) > chance:

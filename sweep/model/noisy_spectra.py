@@ -25,11 +25,11 @@ its noise, its walk, and the speckle that all have, or its own. Flags are those 
 |X|^2, of enough records, or of the mean record; the frequency is the mean of the looks' estimates.
 
 A detector and an estimator of frequency look at each segment's spectrum. The detector flags bins of
-|X|^2. A segment is detected where it flags any bin that the signal occupies (``peak_bin``: the
-strongest or one of its two neighbours); adjacent flagged bins form a group. A group outside the
-bins that the signal occupies is a false alarm. The estimator is given the spectrum and the largest
-bin of the detected group. If all segments are detected, their frequencies are resolved into range
-and radial velocity.
+|X|^2. A segment is detected where it flags any bin that the signal occupies (``peak_bin``: the one
+that is the strongest without noise and speckle); adjacent flagged bins form a group. A group
+outside the bins that the signal occupies is a false alarm. The estimator is given the spectrum and
+the largest bin of the detected group. If all segments are detected, their frequencies are resolved
+into range and radial velocity.
 """
 
 import math
@@ -597,11 +597,11 @@ def look(spectra: Sequence[np.ndarray], signal: Signal, view: View) -> Found:
     power, flags = (unrolled(shots, each, signal.strongest) for each in (power, flags))
     strongest, before, last = (k + turn for k in (signal.strongest, signal.first, signal.last))
     bins, half = np.arange(power.shape[1]), power.shape[1] - 1
-    low, high = max(strongest - 1, 0), min(strongest + 2, half + 1)
+    low, high = strongest, strongest + 1
     if shots.detection == "any_bin" and last >= before:
         low, high = before, last + 1
-    if not shots.real_ends:
-        low, high = max(low, 1), min(high, half)
+        if not shots.real_ends:
+            low, high = max(low, 1), min(high, half)
     place = signal.strongest - index_of_zero(shots)
     own = flags[:, low:high] & is_searched(shots, signal.segment, view.i, place)
     near = np.where(own, power[:, low:high], -1.0)

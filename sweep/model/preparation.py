@@ -444,7 +444,7 @@ class Shots:
                     (up[..., near], down[..., near]),
                     lambda up, down: (detection.fading_together(up, down, level, alike, number),),
                 )
-        return both if self.band is None else np.where((up == 0) | (down == 0), 0.0, both)
+        return np.where((up == 0) | (down == 0), 0.0, both)
 
     def independent_bins(
         self, chances: tuple[np.ndarray, ...], magnitudes: tuple[np.ndarray, ...]

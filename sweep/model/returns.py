@@ -184,12 +184,16 @@ def draw_returns(
     one = np.exp(shots.looks.log_alarm(known.levels[:, 1:2]))
     how, tables = How.of(shots, first_draw, noisy), interpolator(shots.window, shots.fft_size)
     around = int(2 * known.fan.reach.max(initial=0) + 1)
+    roots: dict[int, np.ndarray] = {}
     for part, seen, of_signal in _spectra(shots, found, noisy, leaks):
         of_part = known.of(part)
         of_part = of_part._replace(alarm=at_least_one(one[part], seen.others))
         own = Drawn(*(column[part] for column in drawn))
         rule = echo_filter(shots, seen, 0 if noisy else around)
-        filtered = how._replace(rule=rule, root=noise_root(rule))
+        size = rule[0].shape[0]
+        if size not in roots:
+            roots[size] = noise_root(rule)
+        filtered = how._replace(rule=rule, root=roots[size])
         if shots.real_ends and shots.fading is not None and (shots.speckle_table.row > 0).any():
             quadratures = noise_quadratures(shots.window, shots.fft_size)
             near = 1 + int(np.flatnonzero(np.abs(quadratures) > _ALIKE)[-1])
@@ -895,6 +899,8 @@ class Speckle(NamedTuple):
     """(most, 3, bins): mean power by the lines of the footprint."""
     pseudo: np.ndarray
     """(most, 3, bins): pseudo-variance over that power."""
+    size: np.ndarray
+    """(most, 3, bins): root mean square of the echo's |X| / sigma."""
     drawn: np.ndarray
     """(most, looks, 3, bins): complex amplitudes of a mean power of 1; of one look where all have
     the same."""
@@ -918,7 +924,7 @@ def no_speckle(most):
     powers = np.zeros((most, 3, 0))
     alone = np.zeros((0, 3, 0), np.complex128)
     rank = np.zeros(most, np.int64)
-    return Speckle(bins, bins, powers, powers, nothing, rank, nothing, alone, powers)
+    return Speckle(bins, bins, powers, powers, powers, nothing, rank, nothing, alone, powers)
 
 
 @njit(cache=True, error_model="numpy")
@@ -956,12 +962,21 @@ def speckled_bins(i, how, known, seen):
             )
     drawn = np.zeros((most, looks, 3, widest), np.complex128)
     alone = np.zeros((known.look_root.shape[3], 3, widest), np.complex128)
-    detecting = np.zeros((most, 3, widest))
+    size, detecting = np.zeros((most, 3, widest)), np.zeros((most, 3, widest))
     for g in range(most):
         for s in range(3):
-            if count[g, s] > 0 and not how.noisy:
-                weigh_bins(i, (g, s), how, known, first, power, rank, factor, detecting[g, s])
-    return Speckle(first, count, power, pseudo, drawn, rank, factor, alone, detecting)
+            if count[g, s] == 0 or how.noisy:
+                continue
+            weigh_bins(i, (g, s), how, known, first, power, rank, factor, detecting[g, s])
+            middle, sigma = known.bins[i, s, BIN, g] - first[g, s], known.levels[i, 0]
+            magnitude = known.magnitude[i, s, g]
+            for k in range(count[g, s]):
+                if abs(k - middle) <= 1:
+                    size[g, s, k] = magnitude[1 + k - middle] / sigma
+                else:
+                    share = power[g, s, k] / power[g, s, middle]
+                    size[g, s, k] = magnitude[1] / sigma * math.sqrt(share)
+    return Speckle(first, count, power, pseudo, size, drawn, rank, factor, alone, detecting)
 
 
 @njit(cache=True, error_model="numpy", borrows=True)
@@ -1018,7 +1033,7 @@ def draw_speckle(address, i, known, speckle, fading):
                 for k in range(speckle.number[g, s]):
                     if not speckle.power[g, s, k] > 0.0:  # beyond all lines
                         own[k] = own[centre]
-                total += abs(own[centre]) ** 2
+                total += own[centre].real ** 2 + own[centre].imag ** 2
             fading[g, s] = math.sqrt(total / speckle.drawn.shape[1])
 
 
@@ -1245,7 +1260,7 @@ def detect_faded(address, at, g, how, known, speckle, tables, work, peak):
     detect by their own powers.
     """
     (a, b, draw), (i, s) = address, at
-    sigma, beta, under_lines = known.levels[i]
+    _, beta, under_lines = known.levels[i]
     centre, first = known.bins[i, s, BIN, g], speckle.first[g, s]
     middle, count, chance = centre - first, speckle.number[g, s], known.pd[i, s, g]
     number = known.number[i, s, g]
@@ -1256,7 +1271,8 @@ def detect_faded(address, at, g, how, known, speckle, tables, work, peak):
         return False
     power, room = work.power[:count], work.noise
     power[:] = 0.0
-    magnitude, votes, total = known.magnitude[i, s, g], 0, complex(0.0, 0.0)
+    along, across, votes = 0.0, 0.0, 0
+    of_echo, of_noise = math.sqrt(share), math.sqrt(0.5 * (1.0 - share))
     for look in range(how.looks):
         own = draw + look * NEXT_LOOK
         address_of_noise = a, b, own, philox.STREAM_NOISE[s]
@@ -1266,31 +1282,24 @@ def detect_faded(address, at, g, how, known, speckle, tables, work, peak):
             bins_of_noise(address_of_noise, ECHO * (1 + g), (first, count), how, room)
         echo = speckle.drawn[g, look if speckle.drawn.shape[1] > 1 else 0, s]
         for k in range(count):
-            if abs(k - middle) <= 1:
-                size = magnitude[1 + k - middle] / sigma
-            else:
-                size = (
-                    magnitude[1]
-                    / sigma
-                    * math.sqrt(speckle.power[g, s, k] / speckle.power[g, s, middle])
-                )
-            noise = complex(room[0, k], room[1, k])
-            amplitude = size * echo[k] + under_lines * noise
+            size, weight = speckle.size[g, s, k], of_echo * speckle.detecting[g, s, k]
+            re = size * echo[k].real + under_lines * room[0, k]
+            im = size * echo[k].imag + under_lines * room[1, k]
             if look == 0:
-                total += math.sqrt(share) * speckle.detecting[g, s, k] * echo[k]
+                along, across = along + weight * echo[k].real, across + weight * echo[k].imag
             if k == middle and look == 0:
-                total += math.sqrt(0.5 * (1.0 - share)) * noise
+                along, across = along + of_noise * room[0, k], across + of_noise * room[1, k]
             if k == middle:
-                votes += abs(amplitude) >= beta
-            power[k] += abs(amplitude) ** 2 / how.looks
+                votes += re * re + im * im >= beta * beta
+            power[k] += (re * re + im * im) / how.looks
     if how.looks > 1 and how.votes >= 0:
         there = votes >= how.votes if how.votes > 0 else power[middle] >= beta * beta
     elif near_end:
         pseudo = share * speckle.pseudo[g, s, middle]
         pseudo += (1.0 - share) * bin_share(abs(centre), how.half, how.noise_quadratures)
-        there = hoyt_pair(1.0, pseudo, abs(total))[0] < chance
+        there = hoyt_pair(1.0, pseudo, math.hypot(along, across))[0] < chance
     else:
-        there = math.exp(-(abs(total) ** 2)) < chance
+        there = math.exp(-(along * along + across * across)) < chance
         if not there and number > 1.0:
             there = is_detected_aside(address, (i, s), g, known, chance)
     if not there:

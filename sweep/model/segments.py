@@ -25,6 +25,7 @@ from sweep.model.detection import (
 )
 from sweep.model.effects.circulator_leak import beside_leak
 from sweep.model.effects.line_width import gaussian_shifts
+from sweep.model.faded_rates import faded_rates, no_rates
 from sweep.model.ground import different_rows
 from sweep.model.leakage import LOUDEST, MOST_POINTS, inspect, of_bins, of_fading_bins
 from sweep.model.line_shape import Shapes
@@ -68,6 +69,9 @@ POINTS = 256
 
 ROOM_FOR_RUNS = 1 << 21
 """Bins of runs that are kept at a time, at least."""
+
+THRESHOLD_STEP = 1e-7
+"""Step to which thresholds [sigma] are rounded for rates of leakage in developed speckle."""
 
 SEGMENT_FIELDS = ("pd", "miss", "magnitude", "frequency", "exempted", "leakage")
 """Values found for each segment's spectrum."""
@@ -623,6 +627,7 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
     room, exempt, series = work
     numbers, values, magnitudes, exempts = out
     keep, at = magnitudes.size > 0, np.int64(0)
+    rates = no_rates()
     before, made_of = -1.0, np.int64(-1)  # a literal would compile what takes it once more
     lengths, length = shapes.lengths, sizes[1]
     partly = lengths.size > 0
@@ -644,9 +649,14 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
         sigma, level = p[10], p[11]
         pedestal = PedestalShape(p[18], p[19], p[20])
         sizes[8] = max(rule.beside, int(pedestal.reach))
-        if leaks.any() and level / sigma != before:
-            before = level / sigma
+        threshold = level / sigma
+        if rule.fades >= 0.0:  # one table serves thresholds that differ by light's shot noise
+            threshold = math.floor(threshold / THRESHOLD_STEP + 0.5) * THRESHOLD_STEP
+        if leaks.any() and threshold != before:
+            before = threshold
             crossing_series(before, series)
+            if rule.fades >= 0.0:
+                rates = faded_rates(before, series)
         for s in range(segments.size):
             if not segments[s]:
                 continue
@@ -663,8 +673,9 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
             noise = sigma, level, p[14], loudest, rule.sidelobe_correlation
             if leaks[s] == INTEGRAL:
                 low, count, peak, exempted, leakage = inspect(
-                    origin, lines, noise, table[s], form[s], sizes, tangent, room, exempt, series
-                )
+                    origin, lines, noise, table[s], form[s], sizes, tangent, room, exempt, series,
+                    rates,
+                )  # fmt: skip
             else:
                 low, count, peak, exempted = detect(
                     origin, lines, (level, levels[i]), shift[:, : (1 - sizes[4]) * shift.shape[1]],
@@ -688,7 +699,7 @@ def _inspect_points(points, where, footprint, modes, shapes, tables, how, made, 
                 bins = sigma, level, p[14], rule.sidelobe_correlation
                 if fades:
                     least = p[12] / math.sqrt(LOUDEST)
-                    leakage = of_fading_bins(count, bins, least, room, exempt, series)
+                    leakage = of_fading_bins(count, bins, least, room, exempt, rates)
                 else:
                     leakage = of_bins(count, bins, p[12], room, exempt, series)
                     if p[16] > 0.0 and rule.pairs.size > 0:

@@ -5,9 +5,9 @@ the echoes of all the surfaces that it sees. Flagged bins that are adjacent make
 the estimator; the strongest of them are paired, judged and measured as all others of a flight
 (:mod:`sweep.model.returns`). A peak belongs to an echo whose bins it touches. These are the bins
 from the first to the last of half the echo's largest magnitude, and a main lobe's half-width to
-either side (the strongest and one to either side of it by ``peak_bin``). An echo has one peak, the
-strongest. All others are false, as many as there are, but those that touch bins of a signal at or
-above a fixed threshold, or their neighbours: closed forms exempt these from false alarms, too.
+either side (by ``peak_bin`` the strongest alone). An echo has one peak, the strongest. All others
+are false, as many as there are, but those that touch bins of a signal at or above a fixed
+threshold, or their neighbours: closed forms exempt these from false alarms, too.
 
 A draw is looked at by itself, so that a user's function answers the same however draws are cut.
 
@@ -106,7 +106,7 @@ def _bins_of(view: View, segment: int, signal: Signal | None) -> np.ndarray:
     if shots.complex_record:
         places = (places + turn - 1) % shots.fft_size + 1
     if shots.detection != "any_bin":
-        return np.stack([places - 1, places + 1], axis=1)
+        return np.stack([places, places], axis=1)
     if places.size == 1:
         return np.array([[signal.first + turn, signal.last + turn]])
     magnitude = unrolled(shots, np.abs(signal.spectrum), signal.strongest)

@@ -11,7 +11,7 @@ from typing import Any
 from distributed.comm import get_address_host
 
 from sweep.tasks.engine.interrupts import HANGUP_SIGNAL
-from sweep.tasks.engine.text_streams import ForgivingStream
+from sweep.tasks.engine.text_streams import PatientStream, make_dask_logs_patient
 
 
 def dask_setup(worker: Any) -> None:
@@ -22,8 +22,10 @@ def dask_setup(worker: Any) -> None:
         # The same of one that is closed; a worker ends with its nanny.
         if HANGUP_SIGNAL is not None and getattr(worker, "nanny", None) is not None:
             signal.signal(HANGUP_SIGNAL, signal.SIG_IGN)
-        # What a user's function prints would fail its block where nobody reads it any more.
-        sys.stdout, sys.stderr = ForgivingStream(sys.stdout), ForgivingStream(sys.stderr)
+        make_dask_logs_patient()
+        # What a user's function prints would fail its block where nobody reads it any more, and
+        # hold it up where a terminal has stopped.
+        sys.stdout, sys.stderr = PatientStream(sys.stdout), PatientStream(sys.stderr)
         if get_address_host(worker.address) == get_address_host(worker.scheduler.address):
             # The driver compiles the same kernels, and says once that they can't be cached.
             logging.getLogger("sweep").setLevel(logging.ERROR)

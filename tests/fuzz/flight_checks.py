@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
 from study_checks import Verdict, check_mistake, mistake_kind, warnings_as_errors
 
+from sweep.model.detectors import FIXED
+from sweep.model.estimators import DETECTOR
 from sweep.model.outputs import CYCLES, NAVIGATION, POINTS, SHOTS, STATISTICS
 from sweep.model.unsupported import UnsupportedShot
+from sweep.model.waveform import PEAKS, STRONGEST, order_of
 from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
 from sweep.scenes.scene_files import SceneError
 from sweep.spec import SceneSpec, SpecError, from_stored, load
 from sweep.tasks.engine.blocks import Results
 from sweep.tasks.studies.eyepoint_study import EyepointStudy
-from sweep.tasks.studies.flight_study import FlightStudy
+from sweep.tasks.studies.flight_study import FlightBlock, FlightStudy
 from sweep.tasks.studies.study_plan import plan_study
 
 UNIT_LENGTH_TOLERANCE = 1e-9
@@ -61,13 +65,30 @@ def _check_scanner(study: FlightStudy, eyepoints: EyepointStudy) -> None:
             "effects_error"
         )
         cloud = study.simulate_shots(tile, eyepoint_results, shots, selected, shot_numbers)
-        architecture = study.parameters_at(tile)["instrument.receiver.architecture"]
         check_point_cloud(
             eyepoint_results,
             cloud,
             navigates=tiling.has_navigation,
-            is_direct_detection=architecture == "direct",
+            undefined=_undefined_statistics(study, tile),
         )
+
+
+def _undefined_statistics(study: FlightStudy, tile: FlightBlock) -> set[str]:
+    """Names of statistics that no shot of a block has."""
+    parameters, undefined = study.parameters_at(tile), set()
+    architecture, order = (
+        str(parameters[f"instrument.{name}"])
+        for name in ("receiver.architecture", "chirp.segments")
+    )
+    if "doppler" not in order_of(architecture, order):
+        undefined.add("pd_doppler")
+    if study.ray_accuracy is None:
+        undefined.add("beamlets_error")
+    is_threshold = parameters.get(DETECTOR + "kind", FIXED) == FIXED
+    has_probabilities = is_threshold and parameters.get(PEAKS) != STRONGEST
+    if study.spec.draws.draws_whole_spectra and not has_probabilities:
+        undefined |= {name for name in STATISTICS if name.startswith(("pd_", "pfa_"))}
+    return undefined
 
 
 HIT_ONLY_OUTPUTS = ("beam_radial_velocity", "beam_acceleration", "beam_approach", "beam_turn_rate")
@@ -93,7 +114,7 @@ def check_shots(eyepoint_results: Results) -> None:
 
 
 def check_point_cloud(
-    eyepoint_results: Results, cloud: Results, *, navigates: bool, is_direct_detection: bool
+    eyepoint_results: Results, cloud: Results, *, navigates: bool, undefined: Collection[str]
 ) -> None:
     """Statistics, points and navigation: nan where there is nothing, and nowhere else."""
     expected_outputs = {*STATISTICS, *POINTS, *(NAVIGATION if navigates else ())}
@@ -104,7 +125,7 @@ def check_point_cloud(
         if values.dtype.kind != "f":
             continue
         is_defined = sees_surface | name.startswith("pfa_")
-        if name == "pd_doppler" and is_direct_detection:
+        if name in undefined:
             is_defined = np.zeros_like(sees_surface)
         assert np.isfinite(values[is_defined]).all(), f"{name} is nan for no reason"
         assert np.isnan(values[~is_defined]).all(), f"{name} of nothing"

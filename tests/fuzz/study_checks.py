@@ -196,7 +196,8 @@ def _check_whole_spectra(results: Results) -> None:
         bias, rmse = np.abs(results[f"{name}_bias"]), results[f"{name}_rmse"]
         assert not (bias > rmse * (1 + PROBABILITY_ROUNDING)).any(), f"{name}: more bias than error"
         assert (np.isnan(bias) == np.isnan(rmse)).all(), name
-        assert (results[f"{name}_bound"] >= 0).all(), name
+        bound = results[f"{name}_bound"]  # of any two segments nan where no draw is detected
+        assert ((bound >= 0) | (np.isnan(bound) & np.isnan(bias))).all(), name
 
 
 def _check_draws(spec: GridSpec, results: Results, no_doppler: np.ndarray) -> None:

@@ -8,6 +8,7 @@ from base_study import base_study_mapping
 from click.testing import CliRunner
 from corrupted_specs import to_yaml
 from fast_plans import fast_planning
+from flight_checks import check_flight
 from study_checks import check_study, warnings_as_errors
 
 from sweep.cli import main
@@ -15,8 +16,10 @@ from sweep.model.effects.line_width import MOST_BINS, gaussian_shifts
 from sweep.model.effects.noise_sources import SUN_RADIUS, sunlight
 from sweep.model.effects.saturation import MOST_BEYOND
 from sweep.model.unsupported import UnsupportedShot
+from sweep.scenes.eyepoint_arrays import eyepoints_from_arrays
 from sweep.scenes.terrain import Terrain, smooth
-from sweep.spec import GridSpec, SceneSpec, SpecError
+from sweep.spec import GridSpec, SceneSpec, SpecError, load
+from sweep.tasks.studies.flight_study import FlightStudy
 from sweep.tasks.studies.grid_study import GridStudy
 from sweep.tasks.studies.study_plan import plan_study
 
@@ -242,3 +245,75 @@ def instrument_with(window):
         "instrument.processing.window": window, "target.radial_velocity": "0 m/s",
         "accuracy.line_error": 1e-9,
     }  # fmt: skip
+
+
+LATE = {"instrument.processing.acquisition_delay": "2 us"}  # 6.8 us of record, an echo at 13.3 us
+ELSEWHERE = {
+    f"instrument.processing.search.{name}": value
+    for name, value in {
+        "min_range": "100 m", "max_range": "400 m",
+        "min_radial_velocity": "-1 m/s", "max_radial_velocity": "1 m/s",
+    }.items()
+}  # fmt: skip
+FOUR_LOOKS = {"instrument.looks.number": 4, "instrument.processing.detection": "peak_bin"}
+WITHOUT_GROUP = {
+    "late": LATE,
+    "late peak bin": LATE | {"instrument.processing.detection": "peak_bin"},
+    "late looks": LATE | FOUR_LOOKS,
+    "late complex": LATE | FOUR_LOOKS | {"instrument.receiver.record": "complex"},
+    "late smooth": LATE | {"footprint.speckle": "none"},
+    "late direct": LATE | {"instrument.receiver.architecture": "direct"},
+    "late line": LATE | {"instrument.laser.line_width": "100 kHz"},
+    "elsewhere": ELSEWHERE,
+    "elsewhere in looks": ELSEWHERE | FOUR_LOOKS,
+    "elsewhere complex": ELSEWHERE | {"instrument.receiver.record": "complex"},
+    "elsewhere smooth": ELSEWHERE | {"footprint.speckle": "none"},
+}
+
+
+def flight_mapping(changes):
+    """A flight of two shots at 2 km over a plain, by the instrument of the plain study."""
+    mapping = base_study_mapping(changes)
+    mapping.pop("target")
+    if "footprint.speckle" not in changes:
+        mapping["footprint"].pop("speckle")
+    path = {"kind": "still", "position": ["0 m", "0 m", "2000 m"], "duration": "1.5 s"}
+    scene = {"kind": "plane", "size": "8 km", "reflectance": 0.3}
+    return mapping | {
+        "platform": {"path": path},
+        "scanners": {"down": {"kind": "fixed", "beams": [[0, 0, -1]], "rate": "1 Hz"}},
+        "draws": mapping.get("draws", {}) | {"number": 3},
+        "scene": {"objects": {"plain": scene}, "origin": "plain"},
+    }
+
+
+@pytest.mark.parametrize("name", WITHOUT_GROUP)
+@pytest.mark.parametrize("method", ["probabilities", "noise", "spectra"])
+def test_a_flight_whose_echoes_are_late_or_elsewhere_has_no_nan(tmp_path, name, method):
+    if method == "noise" and "instrument.looks.number" in WITHOUT_GROUP[name]:
+        pytest.skip("draws.method: noise is of one look")
+    mapping = flight_mapping(WITHOUT_GROUP[name] | {"draws.method": method})
+    (tmp_path / "flight.yaml").write_text(to_yaml(mapping))
+    assert not check_flight(tmp_path / "flight.yaml").refusals
+    statistics = statistics_of(tmp_path / "flight.yaml")
+    for probability in ("pd_up", "pd_down", "pd_shot", "surfaces_seen"):
+        assert (statistics[probability] == 0).all()
+    if name.startswith("late"):
+        assert (statistics["snr_up"] == 0).all()
+    else:  # the signal is there, as that of grids, though not searched for
+        seen = {k: v for k, v in WITHOUT_GROUP[name].items() if k not in ELSEWHERE}
+        (tmp_path / "flight.yaml").write_text(to_yaml(flight_mapping(seen)))
+        there = statistics_of(tmp_path / "flight.yaml")["snr_up"]
+        np.testing.assert_allclose(statistics["snr_up"], there, rtol=1e-9)
+
+
+def statistics_of(file):
+    """Statistics of the shots of a flight's only part."""
+    study = FlightStudy(load(file), file.with_suffix(".zarr"))
+    (eyepoints,) = study.eyepoint_studies()
+    shot_numbers = np.arange(eyepoints.n_points)
+    eyepoint_results = eyepoints.cast_cycles(shot_numbers)
+    shots = eyepoints_from_arrays(eyepoint_results, eyepoints.beamlet_weights)
+    flight_block = study.scanner_grids[eyepoints.scanner].flight_block(0)
+    selected = study.select_effects(flight_block, shots, shot_numbers)
+    return study.simulate_shots(flight_block, eyepoint_results, shots, selected, shot_numbers)

@@ -283,3 +283,57 @@ def test_a_line_of_leaked_light_raises_peaks_in_its_own_bins(table_4_1, monkeypa
     hidden = leaks.barred_bin[slice(*leaks.barred_stretch[0, 0])]
     assert (scale * line.most[hidden] >= 0.8 * shots.threshold[0]).all() and hidden.size
     assert not set(hidden) & set(bins)
+
+
+def _faint_shots(table_4_1, power, record="real"):
+    """Shots in developed speckle at several ranges, of little leakage."""
+    law = table_4_1(
+        fft_size=SIZE, beamlets=1, radial_velocity=20.0, window="hamming", power=power,
+        phases="incoherent", range=np.linspace(300.0, 500.0, 7),
+    )  # fmt: skip
+    further = {"footprint.speckle": "developed", RECORD: record}
+    return prepare_single_category(DEFAULTS | law | further, (*CORE, "fading"))
+
+
+@pytest.mark.parametrize("record", ["real", "complex"])
+def test_one_search_finds_the_groups_and_leaks_that_two_searches_find(record, table_4_1):
+    shots = _faint_shots(table_4_1, 200.0, record)
+    found, listed = leaked.groups_with_leaks(shots, 4)
+    apart = groups(shots, leakage=False)
+    for name, values in found._asdict().items():
+        if name != "leakage":
+            np.testing.assert_allclose(values, getattr(apart, name), rtol=1e-12, err_msg=name)
+    number = 0
+    for (part, leaks), (same, others) in zip(
+        listed, leaked.leaked_peaks(shots, apart, np.arange(shots.size)), strict=True
+    ):
+        assert (part == same).all()
+        assert (leaks.stretch == others.stretch).all() and (leaks.bin == others.bin).all()
+        assert (leaks.echo == others.echo).all() and (leaks.side == others.side).all()
+        np.testing.assert_allclose(leaks.amplitude, others.amplitude, rtol=1e-9)
+        np.testing.assert_allclose(found.leakage[part], others.mean_leakage(), rtol=1e-9)
+        number += leaks.bin.size
+    assert number > 50
+
+
+def test_faint_leakage_is_what_the_average_over_all_bins_together_gives(table_4_1):
+    shots = _faint_shots(table_4_1, 1.0)
+    ((_, leaks),) = leaked.leaked_peaks(shots, groups(shots), np.arange(shots.size))
+    means = leaks.mean_leakage()
+    together = leaks._replace(faint=leaks.faint * np.nan).mean_leakage()
+    faint = (together > leaked.SELDOM) & (together < 0.9 * leaked.FAINT_LEAKAGE)
+    assert faint.sum() > 3
+    np.testing.assert_array_equal(means[faint], leaks.faint[faint])
+    np.testing.assert_allclose(means[faint], together[faint], rtol=5e-3)
+
+
+def test_rates_stay_below_their_bounds_at_every_octave_of_speckle(table_4_1):
+    shots = _faint_shots(table_4_1, 20.0)
+    ((_, leaks),) = leaked.leaked_peaks(shots, groups(shots), np.arange(shots.size))
+    for octave in range(leaked.OCTAVES):
+        for j, s in np.ndindex(leaks.total.shape):
+            bins = slice(*leaks.stretch[j, s])
+            amplitudes = leaks.amplitude[bins] + 0.5 * octave * math.log(2.0)
+            law = leaks.law[j]
+            whole = sum(leaked._rate(a, leaks.rates[law], leaks.scale[law]) for a in amplitudes)
+            assert whole <= leaks.bound[j, s, octave] <= 1.3 * whole

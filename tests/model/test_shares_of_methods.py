@@ -31,9 +31,6 @@ from sweep.spec import SpecError
 SCATTERER_DRAWS, DRAWS, SPECTRA = 16_000, 5_000, 800
 SLACK = 0.012
 """Error of draws beyond five standard deviations; that of the closed forms is their stated one."""
-NEIGHBOURS = 0.25
-"""Whole spectra detect ``peak_bin`` by a neighbour of the strongest bin as well, of footprints that
-spread over bins so much more often."""
 SIGMAS = 5.0
 WIDE = 0.25
 """Deviation of lines [bins of fs/L] from which speckle differs over the bins of an echo."""
@@ -120,14 +117,14 @@ def compared(number):
     truth = {name: float(event.mean()) for name, event in events.items()}
     facet = point_facet(p, shots)
 
-    def compare(source, shares, draws, slack, above=0.0):
+    def compare(source, shares, draws, slack):
         for name, share in shares.items():
             if name not in truth or np.isnan(share):
                 continue
             likely = np.clip(truth[name], 1e-3, 1 - 1e-3)
             sigma = math.sqrt(likely * (1 - likely) * (1 / draws + 1 / SCATTERER_DRAWS))
             more, apart = SIGMAS * sigma + slack[name != "doppler"], share - truth[name]
-            if apart > more + above or -apart > more:
+            if abs(apart) > more:
                 differing.append(f"{source} {name}: {share:.4f} for {truth[name]:.4f}")
 
     law = [stated_error(name, shots, facet) + validate_speckle.TOLERANCE for name in ("up", "shot")]
@@ -141,18 +138,16 @@ def compared(number):
         if method == "spectra" and several:
             draws = 200
         slack = [max(SLACK, law[1]) if method == "probabilities" else SLACK] * 2
-        above = NEIGHBOURS if method == "spectra" and shots.detection == "peak_bin" else 0.0
-        compare(f"grid by {method}", shares_of_grid(p, method, draws, number), draws, slack, above)
+        compare(f"grid by {method}", shares_of_grid(p, method, draws, number), draws, slack)
         flights[method] = shares_of_flight(p, method, draws)
-        compare(f"flight by {method}", flights[method], draws, slack, above)
+        compare(f"flight by {method}", flights[method], draws, slack)
     one = flights["probabilities"]
     for method, shares in flights.items():
         draws = DRAWS if method == "noise" else 200 if several else SPECTRA
-        above = NEIGHBOURS if method == "spectra" and shots.detection == "peak_bin" else 0.0
         for name in FLAGS:
             likely = np.clip(one[name], 1e-3, 1 - 1e-3)
             sigma = math.sqrt(likely * (1 - likely) * (1 / draws + 1 / DRAWS))
-            if abs(shares[name] - one[name]) > SIGMAS * sigma + 0.02 + above:
+            if abs(shares[name] - one[name]) > SIGMAS * sigma + 0.02:
                 differing.append(f"{method} {name}: {shares[name]:.4f} for {one[name]:.4f}")
     return differing
 

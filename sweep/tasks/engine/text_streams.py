@@ -6,6 +6,7 @@ Words of a program must not end its computing: a stream that fails goes silent.
 from __future__ import annotations
 
 import io
+import logging
 import os
 import queue
 import sys
@@ -26,6 +27,9 @@ WRITER_IDLE_SECONDS_MAX = 5.0
 
 #: Texts that wait for such a reader; further ones are dropped.
 WAITING_TEXTS_MAX = 1000
+
+#: Loggers of Dask and of what it is made of, whose handlers write to standard error.
+DASK_LOGGERS = ("distributed", "tornado", "bokeh")
 
 
 class ForgivingStream(io.TextIOBase):
@@ -174,6 +178,30 @@ class PatientStream(ForgivingStream):
                 self._go_silent(error)
             finally:
                 self._waiting_texts.task_done()
+
+
+def make_dask_logs_patient() -> None:
+    """Let no log message of Dask in this process wait for a terminal that has stopped.
+
+    Dask logs from its event loops. One that waits answers neither workers nor clients.
+    """
+    streams: dict[int, PatientStream] = {}
+    for name, logger in [*logging.root.manager.loggerDict.items()]:
+        if name.partition(".")[0] not in DASK_LOGGERS or not isinstance(logger, logging.Logger):
+            continue
+        for handler in logger.handlers:
+            if not isinstance(handler, logging.StreamHandler):
+                continue
+            if isinstance(handler.stream, PatientStream):
+                continue
+            try:
+                descriptor = int(handler.stream.fileno())
+            except (AttributeError, OSError, ValueError, TypeError):
+                continue
+            if descriptor in STANDARD_DESCRIPTORS:
+                stream = streams.setdefault(descriptor, PatientStream(handler.stream))
+                # Not by setStream, which flushes the stream before.
+                handler.stream = stream
 
 
 def is_terminal(stream: Any) -> bool:

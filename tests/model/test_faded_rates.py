@@ -1,0 +1,124 @@
+"""Leakage in developed speckle: rates from a table, against direct sums over bins and powers."""
+
+import numpy as np
+import pytest
+
+from sweep.model import detection, leakage
+from sweep.model.crossings import MOST_TERMS, any_crossing, crossing_series, leave_out_joined
+from sweep.model.faded_rates import (
+    FINER_POWERS,
+    LOUDEST,
+    OCTAVES,
+    POWERS,
+    SPECKLE_POWERS,
+    add_rates,
+    faded_rates,
+)
+from sweep.model.marcum import excess_crossing, marcum_q1
+from sweep.model.spectrum import OUT, ROOM
+
+CERTAIN = 25.0
+"""Rate from which on only it matters that bins cross."""
+
+
+def table_of(level):
+    series = np.empty(MOST_TERMS)
+    crossing_series(level, series)
+    return faded_rates(level, series)
+
+
+def direct_rates(amplitude, level):
+    """Rates -ln(1 - c) of amplitudes, with the digits of the smaller of c and 1 - c."""
+    quiet = -np.expm1(-(level**2) / 2)
+    c = np.array([excess_crossing(a, level) for a in amplitude]) / quiet
+    stays = np.maximum(marcum_q1(amplitude, np.array(level)).p / quiet, 1e-300)
+    return np.where(c < 0.5, -np.log1p(-np.minimum(c, 0.9)), -np.log(stays))
+
+
+@pytest.mark.parametrize("level", [1.5, 4.0, 6.55, 9.0, 14.0, 35.0])
+def test_tabulated_rates_are_those_of_a_bin_at_each_speckle_power(level):
+    table = table_of(level)
+    for amplitude in np.exp(np.linspace(np.log(1e-4), np.log(level + 20), 300)):
+        sums = np.zeros(POWERS)
+        add_rates(amplitude**2, 1.0, table, sums)
+        told = sums * SPECKLE_POWERS
+        faded = amplitude * np.sqrt(SPECKLE_POWERS)
+        expected = direct_rates(faded, level)
+        sound = expected < CERTAIN
+        np.testing.assert_allclose(told[sound], expected[sound], rtol=2e-5, atol=1e-14)
+        assert (told[~sound] > 0.9 * CERTAIN).all()
+
+
+def run_at_random(seed, level):
+    """|X| / sigma of a run of bins with one or two echoes, and the bins exempt from alarms."""
+    rng = np.random.default_rng(seed)
+    k, peak = np.arange(70), np.exp(rng.uniform(np.log(level), np.log(400 * level)))
+    place, other = rng.uniform(15, 50), rng.uniform(15, 50)
+    signal = peak * np.exp(-(((k - place) / 1.1) ** 2))
+    signal += 0.5 * peak * np.exp(-(((k - other) / 1.1) ** 2)) * rng.integers(0, 2)
+    sidelobes = peak * 10 ** rng.uniform(-3.5, -1.5) / (1 + 0.2 * np.abs(k - place))
+    magnitude = np.hypot(signal, np.minimum(sidelobes, 0.9 * level) * rng.uniform(0.5, 1, k.size))
+    exempt = np.zeros(k.size, bool)
+    for i in np.flatnonzero(magnitude >= level):
+        exempt[max(i - 1, 0) : i + 2] = True
+    exempt[magnitude.argmax()] = True
+    return magnitude, exempt
+
+
+@pytest.mark.parametrize("seed", range(24))
+def test_mean_leakage_is_that_of_direct_sums_at_each_speckle_power(seed):
+    level, correlation = float([4.5, 6.55, 9.0][seed % 3]), [-0.5, 0.0, 0.6][seed % 2]
+    magnitude, exempt = run_at_random(seed, level)
+    room = np.zeros((ROOM, magnitude.size + 8))
+    room[OUT, : magnitude.size] = magnitude
+    told = leakage.of_fading_bins(
+        np.int64(magnitude.size), (1.0, level, 0.0, correlation), 0.0, room, exempt, table_of(level)
+    )
+
+    def log_rates(per_octave):
+        found = []
+        for k in range(per_octave * OCTAVES + 1):
+            root = np.sqrt(LOUDEST * 2.0 ** (-k / per_octave))
+            chances = np.where(exempt, 0.0, -np.expm1(-direct_rates(root * magnitude, level)))
+            brightest = any_crossing(chances, 0, chances.size)
+            noise = 1.0 / root, level / root
+            leave_out_joined(chances, 0, chances.size, magnitude, exempt, noise, correlation)
+            rate = -np.log1p(-min(any_crossing(chances, 0, chances.size), 1 - 1e-15))
+            found.append((np.log(max(rate, leakage.FAINTEST_RATE)), brightest))
+        return np.array([f[0] for f in found]), found[0][1]
+
+    of_octaves, brightest = log_rates(1)
+    per_octave = 1
+    if brightest > leakage.BRIGHTEST_MAX:
+        per_octave, (of_octaves, _) = FINER_POWERS, log_rates(FINER_POWERS)
+    expected = leakage.fading_mean(of_octaves, per_octave)
+    assert told == pytest.approx(expected, rel=5e-5, abs=1e-13)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_bins_that_are_left_out_of_an_echo_change_nothing(seed):
+    """The mean over the strongest mode, against its quadrature with all bins at all nodes."""
+    rng = np.random.default_rng(seed)
+    bins, echo = 9, np.ones(9, bool)
+    steady = np.zeros((4, bins))
+    peak = np.exp(rng.uniform(np.log(0.5), np.log(300.0)))
+    steady[0] = peak * np.exp(-(((np.arange(bins) - rng.uniform(3, 5)) / rng.uniform(0.7, 3)) ** 2))
+    steady[1] = rng.uniform(3.0, 9.0) * rng.uniform(0.7, 1.0, bins)
+    steady[2, 1:] = rng.uniform(-0.6, 0.6, bins - 1)
+    told = detection._mean_over_mode(steady, echo, 100, 0)
+
+    ratio = steady[1] / steady[0]
+    first = np.min(np.maximum(steady[1] - detection._REACH, 0.0) / steady[0])
+    last = min(np.min((steady[1] + detection._REACH) / steady[0]), detection._Z_MAX)
+    first, last = (min(v, detection._Z_MAX) for v in (first, last))
+    last = min(last, np.sqrt(min(ratio.min(), detection._Z_MAX) ** 2 + 10.0))
+    z = first + (last - first) * 0.5 * (detection._NODE + 1)
+    weight = 0.5 * (last - first) * detection._WEIGHT * 2 * z * np.exp(-z * z)
+    z, weight = np.append(0.6 * first, z), np.append(-np.expm1(-first * first), weight)
+    of_nodes = [detection._any_steady(steady, one, echo, 100, 0, np.inf, 0.0) for one in z]
+    found, missed = (weight * np.array(of_nodes).T).sum(axis=1)
+    found += np.exp(-last * last)
+    whole = found + missed
+    assert told[0] == pytest.approx(found / whole, rel=3e-5, abs=0)
+    assert told[1] == pytest.approx(missed / whole, rel=3e-5, abs=0)
+    assert told[0] == pytest.approx(found / whole, abs=3e-7)
