@@ -53,6 +53,17 @@ def one_line(text: object) -> str:
     return printable(str(text).replace("\n", "\\n").replace("\t", "\\t"))
 
 
+def counted(number: int, thing: str) -> str:
+    """Return a number of things.
+
+    Examples
+    --------
+    >>> counted(1, "shot"), counted(1200, "shot")
+    ('1 shot', '1,200 shots')
+    """
+    return f"{number:,} {thing}{'' if number == 1 else 's'}"
+
+
 class PrintableError(Exception):
     """Base of errors whose text quotes stores, specs and file names."""
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import re
 import unicodedata
+from collections.abc import Callable
 from dataclasses import dataclass
 from decimal import Decimal, localcontext
 from difflib import get_close_matches
@@ -136,12 +137,16 @@ class Unit:
 
 
 def read_number(
-    written: object, about: str = "", *, is_power_ratio: bool = False
+    written: object,
+    about: str = "",
+    *,
+    is_power_ratio: bool = False,
+    is_valid: Callable[[Fraction], bool] = lambda number: True,
 ) -> tuple[Fraction, Unit]:
     """Exact value and unit of a pure number: ``0.1``, ``"1e9"``, ``"2^17"`` or ``"10 %"``.
 
     A ratio of powers may be in decibels, ``"-3 dB"``. A `QuantityError` for any other unit says
-    what the number is `about`.
+    what the number is `about`, and suggests numbers that are `is_valid` only.
     """
     value, unit = _split(written, "must be a number")
     if unit in ("%", "percent"):
@@ -150,24 +155,39 @@ def read_number(
         return value, Unit(DECIBEL)
     if unit:
         what = f": {about}" if about else ""
-        raise QuantityError(f"is a pure number and takes no unit{what}", _without_unit(value, unit))
+        remedy = _without_unit(value, unit, is_valid)
+        raise QuantityError(f"is a pure number and takes no unit{what}", remedy)
     return value, Unit("")
 
 
-def _without_unit(value: Fraction, unit: str) -> str:
-    """Suggestion of the pure number that a number with a unit may mean, if that is clear."""
+def _without_unit(value: Fraction, unit: str, is_valid: Callable[[Fraction], bool]) -> str:
+    """Suggestion of the pure number that a number with a unit may mean, if that is clear.
+
+    Empty where no such number `is_valid`.
+    """
     if unit == DECIBEL:
-        powers, amplitudes = _show(_ratio(value)), _show(_ratio(value / 2))
-        if powers == amplitudes:
-            return f"write {powers}"
-        return f"write {powers} for a ratio of powers, {amplitudes} for one of amplitudes"
+        ratios = {"powers": _ratio(value), "amplitudes": _ratio(value / 2)}
+        shown = {kind: _show(ratio) for kind, ratio in ratios.items() if is_valid(ratio)}
+        if len(set(shown.values())) == 1:
+            return f"write {next(iter(shown.values()))}"
+        if not shown:
+            return ""
+        return "write {powers} for a ratio of powers, {amplitudes} for one of amplitudes".format(
+            **shown
+        )
+    if unit in LOGARITHMIC:
+        return ""
     if unit in _PREFIXED["rad"].split():
         angle = read_unit(unit, si_unit="rad", example="1 deg").to_si(value)
-        return f"write {math.tan(angle):.4g}, the tangent of that angle, if a slope is meant"
+        slope = math.tan(angle)
+        if not is_valid(Fraction(slope)):
+            return ""
+        return f"write {slope:.4g}, the tangent of that angle, if a slope is meant"
     if quotient := re.fullmatch(r"/\s*(\d+)", unit):
         divisor = int(quotient[1])
-        return f"write {_show(value / divisor)}" if divisor else ""
-    return f"write {_show(value)}" if unit.isalpha() else ""
+        is_clear = divisor and is_valid(value / divisor)
+        return f"write {_show(value / divisor)}" if is_clear else ""
+    return f"write {_show(value)}" if unit.isalpha() and is_valid(value) else ""
 
 
 def read_quantity(written: object, *, si_unit: str, example: str) -> tuple[Fraction, Unit]:

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from sweep.messages import counted as counted
+
 LONG_RANGE = 1000.0
 """Median of distances [m] from which on they are shown in km."""
 
@@ -63,11 +65,6 @@ def number(value: float) -> str:
     if value >= 1024 and value == int(value) and int(value).bit_count() == 1:
         return f"2^{int(math.log2(value))}"
     return f"{value:.6g}"
-
-
-def counted(number: int, thing: str) -> str:
-    """Return a number of things: ``1 shot``, ``1,200 shots``."""
-    return f"{number:,} {thing}{'' if number == 1 else 's'}"
 
 
 def coordinate(name: str) -> str:

@@ -19,7 +19,7 @@ from sweep.cli.terminal import (
     tell,
     tell_accuracy,
 )
-from sweep.messages import command_line, one_line
+from sweep.messages import command_line, counted, one_line
 from sweep.storage.locations import Location, beside, files_below
 
 if TYPE_CHECKING:
@@ -39,17 +39,18 @@ def status(store: Location) -> None:
 
     For a study with draws, a table has the number of points within accuracy.tolerance.
     """
-    from sweep.analysis.labels import counted
     from sweep.tasks.progress import amount, duration
     from sweep.tasks.summary import status as read
 
     s = read(store)
     left = duration(s.left) if s.rate else "unknown"
     click.echo(f"{one_line(s.title or store)}\nstudy {one_line(s.study_id)}")
+    drawn = f", {counted(s.draws_done, 'draw')}" if s.draws_done else ""
     tell(
-        f"{s.points_done:,} of {s.points:,} {s.unit}, {s.blocks_done:,} of {s.blocks:,} blocks"
+        f"{s.points_done:,} of {s.points:,} {s.unit}, {s.blocks_done:,} of "
+        f"{counted(s.blocks, 'block')}"
         f"{f', {amount(s.points_begun)} more begun' if s.points_begun else ''}"
-        f"{f', {s.draws_done:,} draws' if s.draws_done else ''}, {decimal(s.bytes)} stored"
+        f"{drawn}, {decimal(s.bytes)} stored"
     )
     if s.rate:
         rate = f"{float(f'{s.rate:.3g}'):,.12g} {s.unit}/s"
@@ -153,7 +154,7 @@ def finalize(store: Location, output: Location | None) -> None:
 
     made = pack(store, output or store.with_name(f"{store.name.removesuffix('.zarr')}_final.zarr"))
     files = files_below(made)
-    click.echo(f"{shown(made)}: {len(files):,} files, {decimal(sum(files.values()))}")
+    click.echo(f"{shown(made)}: {counted(len(files), 'file')}, {decimal(sum(files.values()))}")
 
 
 def _tell(report: Report) -> None:
@@ -173,7 +174,10 @@ def _tell(report: Report) -> None:
             f"{more if len(report.foreign) > MOST_LISTED else ''}"
         )
     if report.blocks:
-        tell(f"{store}: {report.whole:,} of {report.blocks:,} blocks committed and undamaged")
+        tell(
+            f"{store}: {report.whole:,} of {counted(report.blocks, 'block')} committed "
+            "and undamaged"
+        )
 
 
 def _say_what_to_do(store: Location, reports: list[Report]) -> None:

@@ -16,7 +16,7 @@ import click
 from click.shell_completion import CompletionItem
 from rich.filesize import decimal
 
-from sweep.messages import INCOMPLETE, MISTAKE, command_line, one_line, printable
+from sweep.messages import INCOMPLETE, MISTAKE, command_line, counted, one_line, printable
 from sweep.storage.locations import Location, located
 from sweep.tasks.streams import is_terminal
 from sweep.units import number_text, percent
@@ -272,11 +272,11 @@ def conclude(outcome: Outcome, store: Location) -> None:
         except Exception as error:  # the study is computed all the same
             tell(f"no table of the results: {_described(error)}", err=True)
     for scanner, rays in outcome.rays.items():
-        told = f"{rays:,} rays cast" if rays else "eyepoints were there, no ray cast"
+        told = f"{counted(rays, 'ray')} cast" if rays else "eyepoints were there, no ray cast"
         click.echo(f"{scanner}: {told}")
     tell(
         f"{store}: {outcome.points_done:,} of {outcome.points:,} {outcome.unit}, "
-        f"computed {outcome.blocks_computed:,} of {outcome.blocks:,} blocks "
+        f"computed {outcome.blocks_computed:,} of {counted(outcome.blocks, 'block')} "
         f"in {duration(outcome.seconds)}"
     )
     if outcome.complete:
@@ -289,7 +289,7 @@ def conclude(outcome: Outcome, store: Location) -> None:
     left = outcome.blocks - outcome.blocks_done
     failed = len(outcome.failures) + outcome.left_out
     why = outcome.stopped or f"{failed:,} failed; {command_line('status', store)}  tells why"
-    click.echo(f"Incomplete, {left:,} of {outcome.blocks:,} blocks left: {why}.", err=True)
+    click.echo(f"Incomplete, {left:,} of {counted(outcome.blocks, 'block')} left: {why}.", err=True)
     if left > failed:
         click.echo(f"{command_line('resume', store)}  goes on.", err=True)
     if failed:
@@ -517,7 +517,7 @@ def plan_lines(
     else:
         yield from _scene_lines(study, p)
         yield "blocks", f"{p.blocks:,}"
-    yield "chunks", f"{p.chunks:,} files"
+    yield "chunks", counted(p.chunks, "file")
     yield "bytes", f"{decimal(p.bytes)} before compression"
     if why := unchecked_beamlets(study):
         yield "not checked", why
@@ -527,7 +527,7 @@ def plan_lines(
     if RunOptions(workers=workers).place(study) is None:
         yield "time", f"{bound} {duration(p.work)}, at once, without workers"
     else:
-        yield "time", f"{bound} {duration(p.seconds)} on {p.workers} workers"
+        yield "time", f"{bound} {duration(p.seconds)} on {counted(p.workers, 'worker')}"
     yield "memory", f"about {decimal(p.worker_memory)} a worker"
     if why := _excess(p.points, p.bytes, p.work):
         yield "question", f"sweep run asks first, or takes --yes: {why}"
@@ -545,9 +545,9 @@ def _scene_lines(study: SceneSpec, plan: Plan) -> Iterator[tuple[str, str]]:
         rays, most = int(parameters[BEAMLETS]), Accuracy.of(parameters).rays[-1]
         yield "beamlets", f"{rays:,} a shot, more where it needs them, at most {most:,}"
     for s in plan.scanners:
-        yield s.name, f"{s.cycles:,} cycles, {s.shots:,} shots, " + (
+        yield s.name, f"{counted(s.cycles, 'cycle')}, {counted(s.shots, 'shot')}, " + (
             "eyepoints are there already" if s.is_cast
-            else f"{s.rays:,} rays at {1e6 * s.seconds_a_ray:.3g} us on one core"
+            else f"{counted(s.rays, 'ray')} at {1e6 * s.seconds_a_ray:.3g} us on one core"
         )  # fmt: skip
         yield "", f"{1e6 * s.seconds_a_draw:,.0f} us a shot and draw on one core"
     seen = coverage(study)

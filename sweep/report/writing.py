@@ -24,6 +24,7 @@ from sweep.analysis.scenes.recording import INTERPOLATED, QUANTITIES, shown
 from sweep.analysis.selection import known
 from sweep.analysis.tables import Page as TablePage
 from sweep.analysis.tables import outputs_page
+from sweep.messages import command_line
 from sweep.model.effects.catalogue import EFFECTS
 from sweep.report import detector, flights
 from sweep.report.flights import Seen
@@ -457,7 +458,13 @@ def _reproduction(attributes: Mapping[Any, Any], spec: Declared, store: str) -> 
         f"  note = {{{identity}}},\n" + (f"  year = {{{year}}},\n" if year else "") + "}"
     )
     text = yaml.safe_dump(spec.to_yaml_mapping(), sort_keys=False, allow_unicode=True, width=100)
-    commands = f"sweep run study.yaml --store {store}\nsweep figures {store}\nsweep report {store}"
+    commands = "\n".join(
+        [
+            command_line("run", "study.yaml", store=store),
+            command_line("figures", store),
+            command_line("report", store),
+        ]
+    )
     versions = ", ".join(f"{name} {number}" for name, number in software.items())
     words = [
         f"Made with {versions}, on a processor {attributes['processor']}. The same spec, seed and "

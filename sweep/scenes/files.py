@@ -15,7 +15,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from sweep.messages import PrintableError
+from sweep.messages import PrintableError, counted
 from sweep.model.geometry.quaternion import from_heading
 from sweep.units import QuantityError, read_unit
 
@@ -346,7 +346,10 @@ def _row(path: Path, line: Line, names: Sequence[str]) -> list[float]:
     """Numbers of a line, in the order of the columns' names."""
     number, cells = line
     if len(cells) != len(names):
-        rule = f"has {len(cells)} cells under {len(names)} columns on line {number}"
+        rule = (
+            f"has {counted(len(cells), 'cell')} under {counted(len(names), 'column')} "
+            f"on line {number}"
+        )
         raise SceneError(path, rule, "fill or cut the line")
     values = [_finite_number(cell) for cell in cells]
     if None in values:
@@ -380,6 +383,14 @@ def _attitude(path: Path, table: Mapping[str, np.ndarray]) -> np.ndarray | None:
         raise SceneError(path, "has part of a quaternion", "give qw, qx, qy and qz")
     q = np.column_stack([table[name] for name in _QUATERNION])
     length = np.linalg.norm(q, axis=1)
-    if not (np.abs(length - 1) < 1e-3).all():
-        raise SceneError(path, "has quaternions of a length other than 1", "divide them by it")
+    if (wrong := np.flatnonzero(~(np.abs(length - 1) < 1e-3))).size:
+        numbers = [line for line, _ in _lines(path)[1:]]
+        raise _joined(path, [_unfit_quaternion(path, numbers[row], length[row]) for row in wrong])
     return np.asarray(q / length[:, None])
+
+
+def _unfit_quaternion(path: Path, line: int, length: float) -> SceneError:
+    """Refusal of a quaternion whose length is not 1."""
+    rule = f"has a quaternion of the length {length:.6g} on line {line}, which has to be 1"
+    remedy = "divide it by its length" if length > 0 else "write 1, 0, 0, 0 for no turn"
+    return SceneError(path, rule, remedy)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sweep.messages import counted
 from sweep.scenes.files import SceneError
 
 HEIGHT_MAX = 1e6
@@ -53,7 +54,8 @@ def without_data(path: Path, values: np.ndarray, no_data: float | None) -> tuple
     if far.any():
         place = float(values[far][0])
         rule = (
-            f"holds the height {place:g} at {int(far.sum()):,} cells, farther than {HEIGHT_MAX:g}"
+            f"holds the height {place:g} at {counted(int(far.sum()), 'cell')}, "
+            f"farther than {HEIGHT_MAX:g}"
         )
         raise SceneError(path, rule, f"if they have no data, state 'no_data: {_shortest(place)}'")
     return tuple(_doubts(path, values))
@@ -93,8 +95,9 @@ def _doubts(path: Path, values: np.ndarray) -> list[str]:
                 is_doubtful = count >= _SHARED_CELLS and gap > _GAP * span > 0
             if is_doubtful:
                 warnings.append(
-                    f"{path}: the value {value:g} stands in {count:,} cells, {gap:.4g} from the "
-                    f"next: if it means that there is no data, state 'no_data: {_shortest(value)}'"
+                    f"{path}: the value {value:g} stands in {counted(count, 'cell')}, "
+                    f"{gap:.4g} from the next: if it means that there is no data, "
+                    f"state 'no_data: {_shortest(value)}'"
                 )
                 low, high = (value, high) if value == least else (low, value)
                 break
@@ -123,6 +126,6 @@ def cliff_warnings(path: Path, heights: np.ndarray, spacing: tuple[float, float]
         return []
     return [
         f"{path}: neighbouring cells differ by up to {highest:.4g} m over {width:.3g} m, at "
-        f"{number:,} places: if the ground has no such cliffs, a value stands for missing "
+        f"{counted(number, 'place')}: if the ground has no such cliffs, a value stands for missing "
         "heights there: state it as no_data, or mend the file"
     ]

@@ -287,7 +287,9 @@ class Numeric(Rule):
             raise QuantityError(rule, "leave it out")
         try:
             about = _first_clause(self.about)
-            return read_number(written, about, is_power_ratio=self.is_power_ratio)
+            return read_number(
+                written, about, is_power_ratio=self.is_power_ratio, is_valid=self._is_valid
+            )
         except QuantityError as error:
             if not self.word:
                 raise
@@ -305,6 +307,15 @@ class Numeric(Rule):
                 text = written if isinstance(written, str) else ""
                 remedy = near_miss(text, [self.word], otherwise=f"{remedy} or '{self.word}'")
             raise QuantityError(error.rule, remedy) from None
+
+    def _is_valid(self, number: Fraction) -> bool:
+        """Tell whether a pure number fits the field."""
+        if self.whole and number.denominator != 1:
+            return False
+        try:
+            return self.first_outside(np.array([Unit("").to_si(number)])) is None
+        except QuantityError:  # more than a float holds
+            return False
 
     def _number(self, written: object) -> float | int:
         number, unit = self.exact(written)

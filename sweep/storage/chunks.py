@@ -20,6 +20,7 @@ from zarr.abc.store import OffsetByteRequest, RangeByteRequest, SuffixByteReques
 from zarr.core.buffer import default_buffer_prototype
 from zarr.storage import LocalStore, ObjectStore
 
+from sweep.messages import suggestion
 from sweep.plain_files import UnfitFileError, read_below, refuse_larger
 
 #: Bytes of the document of a group or an array at most.
@@ -206,7 +207,7 @@ class CheckedFiles(LocalStore):
         except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
             return None
         except UnfitFileError as error:
-            remedy = f"{error.strerror}: `sweep verify {self.root}` names what is damaged"
+            remedy = f"{error.strerror}: {suggestion('verify', self.root)} names what is damaged"
             raise UnfitFileError(error.errno, remedy, error.filename) from None
         return content
 

@@ -80,6 +80,9 @@ Tag = Any
 Item = TypeVar("Item")
 Found = TypeVar("Found")
 
+#: Words of the library for a body that is cut, and for a list that is.
+_CUT = ("body error", "invalid list response")
+
 _clients: dict[str, Any] = {}
 _opening = threading.RLock()
 
@@ -133,7 +136,8 @@ class ObjectPath:
             if self.root not in _clients:
                 with in_words(self):
                     if not self.root.startswith("memory:"):
-                        _client(self.root, FIRST_RETRIES).list_with_delimiter(self.key or None)
+                        first = _client(self.root, FIRST_RETRIES)
+                        _ask_twice(lambda: first.list_with_delimiter(self.key or None))
                     _clients[self.root] = _client(self.root, RETRIES)
             return _clients[self.root]
 
@@ -184,14 +188,25 @@ class ObjectPath:
 
     def below(self) -> Iterator[tuple[str, int]]:
         """Keys under this one, relative to it, and their sizes, a page in memory at a time."""
+        from obstore.exceptions import BaseError
+
+        last, is_repeated = None, False
         with in_words(self):
-            for page in self.client.list(self.key or None):
-                for found in page:
-                    yield found["path"][len(self.key) :].lstrip("/"), found["size"]
+            while True:
+                try:
+                    for page in self.client.list(self.key or None, offset=last):
+                        for found in page:
+                            yield found["path"][len(self.key) :].lstrip("/"), found["size"]
+                            last, is_repeated = found["path"], False
+                    return
+                except BaseError as error:
+                    if is_repeated or not _is_cut(error):
+                        raise
+                    is_repeated = True  # the list goes on after the last key that came
 
     def _children(self) -> list[str]:
         with in_words(self):
-            found = self.client.list_with_delimiter(self.key or None)
+            found = _ask_twice(lambda: self.client.list_with_delimiter(self.key or None))
         paths = [*found["common_prefixes"], *(one["path"] for one in found["objects"])]
         return sorted(path.rpartition("/")[2] for path in paths)
 
@@ -205,10 +220,22 @@ class ObjectPath:
 
     def read_tagged(self) -> tuple[bytes, Tag] | None:
         """Return the object and the tag of what it holds; None where there is none."""
+
+        def ask() -> tuple[bytes, Tag]:
+            answer = self.client.get(self.key)
+            return bytes(answer.bytes()), _tag(answer.meta)
+
         with in_words(self), suppress(FileNotFoundError):
-            found = self.client.get(self.key)
-            return bytes(found.bytes()), _tag(found.meta)
+            return _ask_twice(ask)
         return None
+
+    def refuse_cut(self, content: bytes) -> None:
+        """Raise ObjectStoreError if an answer with this content lacks a part of the object.
+
+        A proxy may announce the part of a body that it has as the whole of it.
+        """
+        if len(content) < self.size():
+            raise ObjectStoreError(errno.EIO, _cut_in_words(self.root), str(self))
 
     def put_if(self, content: bytes, tag: Tag | None) -> Tag | None:
         """Put an object if none is there, or only what has a tag; None if somebody was quicker."""
@@ -219,6 +246,23 @@ class ObjectPath:
         with in_words(self), suppress(*quicker):
             return _tag(self.client.put(self.key, content, mode=mode))
         return None
+
+
+def _ask_twice(ask: Callable[[], Found]) -> Found:
+    """Return what an object store answers, asked once more where the answer is cut."""
+    from obstore.exceptions import BaseError
+
+    try:
+        return ask()
+    except BaseError as error:
+        if not _is_cut(error):
+            raise
+        return ask()
+
+
+def _is_cut(error: Exception) -> bool:
+    """Tell whether the body of an answer, or the document of a list in it, was cut short."""
+    return any(words in str(error) for words in _CUT)
 
 
 def _tag(found: Any) -> Tag:
@@ -233,6 +277,14 @@ def _client(root: str, retries: Any) -> Any:
     allowed = os.environ.get("AWS_ALLOW_HTTP", "").lower() in ("1", "true", "yes")
     options: Any = {**CLIENT, "allow_http": allowed or _endpoint().startswith("http:")}
     return from_url(root, client_options=options, retry_config=retries)
+
+
+def _cut_in_words(root: str) -> str:
+    return f"{_service(root)} cuts its answers short: try again, or look at the network"
+
+
+def _service(root: str) -> str:
+    return _endpoint() or f"the service of {root.split(':')[0]}://"
 
 
 def _endpoint() -> str:
@@ -263,7 +315,7 @@ def worded(error: Exception) -> Exception:
 
 def explained(text: str, root: str) -> tuple[int, str]:
     """Return the number and words of what an object store's library says, of a kind and bucket."""
-    bucket, at = root.partition("://")[2], _endpoint() or f"the service of {root.split(':')[0]}://"
+    bucket, at = root.partition("://")[2], _service(root)
     said = text.partition("\n\nDebug source")[0]
     status = re.search(r"status code: (\d+ [A-Za-z ]+)|\b([45]\d\d [A-Z][a-z ]+)", said)
     answer = (status[1] or status[2]).strip() if status else ""
@@ -285,8 +337,8 @@ def explained(text: str, root: str) -> tuple[int, str]:
         )
     if "imed out" in text or "Timeout" in text:
         return errno.ETIMEDOUT, f"{at} does not answer in time: try again, or look at the network"
-    if "body error" in text:
-        return errno.EIO, f"{at} cuts its answers short: try again, or look at the network"
+    if any(words in text for words in _CUT):
+        return errno.EIO, _cut_in_words(root)
     if "error sending request" in text or "onnect" in said:
         return errno.ECONNREFUSED, (
             f"{at} can't be reached: is it up, and are AWS_ENDPOINT_URL and the network right?"

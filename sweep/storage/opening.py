@@ -656,8 +656,12 @@ def _contents(path: ObjectPath, names: list[str]) -> Iterator[tuple[str, bytes]]
 
 def _whole_lines(segment: ObjectPath) -> bytes:
     """Read an object of a log; once more where its last line is cut, as an answer may have been."""
-    content = segment.read_bytes()
-    return content if content.endswith(b"\n") else segment.read_bytes()
+    for _ in range(2):
+        content = segment.read_bytes()
+        if content.endswith(b"\n"):
+            return content
+    segment.refuse_cut(content)  # else lines would count as damaged that are not
+    return content
 
 
 def raw_lines(path: Location) -> Iterator[bytes]:
@@ -665,7 +669,7 @@ def raw_lines(path: Location) -> Iterator[bytes]:
     if isinstance(path, ObjectPath):
         names = segments(path)
         if not names and path.size() > 0:
-            yield from path.read_bytes().splitlines(keepends=True)
+            yield from _whole_lines(path).splitlines(keepends=True)
         for _, content in _contents(path, names):
             yield from content.splitlines(keepends=True)
     else:

@@ -21,8 +21,9 @@ import zarr
 from zarr.core.buffer import default_buffer_prototype
 from zarr.storage import StorePath, WrapperStore
 
+from sweep.messages import STORE, suggestion
 from sweep.storage import opening
-from sweep.storage.locations import JOURNAL, PACKED, Location, worded
+from sweep.storage.locations import JOURNAL, PACKED, Location, ObjectPath, in_words, worded
 from sweep.storage.opening import MANIFEST, read_document, read_lines, read_receipts
 
 #: Name of a chunk: its array, and its position in the grid of chunks.
@@ -160,7 +161,8 @@ class SoundStore(WrapperStore[Any]):
         """Return the bytes of a file, or of a part of it; DamagedChunkError for a damaged chunk."""
         prototype = prototype or default_buffer_prototype()
         try:
-            return await self._checked(key, prototype, byte_range)
+            with in_words(self._location):
+                return await self._checked(key, prototype, byte_range)
         except Exception:
             _failed_loops.add(asyncio.get_running_loop())
             raise
@@ -171,10 +173,12 @@ class SoundStore(WrapperStore[Any]):
         if not CHUNK.fullmatch(name) or not (what := self._damage(name, found, byte_range)):
             return found
         # Once more: the body of an answer may be cut, and another process may just have written it.
-        whole = await self._store.get(key, prototype)
+        whole = await self._fetch(key, prototype, None)
         if what := self._damage(name, whole, None):
+            if isinstance(self._location, ObjectPath) and whole is not None:
+                await asyncio.to_thread((self._location / name).refuse_cut, whole.to_bytes())
             raise DamagedChunkError(self._described(name, what))
-        return await self._store.get(key, prototype, byte_range)
+        return await self._fetch(key, prototype, byte_range)
 
     async def _fetch(self, key: str, prototype: Any, byte_range: Any) -> Any:
         """Return the bytes of a file, asked for twice where the body of the first answer is cut."""
@@ -218,15 +222,18 @@ class SoundStore(WrapperStore[Any]):
         block = owners.block(name)
         place = f"{path}: block {block}: {name}" if block >= 0 else f"{path}: {name}"
         if owners.is_packed:
-            remedy = f"`sweep verify {path}` names all that is damaged; copy the store anew"
+            remedy = f"{suggestion('verify', path)} names all that is damaged; copy the store anew"
         elif name in owners.template:
-            remedy = f"`sweep verify {path} --repair` puts it back"
+            remedy = f"{suggestion('verify', path, repair=True)} puts it back"
         elif owners.kind == "eyepoints":
-            remedy = "`sweep verify` and `sweep resume` of the study that uses them mend it"
+            remedy = (
+                f"{suggestion('verify', STORE)} and {suggestion('resume', STORE)} "
+                "of the study that uses them mend it"
+            )
         else:
             remedy = (
-                f"`sweep verify {path}` marks what is damaged, "
-                f"and `sweep resume {path}` computes it again"
+                f"{suggestion('verify', path)} marks what is damaged, "
+                f"and {suggestion('resume', path)} computes it again"
             )
         return f"{place} {what}: {remedy}"
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from sweep.messages import counted
 from sweep.scenes.files import SceneError
 from sweep.tasks.eyepoint_study import EyepointStudy, world_of
 
@@ -85,7 +86,7 @@ def refuse_blind(spec: SceneSpec) -> None:
     if any(scanner.seen for scanner in seen.scanners):
         return
     shots = sum(scanner.shots for scanner in seen.scanners)
-    rule = f"leads nowhere that a beam hits anything, of {shots:,} shots: {seen.extents()}"
+    rule = f"leads nowhere that a beam hits anything, of {counted(shots, 'shot')}: {seen.extents()}"
     remedy = (
         "give the path in the scene's coordinates, whose zero is the middle of scene.origin, or "
         "take 'origin: world' for those of the map; or turn the beams towards the scene"

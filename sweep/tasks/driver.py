@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from sweep.messages import option, suggestion
+from sweep.messages import counted, option, suggestion
 from sweep.spec import SceneSpec, Spec
 from sweep.storage.locations import (
     PACKED,
@@ -289,7 +289,7 @@ def _refuse_in_the_way(path: Location, study: GridStudy | FlightStudy) -> None:
         attributes, held = _held(path)
         refuse_other_study(path, attributes, held.spec, study.spec)
         done = int(np.count_nonzero(receipted(path, study)))
-        said = f"{path} holds this study already, {done} of {study.n_blocks} blocks done"
+        said = f"{path} holds this study already, {done} of {counted(study.n_blocks, 'block')} done"
         if done == study.n_blocks:
             what_next = f"{suggestion('status', path)} tells about it"
     elif new:

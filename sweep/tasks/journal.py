@@ -56,6 +56,7 @@ from sweep.storage.locations import (
     process_start,
     put_whole,
     read_object,
+    reason,
 )
 from sweep.storage.opening import (
     RECEIPTS,
@@ -449,7 +450,7 @@ _left: set[str] = set()
 """Tokens of locks that this process has given up, which a store out of reach may not know."""
 
 _warned: set[str] = set()
-"""Warnings about file systems that this process has given."""
+"""Kinds of warnings about locks that this process has given: a study may have many locks."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -605,6 +606,7 @@ class _FileClaim:
                     raise
                 _say_once(
                     say,
+                    "flock",
                     f"the file system of {self._path} has no flock ({error.strerror}): start no "
                     "two runs of one store within the same second",
                 )
@@ -638,15 +640,19 @@ class _FileClaim:
             why = error.strerror
         _say_once(
             say,
+            "links",
             f"the file system of {self._path} has no hard links ({why}): its lock is a file that "
             "is made if none is there, which not every file server does in one step",
         )
         opened = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
         try:
-            os.write(opened, text.encode())
-            os.fsync(opened)
-        finally:
-            os.close(opened)
+            with open(opened, "wb") as file:
+                file.write(text.encode())
+                file.flush()
+                os.fsync(opened)
+        except OSError:
+            self._path.unlink(missing_ok=True)  # part of a lock would look alive
+            raise
 
     def beat(self) -> None:
         """Say that the holder lives."""
@@ -666,9 +672,10 @@ def _text_of(path: Path) -> str | None:
         return file.read(LOCK_BYTES_MAX).decode("utf-8", "replace")
 
 
-def _say_once(say: Callable[[str], None], warning: str) -> None:
-    if warning not in _warned:
-        _warned.add(warning)
+def _say_once(say: Callable[[str], None], kind: str, warning: str) -> None:
+    """Give the first warning of a kind in this process."""
+    if kind not in _warned:
+        _warned.add(kind)
         say(f"warning: {warning}")
 
 
@@ -682,18 +689,31 @@ class _ObjectClaim:
 
     def read(self) -> str | None:
         """Text of its holder; None where nobody holds it."""
-        found = self._path.read_tagged()
+        found = self._read_tagged()
         return _first_line(found[0]) if found and found[0] else None
+
+    def _read_tagged(self) -> tuple[bytes, Tag] | None:
+        """Return the lock and its tag, read once more if cut; ObjectStoreError if cut twice.
+
+        Part of a lock would look like a stranger's.
+        """
+        for _ in range(2):
+            tagged = self._path.read_tagged()
+            if tagged is None or tagged[0].count(b"\n") == 2 or not tagged[0]:
+                return tagged
+        if tagged:
+            self._path.refuse_cut(tagged[0])
+        return tagged
 
     def mark(self) -> object:
         """Mark of the last heartbeat, another one after each."""
-        tagged = self._path.read_tagged()
+        tagged = self._read_tagged()
         return tagged and tagged[0]
 
     def take(self, text: str, judge: Callable[[], None], say: Callable[[str], None]) -> None:
         """Take it, unless `judge` raises."""
         for _ in range(TRIES):
-            found = self._path.read_tagged()
+            found = self._read_tagged()
             if found and _first_line(found[0]) == text:  # put, though its answer was lost
                 self._text, self._tag = text, found[1]
                 return
@@ -717,7 +737,7 @@ class _ObjectClaim:
         """Put something in the place of what was last put; of what is there, where that is ours."""
         tag = self._path.put_if(text.encode(), self._tag)
         if tag is None:
-            found = self._path.read_tagged()
+            found = self._read_tagged()
             if found and _first_line(found[0]) == self._text:
                 tag = self._path.put_if(text.encode(), found[1])
         if tag is not None:
@@ -771,7 +791,7 @@ class Lock:
     """
 
     def __init__(self, store_path: Location, say: Callable[[str], None] = warnings.warn) -> None:
-        self._store, self._claim = store_path, _claim(store_path)
+        self._store, self._claim, self._say = store_path, _claim(store_path), say
         self._me = Holder.myself()
         self._released = threading.Event()
         with told(f"{store_path} can't be locked"):
@@ -806,9 +826,20 @@ class Lock:
 
     def _beat(self) -> None:
         while not self._released.wait(HEARTBEAT):
-            with suppress(OSError):
+            try:
                 if self.is_mine():
                     self._claim.beat()
+            except FileNotFoundError:
+                pass  # the store was taken away
+            except OSError as error:
+                with suppress(Warning):  # that is to be an error: the next heartbeat may succeed
+                    _say_once(
+                        self._say,
+                        "heartbeat",
+                        f"the heartbeat of the lock of {self._store} can't be written "
+                        f"({reason(error, self._store)}): to other hosts this run looks dead after "
+                        f"{EXPIRY:g} s, so start none of this store there",
+                    )
 
     def is_mine(self) -> bool:
         """Tell whether the lock is still this driver's."""

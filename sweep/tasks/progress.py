@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import IO, TYPE_CHECKING, Any, cast
 
-from sweep.messages import PrintableError, printable
+from sweep.messages import PrintableError, counted, printable
 from sweep.plain_files import UnfitFileError
 from sweep.storage.opening import StoreError as StoreError
 from sweep.tasks.streams import PatientStream, is_terminal
@@ -200,7 +200,7 @@ class _Counting(Progress):
             "done": amount(self._done),
             "rate": f"{amount(self._rate)} {self._unit}/s" if self._rate > 0 else "",
             "work": self._work,
-            "failures": f"{self._failed} blocks failed" if self._failed else "",
+            "failures": f"{counted(self._failed, 'block')} failed" if self._failed else "",
         }
 
 

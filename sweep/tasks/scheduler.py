@@ -18,6 +18,7 @@ from dataclasses import dataclass, field, replace
 from itertools import chain, takewhile
 from typing import TYPE_CHECKING, Any
 
+from sweep.messages import counted, option_name
 from sweep.storage.opening import NotAStoreError
 from sweep.tasks.journal import Receipt
 from sweep.tasks.progress import SchedulerLost, StoreError, duration
@@ -47,6 +48,9 @@ LATENCY = 60.0
 
 #: Time without an answer after which a run is told to stall [s]; longer where tasks take longer.
 STALL_SECONDS = 60.0
+
+#: Time in which the first answer of a run may be that late, as workers compile the model [s].
+COMPILATION_SECONDS_MAX = 600.0
 
 #: Times that a task should take after which a run is told to stall.
 STALL_TASKS = 5.0
@@ -172,14 +176,16 @@ class Scheduler:
         now = time.monotonic()
         tasks = set(self._flying.values())
         lines = [
-            f"{self._blocks.left:,} blocks not yet sent, {len(self._blocks.failed):,} failed once, "
+            f"{counted(self._blocks.left, 'block')} not yet sent, "
+            f"{len(self._blocks.failed):,} failed once, "
             f"{len(self._unseen):,} written but not yet found in the store",
-            f"{len(tasks):,} tasks in flight, {len(self._outrun):,} superseded; "
-            f"{self._pace.blocks:,} blocks came back in {duration(self._pace.seconds)} of work",
+            f"{counted(len(tasks), 'task')} in flight, {len(self._outrun):,} superseded; "
+            f"{counted(self._pace.blocks, 'block')} came back in "
+            f"{duration(self._pace.seconds)} of work",
         ]
         lines += [
             f"task of block {task.blocks[0]} and {len(task.blocks) - 1} more: sent "
-            f"{duration(now - task.sent)} ago, {len(task.futures)} times; Dask says "
+            f"{duration(now - task.sent)} ago, {counted(len(task.futures), 'time')}; Dask says "
             f"{', '.join(sorted({str(future.status) for future in task.futures.values()}))}"
             for task in sorted(tasks, key=lambda task: task.sent)[:TASKS_SHOWN]
         ]
@@ -187,7 +193,9 @@ class Scheduler:
             answered = self._heard.get(worker)
             heard = "never" if answered is None else f"{duration(now - answered)} ago"
             excluded = ", left out" if worker in self._unfit else ""
-            lines.append(f"worker {worker}: {threads} threads, last answer {heard}{excluded}")
+            lines.append(
+                f"worker {worker}: {counted(threads, 'thread')}, last answer {heard}{excluded}"
+            )
         return "\n".join(lines)
 
     def _watch_for_stall(self) -> None:
@@ -197,11 +205,18 @@ class Scheduler:
         waited = time.monotonic() - self._stall_clock
         if waited < self._stall_patience:
             return
-        is_first = not self._stall_told
-        self._stall_patience, self._stall_told = 2 * waited, True
         summary = self.state_summary()
         _log.info("nothing came back for %s:\n%s", duration(waited), summary)
         told = f"no block has come back for {duration(waited)}"
+        if not self._heard and waited < COMPILATION_SECONDS_MAX:
+            self._stall_patience = min(2 * waited, COMPILATION_SECONDS_MAX)
+            self._say(
+                f"{told}: workers load the model, or compile it once, which takes minutes where "
+                "the machine is busy"
+            )
+            return
+        is_first = not self._stall_told
+        self._stall_patience, self._stall_told = 2 * waited, True
         self._say(f"{told}:\n{textwrap.indent(summary, '  ')}" if is_first else told)
 
     def _fit(self) -> list[str]:
@@ -396,7 +411,7 @@ def _failed(error: BaseException, blocks: list[int]) -> Answer:
         number = error.allowed_failures + 1
         why = (
             f"KilledWorker: {number} worker{'s' if number > 1 else ''} died at it: "
-            "out of memory, stuck beyond --block-timeout, or killed"
+            f"out of memory, stuck beyond {option_name('block_timeout')}, or killed"
         )
         failures = [replace(each, error=why) for each in failures]
     return Answer(failures=failures)

@@ -502,6 +502,7 @@ class Session:
         before = self._study.points_in(done) + self._committed["points"]
         with ExitStack() as stack:
             try:
+                self._interrupts.is_computing = True  # a start loses nothing either
                 compiling = threading.Thread(target=self._compile, daemon=True)
                 what = "loading the model" + ("" if self._pool.is_plain else ", reaching workers")
                 with working(what, self._told):
@@ -516,7 +517,6 @@ class Session:
                     unit=self._study.unit,
                 )
                 stack.callback(self._told.end)
-                self._interrupts.is_computing = True
                 return self._take(answers, blocks)
             except SchedulerLost as error:
                 return f"the scheduler is gone ({error})"

@@ -38,6 +38,7 @@ from sweep.storage.locations import (
     JOURNAL,
     Location,
     ObjectPath,
+    ObjectStoreError,
     discard,
     draft,
     each,
@@ -433,13 +434,18 @@ def refuse_damaged(path: Location) -> None:
 
 
 def wrong_with(damage: Callable[[], str]) -> str:
-    """Damage of an object in words, as a function says that reads it; empty if there is none."""
+    """Damage of an object in words, as a function says that reads it; empty if there is none.
+
+    ObjectStoreError where an object store does not give it.
+    """
     try:
         return damage()
     except (FileNotFoundError, NotADirectoryError):
         return "is missing"
     except UnfitFileError as error:
         return str(error.strerror)
+    except ObjectStoreError:
+        raise  # its service's fault, of which the object says nothing
     except OSError as error:
         return f"can't be read: {error.strerror}"
 
@@ -503,7 +509,7 @@ def refuse_foreign_files(path: Location) -> None:
         listed = ", ".join(names[:MOST_NAMED]) + (", ..." if len(names) > MOST_NAMED else "")
         raise StoreError(
             f"{path} has files in it that are not sweep's ({listed}): move them elsewhere, as "
-            "--overwrite replaces the whole folder"
+            f"{option('overwrite')} replaces the whole folder"
         )
 
 

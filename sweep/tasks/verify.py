@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import zarr
 
-from sweep.messages import suggestion
+from sweep.messages import counted, suggestion
 from sweep.storage import opening
 from sweep.storage.foreign import foreign_names
 from sweep.storage.locations import (
@@ -223,7 +223,13 @@ def _of_block(path: Location, study: Study, block: int, known: bytes) -> list[Da
     for name in objects:
         if what := wrong_with(partial(_of_chunk, path, name, bytes_max(name))):
             found.append(Damage(name, what, block))
-    count = f"one of its {len(objects)} chunks"
+    if (
+        not found
+        and isinstance(path, ObjectPath)
+        and has_digest(path, objects, known.decode(), bytes_max)
+    ):
+        return []  # answers were cut before
+    count = f"one of its {counted(len(objects), 'chunk')}"
     return found or [Damage(count, "is whole but not the one that was committed", block)]
 
 
@@ -231,7 +237,9 @@ def _of_chunk(path: Location, name: str, bytes_max: int) -> str:
     """Damage of a chunk in words; read once more from an object store, as an answer may be cut."""
     what = chunk_damage(read_object(path, name, bytes_max))
     if what and isinstance(path, ObjectPath):
-        return chunk_damage(read_object(path, name, bytes_max))
+        content = read_object(path, name, bytes_max)
+        if what := chunk_damage(content):
+            (path / name).refuse_cut(content)
     return what
 
 
@@ -327,7 +335,11 @@ def pack(
     attributes, study = studies.read(path)
     left = study.n_blocks - int(np.count_nonzero(committed(path, study)))
     if attributes.get(PACKED) or left:
-        why = "is packed already" if attributes.get(PACKED) else f"lacks {left:,} blocks: resume it"
+        why = (
+            "is packed already"
+            if attributes.get(PACKED)
+            else f"lacks {counted(left, 'block')}: resume it"
+        )
         raise StoreError(f"{path} {why}")
     if not is_free(output):
         raise StoreError(f"{output} is there already: name another place")

@@ -4,6 +4,7 @@ import pickle
 import shutil
 import subprocess
 import sys
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -13,6 +14,8 @@ from small_flights import small_scene
 
 import sweep
 from sweep.cli import main
+from sweep.messages import as_command
+from sweep.plain_files import UnfitFileError
 from sweep.report import writing
 from sweep.storage.locations import eyepoints_path, located
 from sweep.storage.sound import ChunkOwners, DamagedChunkError, open_arrays, readable
@@ -75,10 +78,30 @@ def test_a_damaged_chunk_is_told_as_it_is_read(copy, damage):
     with pytest.raises(DamagedChunkError) as raised:
         dataset.pd_shot.compute()
     assert str(raised.value) == (
-        f"{copy}: block 0: pd_shot/c/0/0/0 {words}: `sweep verify {copy}` marks what is damaged, "
-        f"and `sweep resume {copy}` computes it again"
+        f"{copy}: block 0: pd_shot/c/0/0/0 {words}: `sweep.verify('{copy}')` marks what is "
+        f"damaged, and `sweep.resume('{copy}')` computes it again"
     )
     assert np.isfinite(dataset.pd_up.compute()).all()
+
+
+@pytest.mark.parametrize("as_what", ["command", "program"])
+def test_remedies_are_quoted_as_they_are_to_be_typed(grid, tmp_path, as_what):
+    copy = shutil.copytree(grid, tmp_path / "q p" / "grid.zarr")
+    flip(copy / "pd_shot/c/0/0/0")
+    (copy / "pd_up/c/0/0/0").write_bytes(bytes(10**6))  # larger than it can be
+    dataset = sweep.open(copy)
+    with as_command() if as_what == "command" else nullcontext():
+        with pytest.raises(DamagedChunkError) as damaged:
+            dataset.pd_shot.compute()
+        with pytest.raises(UnfitFileError) as unfit:
+            dataset.pd_up.compute()
+    if as_what == "command":
+        verify, resume = f"`sweep verify '{copy}'`", f"`sweep resume '{copy}'`"
+    else:
+        verify, resume = f"`sweep.verify('{copy}')`", f"`sweep.resume('{copy}')`"
+    assert f"{verify} marks what is damaged" in str(damaged.value)
+    assert f"{resume} computes it again" in str(damaged.value)
+    assert f"{verify} names what is damaged" in str(unfit.value)
 
 
 COMMANDS = [
@@ -95,7 +118,7 @@ def test_commands_tell_of_a_damaged_chunk_in_words(copy, command, damage):
     done = CliRunner().invoke(main, [word.format(copy) for word in command])
     assert done.exit_code == 2, done.output
     if (command[0], damage) == ("finalize", "missing"):
-        assert "lacks 1 blocks: resume it" in done.output  # it counts chunks before it copies
+        assert "lacks 1 block: resume it" in done.output  # it counts chunks before it copies
     else:
         assert "block 1: pd_" in done.output and f"/c/0/1/0 {words}: `sweep ver" in done.output
     assert "Traceback" not in done.output
@@ -185,6 +208,7 @@ def test_a_store_that_is_opened_goes_to_other_processes(grid):
 
 READER = """
 import sys
+from contextlib import nullcontext
 import sweep
 from sweep.storage.opening import ReplacedError
 from sweep.storage.sound import DamagedChunkError
