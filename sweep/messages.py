@@ -29,7 +29,7 @@ def escape_unprintable(text: str) -> str:
 
     Examples
     --------
-    >>> print(printable("lidar\x1b[2J\u202egnp.exe"))
+    >>> print(escape_unprintable("lidar\x1b[2J\u202egnp.exe"))
     lidar\x1b[2J\u202egnp.exe
     """
     return _UNPRINTABLE.sub(_escape_character, text.replace("\r\n", "\n"))
@@ -47,10 +47,21 @@ def escape_to_one_line(text: object) -> str:
 
     Examples
     --------
-    >>> print(one_line("node1\ncomplete"))
+    >>> print(escape_to_one_line("node1\ncomplete"))
     node1\ncomplete
     """
     return escape_unprintable(str(text).replace("\n", "\\n").replace("\t", "\\t"))
+
+
+def counted(number: int, thing: str) -> str:
+    """Return a number of things.
+
+    Examples
+    --------
+    >>> counted(1, "shot"), counted(1200, "shot")
+    ('1 shot', '1,200 shots')
+    """
+    return f"{number:,} {thing}{'' if number == 1 else 's'}"
 
 
 class PrintableError(Exception):
@@ -126,7 +137,7 @@ def shell_command(name: str, *arguments: object, **options: object) -> str:
 
     Examples
     --------
-    >>> command_line("verify", "results/my lidar.zarr", repair=True)
+    >>> shell_command("verify", "results/my lidar.zarr", repair=True)
     "sweep verify 'results/my lidar.zarr' --repair"
     """
     words = ["sweep", name, *map(_shell_word, arguments)]
@@ -157,7 +168,7 @@ def suggestion(name: str, *arguments: object, **options: object) -> str:
     --------
     >>> suggestion("resume", "a b.zarr", retry_failed=True)
     "`sweep.resume('a b.zarr', retry_failed=True)`"
-    >>> with as_command():
+    >>> with suggest_shell_commands():
     ...     suggestion("resume", "a b.zarr", retry_failed=True)
     "`sweep resume 'a b.zarr' --retry-failed`"
     """
@@ -173,10 +184,10 @@ def option_text(name: str, value: object = True) -> str:
 
     Examples
     --------
-    >>> option("overwrite"), option("allow_code", ["mine"])
+    >>> option_text("overwrite"), option_text("allow_code", ["mine"])
     ('overwrite=True', "allow_code=['mine']")
-    >>> with as_command():
-    ...     option("overwrite"), option("allow_code", ["mine"])
+    >>> with suggest_shell_commands():
+    ...     option_text("overwrite"), option_text("allow_code", ["mine"])
     ('--overwrite', '--allow-code mine')
     """
     if not _runs_as_command:

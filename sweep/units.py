@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import re
 import unicodedata
+from collections.abc import Callable
 from dataclasses import dataclass
 from decimal import Decimal, localcontext
 from difflib import get_close_matches
@@ -140,12 +141,16 @@ class Unit:
 
 
 def read_number(
-    raw_value: object, description: str = "", *, is_power_ratio: bool = False
+    raw_value: object,
+    description: str = "",
+    *,
+    is_power_ratio: bool = False,
+    is_valid: Callable[[Fraction], bool] = lambda number: True,
 ) -> tuple[Fraction, Unit]:
     """Exact value and unit of a pure number: ``0.1``, ``"1e9"``, ``"2^17"`` or ``"10 %"``.
 
     A ratio of powers may be in decibels, ``"-3 dB"``. A `QuantityError` for any other unit says
-    what the number is `about`.
+    what the number is, its `description`, and suggests numbers that are `is_valid` only.
     """
     value, unit = _split_quantity(raw_value, "must be a number")
     if unit in ("%", "percent"):
@@ -156,31 +161,43 @@ def read_number(
         description_text = f": {description}" if description else ""
         raise QuantityError(
             f"is a pure number and takes no unit{description_text}",
-            _pure_number_suggestion(value, unit),
+            _pure_number_suggestion(value, unit, is_valid),
         )
     return value, Unit("")
 
 
-def _pure_number_suggestion(value: Fraction, unit: str) -> str:
-    """Suggestion of the pure number that a number with a unit may mean, if that is clear."""
+def _pure_number_suggestion(
+    value: Fraction, unit: str, is_valid: Callable[[Fraction], bool]
+) -> str:
+    """Suggestion of the pure number that a number with a unit may mean, if that is clear.
+
+    Empty where no such number `is_valid`.
+    """
     if unit == DECIBEL:
-        power_ratio_text, amplitude_ratio_text = (
-            _format_number(_power_ratio(value)),
-            _format_number(_power_ratio(value / 2)),
+        ratios = {"powers": _power_ratio(value), "amplitudes": _power_ratio(value / 2)}
+        ratio_texts = {
+            kind: _format_number(ratio) for kind, ratio in ratios.items() if is_valid(ratio)
+        }
+        if len(set(ratio_texts.values())) == 1:
+            return f"write {next(iter(ratio_texts.values()))}"
+        if not ratio_texts:
+            return ""
+        return "write {powers} for a ratio of powers, {amplitudes} for one of amplitudes".format(
+            **ratio_texts
         )
-        if power_ratio_text == amplitude_ratio_text:
-            return f"write {power_ratio_text}"
-        return (
-            f"write {power_ratio_text} for a ratio of powers, {amplitude_ratio_text} for one of "
-            "amplitudes"
-        )
+    if unit in LOGARITHMIC_UNITS:
+        return ""
     if unit in _USUAL_UNITS_BY_SI_UNIT["rad"].split():
         angle = read_unit(unit, si_unit="rad", example="1 deg").to_si(value)
-        return f"write {math.tan(angle):.4g}, the tangent of that angle, if a slope is meant"
+        slope = math.tan(angle)
+        if not is_valid(Fraction(slope)):
+            return ""
+        return f"write {slope:.4g}, the tangent of that angle, if a slope is meant"
     if quotient := re.fullmatch(r"/\s*(\d+)", unit):
         divisor = int(quotient[1])
-        return f"write {_format_number(value / divisor)}" if divisor else ""
-    return f"write {_format_number(value)}" if unit.isalpha() else ""
+        is_clear = divisor and is_valid(value / divisor)
+        return f"write {_format_number(value / divisor)}" if is_clear else ""
+    return f"write {_format_number(value)}" if unit.isalpha() and is_valid(value) else ""
 
 
 def read_quantity(raw_value: object, *, si_unit: str, example: str) -> tuple[Fraction, Unit]:

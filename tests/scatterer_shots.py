@@ -162,6 +162,22 @@ def draw_shots(
     )
 
 
+FLAT_BINS = 4
+"""Bins within a tenth of the largest mean power from which draws do not tell the strongest."""
+
+
+def strongest_bin(mean_power: np.ndarray) -> int:
+    """Index of the strongest bin: that of a parabola where the drawn means have a flat top."""
+    top = mean_power.max()
+    if (mean_power > 0.9 * top).sum() < FLAT_BINS:
+        return int(mean_power.argmax())
+    place = np.flatnonzero(mean_power > 0.6 * top)
+    middle = place.mean()
+    bend, slope, _ = np.polyfit(place - middle, np.log(mean_power[place]), 2)
+    vertex = middle - 0.5 * slope / bend if bend < 0 else mean_power.argmax()
+    return int(np.clip(round(vertex), place[0], place[-1]))
+
+
 def searched_bins(mean_power: np.ndarray, shots) -> np.ndarray:
     """Bins (k,) bool that detect an echo of such a mean power.
 
@@ -170,7 +186,7 @@ def searched_bins(mean_power: np.ndarray, shots) -> np.ndarray:
     """
     magnitude, positions = np.sqrt(mean_power), np.arange(mean_power.size)
     if shots.detection == "peak_bin":
-        return positions == magnitude.argmax()
+        return positions == strongest_bin(mean_power)
     half_lobe = math.ceil(main_lobe(shots.window) * shots.fft_size / shots.window.length)
     searched = np.zeros(positions.size, bool)
     for bins, reach in (

@@ -26,7 +26,7 @@ def test_it_says_what_there_is_and_ends_with_the_larger_study(store):
     result = sweep("extend", store, "--set", f"{POWER}=[1 W, 2 W, 3 W]", "--scheduler", "none")
     assert result.exit_code == 0
     assert "4 of 6 points are there; 2 to compute" in result.stderr
-    assert "four.zarr: 6 of 6 points, computed 1 of 1 blocks" in result.stdout
+    assert "four.zarr: 6 of 6 points, computed 1 of 1 block" in result.stdout
     assert file_digests(Path(store)) == file_digests(
         run_serially(four("[1 W, 2 W, 3 W]"), Path("again.zarr")).store
     )

@@ -55,7 +55,7 @@ def test_a_scene_is_planned_run_and_exported(here):
     ran = sweep("run", "descent.yaml", "--scheduler", "none")
     assert ran.exit_code == 0
     assert "three: 550 rays cast" in ran.stdout
-    assert "150 of 150 shots, computed 1 of 1 blocks" in ran.stdout
+    assert "150 of 150 shots, computed 1 of 1 block" in ran.stdout
     assert "150 of 150 shots" in sweep("status", "results/descent.zarr").stdout
     written = sweep("export", "results/descent.zarr", "cloud.csv")
     assert written.exit_code == 0

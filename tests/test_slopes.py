@@ -268,3 +268,11 @@ def test_lines_of_any_slope_are_those_of_the_record(table_4_1):
     shots = prepared(p, ("doppler", "footprint"))
     found, true = find(shots), truth.find(shots, range_walk=False)
     assert found[:, 2:4] == pytest.approx(true[:, 2:4], rel=1e-9)
+
+
+def test_segments_of_which_two_are_never_detected_are_no_shot():
+    pd = np.array([[0.0, 0.0, 0.5], [0.0, 0.3, 0.0], [0.0, 0.0, 0.5]])
+    alike = np.full((3, 3), 0.9)
+    for level in (np.full(3, 5.0), np.full(3, 1e100)):
+        found, missed = fading_any_two(pd, 1 - pd, level, alike)
+        assert (found[:2] == 0.0).all() and (missed[:2] == 1.0).all() and found[2] > 0.1

@@ -1,9 +1,9 @@
 """Table of random specs in developed speckle, compared with drawn scatterers.
 
 ``make validate-speckle`` prints a row for every spec: probabilities of detection that a study
-stores, those of drawn records (:mod:`drawn_shots`), and the difference over what is allowed, five
-standard deviations of the drawn share, the spec's tolerance, and the error that docs/physics.md
-states for the law of this kind. The exit status is 1 if any spec is beyond.
+stores, those of drawn records (:mod:`scatterer_shots`), and the difference over what is allowed,
+five standard deviations of the drawn share, the spec's tolerance, and the error that
+docs/physics.md states for the law of this kind. The exit status is 1 if any spec is beyond.
 """
 
 from __future__ import annotations

@@ -610,16 +610,16 @@ def _sheet_note(dataset: xr.Dataset, settings: Sequence[MeasuredSetting]) -> str
     mark_meaning = "the largest" if error_quantile == 1 else f"that of {100 * error_quantile:.0f} %"
     phrases = [
         f"mark: {mark_meaning} of "
-        f"{labels.format_count(attributes['points'], attributes['unit'][:-1])}; "
+        f"{labels.counted(attributes['points'], attributes['unit'][:-1])}; "
         f"bar and dot: 90 % and half of them, in pd alone; {NEGLIGIBLE_ERROR:g} and less at the "
         "foot",
-        f"best of {labels.format_count(dataset.sizes['round'], 'round')}; "
+        f"best of {labels.counted(dataset.sizes['round'], 'round')}; "
         f"reference: {attributes['reference']}",
     ]
     if attributes["truth_points"]:
         difference_text = format_error(attributes["truth_pd_difference"])
         phrases.append(
-            f"time domain at {labels.format_count(attributes['truth_points'], 'point')}: within "
+            f"time domain at {labels.counted(attributes['truth_points'], 'point')}: within "
             f"{difference_text} of it"
         )
     phrases.append(f"study {attributes['study_id'][:8]}, model {attributes['model_version']}")

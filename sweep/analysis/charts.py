@@ -230,7 +230,7 @@ def split_into_parts(
 
 def omission_remark(n_omitted: int) -> str:
     """Remark that some values are left out; empty where none is."""
-    return f"{labels.format_count(n_omitted, 'further value')} not shown" if n_omitted else ""
+    return f"{labels.counted(n_omitted, 'further value')} not shown" if n_omitted else ""
 
 
 def surface_chart(

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from sweep.messages import counted as counted
+
 KILOMETRES_FROM = 1000.0
 """Median of distances [m] from which on they are shown in km."""
 
@@ -63,11 +65,6 @@ def format_number(value: float) -> str:
     if value >= 1024 and value == int(value) and int(value).bit_count() == 1:
         return f"2^{int(math.log2(value))}"
     return f"{value:.6g}"
-
-
-def format_count(count: int, noun: str) -> str:
-    """Return a number of things: ``1 shot``, ``1,200 shots``."""
-    return f"{count:,} {noun}{'' if count == 1 else 's'}"
 
 
 def coordinate_label(name: str) -> str:

@@ -19,7 +19,7 @@ from sweep.cli.terminal import (
     print_table,
     shorten_path,
 )
-from sweep.messages import escape_to_one_line, shell_command
+from sweep.messages import counted, escape_to_one_line, shell_command
 from sweep.storage.locations import Location, file_sizes_below, output_dir
 
 if TYPE_CHECKING:
@@ -39,7 +39,6 @@ def status(store: Location) -> None:
 
     For a study with draws, a table has the number of points within accuracy.tolerance.
     """
-    from sweep.analysis.labels import format_count
     from sweep.tasks.engine.progress import amount_text, duration_text
     from sweep.tasks.studies.store_summary import status as read_status
 
@@ -54,17 +53,15 @@ def status(store: Location) -> None:
         if store_status.points_begun
         else ""
     )
+    draws_text = f", {counted(store_status.draws_done, 'draw')}" if store_status.draws_done else ""
     echo_wrapped(
         f"{store_status.points_done:,} of {store_status.points:,} {store_status.unit}, "
-        f"{store_status.blocks_done:,} of {store_status.blocks:,} blocks{points_begun_text}"
-        f"{f', {store_status.draws_done:,} draws' if store_status.draws_done else ''}, "
-        f"{decimal(store_status.bytes)} stored"
+        f"{store_status.blocks_done:,} of {counted(store_status.blocks, 'block')}"
+        f"{points_begun_text}{draws_text}, {decimal(store_status.bytes)} stored"
     )
     if store_status.rate:
         rate_text = f"{float(f'{store_status.rate:.3g}'):,.12g} {store_status.unit}/s"
-        click.echo(
-            f"{rate_text} in the last run, by {format_count(store_status.workers, 'worker')}"
-        )
+        click.echo(f"{rate_text} in the last run, by {counted(store_status.workers, 'worker')}")
     if store_status.holder_lives and store_status.holder:
         echo_wrapped(
             f"running: process {escape_to_one_line(store_status.holder.pid)} on "
@@ -172,7 +169,7 @@ def finalize(store: Location, output: Location | None) -> None:
     )
     file_sizes = file_sizes_below(packed_store)
     click.echo(
-        f"{shorten_path(packed_store)}: {len(file_sizes):,} files, "
+        f"{shorten_path(packed_store)}: {counted(len(file_sizes), 'file')}, "
         f"{decimal(sum(file_sizes.values()))}"
     )
 
@@ -195,7 +192,8 @@ def _print_verify_report(report: Report) -> None:
         )
     if report.blocks:
         echo_wrapped(
-            f"{store}: {report.whole:,} of {report.blocks:,} blocks committed and undamaged"
+            f"{store}: {report.whole:,} of {counted(report.blocks, 'block')} committed "
+            "and undamaged"
         )
 
 

@@ -19,6 +19,7 @@ from rich.filesize import decimal
 from sweep.messages import (
     EXIT_INCOMPLETE,
     EXIT_MISTAKE,
+    counted,
     escape_to_one_line,
     escape_unprintable,
     shell_command,
@@ -305,11 +306,11 @@ def print_outcome_and_exit(outcome: Outcome, store: Location) -> None:
         except Exception as error:  # the study is computed all the same
             echo_wrapped(f"no table of the results: {_error_text(error)}", err=True)
     for scanner, rays in outcome.rays.items():
-        rays_text = f"{rays:,} rays cast" if rays else "eyepoints were there, no ray cast"
+        rays_text = f"{counted(rays, 'ray')} cast" if rays else "eyepoints were there, no ray cast"
         click.echo(f"{scanner}: {rays_text}")
     echo_wrapped(
         f"{store}: {outcome.points_done:,} of {outcome.points:,} {outcome.unit}, "
-        f"computed {outcome.blocks_computed:,} of {outcome.blocks:,} blocks "
+        f"computed {outcome.blocks_computed:,} of {counted(outcome.blocks, 'block')} "
         f"in {duration_text(outcome.seconds)}"
     )
     if outcome.complete:
@@ -323,7 +324,8 @@ def print_outcome_and_exit(outcome: Outcome, store: Location) -> None:
     n_failed = len(outcome.failures) + outcome.left_out
     reason = outcome.stopped or f"{n_failed:,} failed; {shell_command('status', store)}  tells why"
     click.echo(
-        f"Incomplete, {blocks_left:,} of {outcome.blocks:,} blocks left: {reason}.", err=True
+        f"Incomplete, {blocks_left:,} of {counted(outcome.blocks, 'block')} left: {reason}.",
+        err=True,
     )
     if blocks_left > n_failed:
         click.echo(f"{shell_command('resume', store)}  goes on.", err=True)
@@ -588,7 +590,7 @@ def plan_rows(
     else:
         yield from _scene_plan_rows(spec, study_plan)
         yield "blocks", f"{study_plan.n_blocks:,}"
-    yield "chunks", f"{study_plan.n_chunks:,} files"
+    yield "chunks", counted(study_plan.n_chunks, "file")
     yield "bytes", f"{decimal(study_plan.nbytes)} before compression"
     if reason := unchecked_beamlets_reason(spec):
         yield "not checked", reason
@@ -603,8 +605,8 @@ def plan_rows(
     else:
         yield (
             "time",
-            f"{bound_text} {duration_text(study_plan.wall_seconds)} on {study_plan.n_workers} "
-            "workers",
+            f"{bound_text} {duration_text(study_plan.wall_seconds)} on "
+            f"{counted(study_plan.n_workers, 'worker')}",
         )
     yield "memory", f"about {decimal(study_plan.worker_bytes)} a worker"
     if reason := _excess_text(study_plan.n_points, study_plan.nbytes, study_plan.cpu_seconds):
@@ -625,11 +627,12 @@ def _scene_plan_rows(spec: SceneSpec, study_plan: StudyPlan) -> Iterator[tuple[s
     for scanner_plan in study_plan.scanners:
         yield (
             scanner_plan.name,
-            f"{scanner_plan.n_cycles:,} cycles, {scanner_plan.n_shots:,} shots, "
+            f"{counted(scanner_plan.n_cycles, 'cycle')}, "
+            f"{counted(scanner_plan.n_shots, 'shot')}, "
             + (
                 "eyepoints are there already"
                 if scanner_plan.is_cast
-                else f"{scanner_plan.n_rays:,} rays at "
+                else f"{counted(scanner_plan.n_rays, 'ray')} at "
                 f"{1e6 * scanner_plan.seconds_per_ray:.3g} us on one core"
             ),
         )

@@ -1,8 +1,8 @@
 """Rates of false alarms by leaked signal at many powers of developed speckle, from one table.
 
 Signal of amplitude a, over the noise per quadrature sigma, adds c to the probability that noise
-alone makes its bin cross the threshold b (:mod:`sweep.model.crossings`), and bins add up by their
-rates r = -ln(1 - c). An echo whose speckle has the power u, of mean 1, leaks signal of amplitude
+alone makes its bin cross the threshold b (:mod:`sweep.model.crossings`). Bins add up by their rates
+r = -ln(1 - c). An echo whose speckle has the power u, of mean 1, leaks signal of amplitude
 a sqrt(u). Its rate is
 
     r(a sqrt(u)) = a^2 u rho(ln a + ln(u) / 2),

@@ -134,14 +134,12 @@ def look_matrices(
 ) -> np.ndarray:
     """Return the covariance matrices sqrt(x_k x_l) mu(l - k) of the looks' speckle, (..., k, k).
 
-    More than ``most`` looks are represented by ``most`` looks farther apart, with the same mean
-    square time from the middle.
+    More than ``most`` looks are represented by those of :func:`look_places`.
     """
     number = by_lag.shape[-1]
-    few = min(number, most)
+    place = look_places(number, most)
+    few = place.size
     if few < number:
-        step = math.sqrt((number**2 - 1) / (few**2 - 1))
-        place = np.minimum(np.arange(few) * step, number - 1)
         lower = np.minimum(place.astype(int), number - 2)
         share = place - lower
         by_lag, power = (
@@ -152,6 +150,31 @@ def look_matrices(
     matrix = by_lag[..., np.abs(lag)]
     matrix = np.where(lag < 0, np.conj(matrix), matrix)
     return matrix * np.sqrt(power[..., :, None] * power[..., None, :])
+
+
+def look_places(number: int, most: int = MATRIX_LOOKS_MAX) -> np.ndarray:
+    """Return the places, in looks, of the ``most`` looks at most that represent ``number`` looks.
+
+    They have the same mean square time from the middle.
+    """
+    few = min(number, most)
+    step = math.sqrt((number**2 - 1) / (few**2 - 1)) if few < number else 1.0
+    return np.minimum(np.arange(few) * step, number - 1)
+
+
+def turned_matrices(by_lag: np.ndarray, power: np.ndarray, cycles: np.ndarray) -> np.ndarray:
+    """Return :func:`look_matrices` of echoes whose phase turns from look to look, (m, k, k).
+
+    Parameters
+    ----------
+    by_lag, power
+        (m, N): as of :class:`LookSpeckle`.
+    cycles
+        (m,): turn of the line's phase from one look to the next [cycles].
+    """
+    place = look_places(by_lag.shape[-1])
+    phase = 2 * np.pi * np.mod(cycles[:, None] * place, 1.0)
+    return look_matrices(by_lag, power) * np.exp(1j * (phase[:, None, :] - phase[:, :, None]))
 
 
 def mean_power_tails(
@@ -175,6 +198,23 @@ def mean_power_tails(
     weight = np.concatenate([speckle.multiplicity, np.maximum(noise_alone, 0.0)], axis=-1)
     mean = 1 + snr[..., None] * speckle.strength
     mean = np.concatenate([mean, np.ones((*mean.shape[:-1], 1))], axis=-1)
+    return power_sum_tails(weight, mean, threshold)
+
+
+def power_sum_tails(
+    weight: np.ndarray, mean: np.ndarray, threshold: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return P(sum of independent gamma variables > threshold), and its complement.
+
+    Parameters
+    ----------
+    weight
+        (..., k): shapes of the variables: 1 of an exponential one, 1/2 of a squared Gaussian one.
+    mean
+        (..., k): their means over their shapes.
+    threshold
+        (...).
+    """
     largest = mean.max(axis=-1)
     mean, y = mean / largest[..., None], threshold / largest
     is_rare = y > (weight * mean).sum(axis=-1)
@@ -251,7 +291,7 @@ def correlated_magnitudes(speckle, root):
 
 
 @njit(cache=True, error_model="numpy")
-def votes_given_speckle(signal, level, votes, magnitude):
+def votes_given_speckle(signal, level, votes, magnitude, is_real=False):
     """Return the probability that at least ``votes`` looks cross, given their speckle, (m,).
 
     Parameters
@@ -262,16 +302,23 @@ def votes_given_speckle(signal, level, votes, magnitude):
         Number of looks that have to cross.
     magnitude
         (m, N): magnitudes of the looks' speckle, of mean square 1.
+    is_real
+        The noise is real: it has the power of both quadratures in one.
 
     Notes
     -----
-    Looks cross independently, with Q_1(signal |s_k|, level); the number of crossings has a Poisson
-    binomial distribution, summed up look by look.
+    Looks cross independently, with Q_1(signal |s_k|, level), or the tails of a normal variable. The
+    number of crossings has a Poisson binomial distribution, summed up look by look.
     """
     crossing = np.empty(_Q_STEPS + 1)
     step = _SPECKLE_MAX / _Q_STEPS
     for k in range(_Q_STEPS + 1):
-        crossing[k] = marcum_q1_pair(signal * k * step, level)[0]
+        faded = signal * k * step
+        if is_real:
+            above, below = math.erfc(0.5 * (level - faded)), math.erfc(0.5 * (level + faded))
+            crossing[k] = 0.5 * (above + below)
+        else:
+            crossing[k] = marcum_q1_pair(faded, level)[0]
     enough, share = np.empty(magnitude.shape[0]), np.empty(votes + 1)
     for i in range(magnitude.shape[0]):
         share[:] = 0.0

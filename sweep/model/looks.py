@@ -625,7 +625,10 @@ def fading_any_two(
     chances = any_two(found, missed) + more, any_two(missed, found) - more
     found, missed = (np.clip((each * weight).sum(axis=-1), 0.0, 1.0) for each in chances)
     whole = found + missed  # 1 but for the quadrature
-    return np.where(there, found / whole, np.nan), np.where(there, missed / whole, np.nan)
+    # A segment that is never detected has no threshold: what stands for it above is too low.
+    is_possible = np.count_nonzero(pd > 0.0, axis=0) >= 2
+    found, missed = np.where(is_possible, [found / whole, missed / whole], [[0.0], [1.0]])
+    return np.where(there, found, np.nan), np.where(there, missed, np.nan)
 
 
 def _bends(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -196,6 +196,8 @@ class Shots:
     """Of echoes in developed speckle."""
     look_speckle: "LookSpeckle | None" = None
     """Speckle of looks that share it in part; None where all have the same, or each its own."""
+    look_turns: np.ndarray | None = None
+    """(3, n): turn of the line's phase from one look to the next [cycles]."""
     line_spread: np.ndarray | float = 0.0
     """(segments, n): deviation of the lines of an echo in developed speckle [bins of fs/N]."""
     speckle_lines: "SpeckleLines | None" = None
@@ -514,8 +516,28 @@ class Shots:
             noise = rule.noise_quadratures[k[near]] if rule.ends else np.zeros(share.size)
             levels = np.broadcast_to(level, signal.shape)[near]
             found, missed = found.copy(), missed.copy()
-            found[near], missed[near] = faded_looks(self.looks, signal[near], levels, share, noise)
+            segment, point = (at[near] for at in np.indices(signal.shape)[-2:])
+            covariance = self._look_covariance(segment, np.arange(self.size)[points][point])
+            found[near], missed[near] = faded_looks(
+                self.looks, signal[near], levels, share, noise, covariance
+            )
         return found, missed
+
+    def _look_covariance(self, segment: np.ndarray, point: np.ndarray) -> np.ndarray:
+        """Covariance of the echo's amplitudes in the looks of segments and points, (m, k, k)."""
+        from sweep.model.look_speckle import turned_matrices
+
+        number = self.looks.number
+        by_lag, power = np.ones((point.size, number), complex), np.ones((point.size, number))
+        if self.looks.independent:
+            by_lag[:, 1:] = 0.0
+        elif self.look_speckle is not None:
+            by_lag = self.look_speckle.by_lag[segment, point]
+            power = self.look_speckle.power[segment, point]
+        cycles = (
+            np.zeros(point.size) if self.look_turns is None else self.look_turns[segment, point]
+        )
+        return turned_matrices(by_lag, power, cycles)
 
     def _deviation(self, variance: np.ndarray) -> np.ndarray:
         energy = np.asarray(self.window.energy)

@@ -30,7 +30,8 @@ import numpy as np
 
 from sweep.model.detectors import main_lobe
 from sweep.model.hoyt import ANGLES, COSINES, hoyt_pair
-from sweep.model.looks import BINARY, Looks
+from sweep.model.look_speckle import independent_speckles, power_sum_tails, votes_given_speckle
+from sweep.model.looks import POWER, Looks
 from sweep.model.search import beamlet_lines, centre_lines
 from sweep.model.speckle_correlation import window_transform
 from sweep.model.window import Window, samples
@@ -170,9 +171,14 @@ def _reach(window: Window) -> float:
     return 0.5 * min(float(far), 12.0)
 
 
+_LEAST_STRENGTH = 1e-7
+"""Part of the looks' power below which an independent amplitude is left out."""
+
+
 def faded_looks(
-    looks: Looks, signal: np.ndarray, level: np.ndarray, shares: np.ndarray, noise: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+    looks: Looks, signal: np.ndarray, level: np.ndarray, shares: np.ndarray, noise: np.ndarray,
+    covariance: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Return pd and 1 - pd of a bin near DC or Nyquist for several looks in developed speckle.
 
     Parameters
@@ -181,30 +187,68 @@ def faded_looks(
         (m,): root mean square |X| and threshold over the noise per quadrature of one look.
     shares, noise
         (m,): pseudo-variance ratio q of the signal, and of the noise.
+    covariance
+        (m, k, k) complex: that of the looks' echoes, of mean power 1, with the turn of the line's
+        phase from look to look. k = N looks, or fewer that represent them.
 
     Notes
     -----
-    If all looks share one speckle, the probability is averaged over its magnitude and over its
-    phase t, which multiplies the signal's power by 1 + q cos t. Noise is taken to be circular
-    except in real bins (``noise`` = 1). If looks have independent speckle each |X|^2 is a Hoyt
-    variable. The mean of N of them is approximated by a gamma variable of the same mean and
-    variance, of the order N / (1 + q^2): exact for q = 0 and 1.
-    """
-    from scipy import special
+    Let g_k be the echo's amplitude in look k. Bin X_k = u_k + i v_k has the quadratures
+    ``u = sqrt(1 + q) Re g``, ``v = sqrt(1 - q) Im g`` times the root of the signal's power, for the
+    line and its image have the phases of g and of its conjugate. Their 2N numbers are Gaussian. So
+    the sum of all |X_k|^2 is one of independent squared Gaussian variables, whose variances are the
+    eigenvalues of the quadratures' covariance matrix.
 
-    if looks.independent:
-        power = np.square(signal) + 2
-        q = np.abs(np.square(signal) * shares + 2 * noise) / power
-        if looks.combine == BINARY:
-            each = np.array([hoyt_pair(*values) for values in zip(power, q, level, strict=True)])
-            return looks.votes_of(*each.reshape(-1, 2).T)
-        order = looks.number / (1 + q * q)
-        limit = order * np.square(level) / power
-        return special.gammaincc(order, limit), special.gammainc(order, limit)
-    turned = signal[:, None] * np.sqrt(np.maximum(1 + shares[:, None] * COSINES, 0.0))
-    levels = np.broadcast_to(level[:, None], turned.shape)
-    speckle, weight = looks.speckle_nodes(levels, turned)
-    real = (noise > 1 - 1e-9)[:, None, None]
-    found, missed = looks.steady(turned[..., None] * speckle, levels[..., None], real)
-    found, missed = ((chance * weight).sum(axis=-1).mean(axis=-1) for chance in (found, missed))
-    return found / (found + missed), missed / (found + missed)
+    Of votes the probability given the amplitudes is averaged over a fixed lattice of them, as of
+    looks far from DC. Of noise whose quadratures differ in part the probabilities of circular and
+    of real noise are averaged.
+    """
+    power = np.square(signal)
+    if looks.combine == POWER:
+        sides = np.stack([np.sqrt(1 + shares), np.sqrt(np.maximum(1 - shares, 0.0))], axis=1)
+        few = covariance.shape[-1]
+        real, turned = covariance.real, covariance.imag
+        quarters = np.block([[real, -turned], [turned, real]])
+        scale = np.repeat(sides, few, axis=1)
+        scale *= np.sqrt(0.5 * power * looks.number / few)[:, None]
+        noise_power = np.stack([1 + noise, 1 - noise], axis=1)
+        matrix = scale[:, :, None] * scale[:, None, :] * quarters
+        matrix += np.repeat(noise_power, few, axis=1)[:, :, None] * np.eye(2 * few)
+        variance = np.concatenate([np.linalg.eigvalsh(matrix), noise_power], axis=1)
+        shape = np.full(variance.shape, 0.5)
+        shape[:, 2 * few :] = 0.5 * (looks.number - few)  # looks that others represent: noise
+        mean = 2 * np.maximum(variance, 0.0)
+        return power_sum_tails(shape, mean, looks.number * np.square(level))
+    found = np.empty(signal.shape)
+    for i, matrix in enumerate(covariance):
+        number = matrix.shape[-1]
+
+        def mean_votes(amplitudes: np.ndarray, i: int = i) -> float:
+            magnitude = np.hypot(
+                math.sqrt(1 + shares[i]) * amplitudes.real,
+                math.sqrt(max(1 - shares[i], 0.0)) * amplitudes.imag,
+            )
+            part = abs(float(noise[i]))
+            mean = 0.0
+            for is_real, weight in ((True, part), (False, 1 - part)):
+                if weight > 0:
+                    given = votes_given_speckle(
+                        signal[i], level[i], looks.votes, magnitude, is_real
+                    )
+                    mean += weight * float(given.mean())
+            return mean
+
+        q = (power[i] * shares[i] + 2 * noise[i]) / (power[i] + 2)
+        lone = np.array(hoyt_pair(power[i] + 2, abs(q), level[i]))
+        found[i] = looks.votes_of(*lone)[0]
+        independence = (number**2 / np.square(np.abs(matrix)).sum() - 1) / max(number - 1, 1)
+        if independence < 1 - 1e-9:
+            value, vector = np.linalg.eigh(matrix)
+            used = value > _LEAST_STRENGTH * number
+            root = vector[:, used] * np.sqrt(value[used])
+            # Less the lattice's error for independent looks, in proportion.
+            apart = found[i] - mean_votes(independent_speckles(number))
+            together = mean_votes(independent_speckles(int(used.sum())) @ root.T)
+            found[i] = together + independence * apart
+    found = np.clip(found, 0.0, 1.0)
+    return found, 1 - found

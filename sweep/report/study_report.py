@@ -30,6 +30,7 @@ from sweep.analysis.selection import to_float_with_nan
 from sweep.analysis.study_figures import GridResults, SceneResults, describe_selection
 from sweep.analysis.tables import TablePage as TablePage
 from sweep.analysis.tables import outputs_page
+from sweep.messages import shell_command
 from sweep.model.effects.catalogue import EFFECTS
 from sweep.report import detector_charts, flight_charts
 from sweep.report.flight_charts import LabelledRecording
@@ -572,9 +573,12 @@ def _reproduction_section(
     spec_yaml = yaml.safe_dump(
         spec.to_yaml_mapping(), sort_keys=False, allow_unicode=True, width=100
     )
-    commands = (
-        f"sweep run study.yaml --store {store_path}\nsweep figures {store_path}\nsweep report "
-        f"{store_path}"
+    commands = "\n".join(
+        [
+            shell_command("run", "study.yaml", store=store_path),
+            shell_command("figures", store_path),
+            shell_command("report", store_path),
+        ]
     )
     versions_text = ", ".join(
         f"{name} {package_version}" for name, package_version in version_by_package.items()

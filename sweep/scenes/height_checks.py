@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sweep.messages import counted
 from sweep.scenes.scene_files import SceneError
 
 HEIGHT_MAX = 1e6
@@ -63,8 +64,8 @@ def mask_missing_heights(path: Path, values: np.ndarray, no_data: float | None) 
     if is_too_far.any():
         wrong_height = float(values[is_too_far][0])
         problem = (
-            f"holds the height {wrong_height:g} at {int(is_too_far.sum()):,} cells, farther than "
-            f"{HEIGHT_MAX:g}"
+            f"holds the height {wrong_height:g} at {counted(int(is_too_far.sum()), 'cell')}, "
+            f"farther than {HEIGHT_MAX:g}"
         )
         raise SceneError(
             path, problem, f"if they have no data, state 'no_data: {_shortest_text(wrong_height)}'"
@@ -108,9 +109,9 @@ def _no_data_warnings(path: Path, values: np.ndarray) -> list[str]:
                 is_doubtful = count >= _SHARED_CELLS_MIN and gap > _SHARED_VALUE_GAP_MIN * span > 0
             if is_doubtful:
                 warnings.append(
-                    f"{path}: the value {value:g} stands in {count:,} cells, {gap:.4g} from the "
-                    "next: if it means that there is no data, state 'no_data: "
-                    f"{_shortest_text(value)}'"
+                    f"{path}: the value {value:g} stands in {counted(count, 'cell')}, "
+                    f"{gap:.4g} from the next: if it means that there is no data, "
+                    f"state 'no_data: {_shortest_text(value)}'"
                 )
                 low, high = (value, high) if value == lowest else (low, value)
                 break
@@ -139,7 +140,7 @@ def cliff_warnings(path: Path, heights: np.ndarray, spacing: tuple[float, float]
         return []
     return [
         f"{path}: neighbouring cells differ by up to {largest_rise:.4g} m over "
-        f"{step_at_largest:.3g} m, at "
-        f"{n_cliffs:,} places: if the ground has no such cliffs, a value stands for missing "
-        "heights there: state it as no_data, or mend the file"
+        f"{step_at_largest:.3g} m, at {counted(n_cliffs, 'place')}: "
+        "if the ground has no such cliffs, a value stands for missing heights there: "
+        "state it as no_data, or mend the file"
     ]

@@ -15,7 +15,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from sweep.messages import PrintableError
+from sweep.messages import PrintableError, counted
 from sweep.model.geometry.quaternion import from_heading
 from sweep.units import QuantityError, read_unit
 
@@ -361,7 +361,10 @@ def _parse_row(path: Path, numbered_row: NumberedRow, column_names: Sequence[str
     """Numbers of a line, in the order of the columns' names."""
     line_number, cells = numbered_row
     if len(cells) != len(column_names):
-        problem = f"has {len(cells)} cells under {len(column_names)} columns on line {line_number}"
+        problem = (
+            f"has {counted(len(cells), 'cell')} under {counted(len(column_names), 'column')} "
+            f"on line {line_number}"
+        )
         raise SceneError(path, problem, "fill or cut the line")
     values = [_parse_finite_number(cell) for cell in cells]
     if None in values:
@@ -397,6 +400,17 @@ def _table_attitude(path: Path, table: Mapping[str, np.ndarray]) -> np.ndarray |
         raise SceneError(path, "has part of a quaternion", "give qw, qx, qy and qz")
     quaternions = np.column_stack([table[name] for name in _QUATERNION_COLUMNS])
     norms = np.linalg.norm(quaternions, axis=1)
-    if not (np.abs(norms - 1) < 1e-3).all():
-        raise SceneError(path, "has quaternions of a length other than 1", "divide them by it")
+    if (wrong_rows := np.flatnonzero(~(np.abs(norms - 1) < 1e-3))).size:
+        line_numbers = [line_number for line_number, _ in _read_rows(path)[1:]]
+        raise _join_errors(
+            path,
+            [_unfit_quaternion(path, line_numbers[row], norms[row]) for row in wrong_rows],
+        )
     return np.asarray(quaternions / norms[:, None])
+
+
+def _unfit_quaternion(path: Path, line_number: int, norm: float) -> SceneError:
+    """Refusal of a quaternion whose length is not 1."""
+    problem = f"has a quaternion of the length {norm:.6g} on line {line_number}, which has to be 1"
+    remedy = "divide it by its length" if norm > 0 else "write 1, 0, 0, 0 for no turn"
+    return SceneError(path, problem, remedy)

@@ -301,7 +301,12 @@ class NumericRule(Rule):
             raise QuantityError(problem, "leave it out")
         try:
             description = _first_clause(self.description)
-            return read_number(raw_value, description, is_power_ratio=self.is_power_ratio)
+            return read_number(
+                raw_value,
+                description,
+                is_power_ratio=self.is_power_ratio,
+                is_valid=self._is_valid,
+            )
         except QuantityError as error:
             if not self.keyword:
                 raise
@@ -321,6 +326,15 @@ class NumericRule(Rule):
                     raw_text, [self.keyword], fallback=f"{remedy} or '{self.keyword}'"
                 )
             raise QuantityError(error.rule, remedy) from None
+
+    def _is_valid(self, number: Fraction) -> bool:
+        """Tell whether a pure number fits the field."""
+        if self.is_integer and number.denominator != 1:
+            return False
+        try:
+            return self.first_out_of_bounds(np.array([Unit("").to_si(number)])) is None
+        except QuantityError:  # more than a float holds
+            return False
 
     def _read_number(self, raw_value: object) -> float | int:
         number, unit = self.read_exact(raw_value)

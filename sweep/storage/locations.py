@@ -80,6 +80,9 @@ ObjectVersion = Any
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
+#: Words of the library for a body that is cut, and for a list that is.
+_CUT = ("body error", "invalid list response")
+
 _clients: dict[str, Any] = {}
 _clients_lock = threading.RLock()
 
@@ -135,9 +138,8 @@ class ObjectPath:
             if self.bucket_url not in _clients:
                 with translate_errors(self):
                     if not self.bucket_url.startswith("memory:"):
-                        _connect(self.bucket_url, FIRST_CONTACT_RETRY_CONFIG).list_with_delimiter(
-                            self.key or None
-                        )
+                        first_client = _connect(self.bucket_url, FIRST_CONTACT_RETRY_CONFIG)
+                        _ask_twice(lambda: first_client.list_with_delimiter(self.key or None))
                     _clients[self.bucket_url] = _connect(self.bucket_url, RETRY_CONFIG)
             return _clients[self.bucket_url]
 
@@ -188,14 +190,25 @@ class ObjectPath:
 
     def iter_objects_below(self) -> Iterator[tuple[str, int]]:
         """Keys under this one, relative to it, and their sizes, a page in memory at a time."""
+        from obstore.exceptions import BaseError
+
+        last, is_repeated = None, False
         with translate_errors(self):
-            for page in self.client.list(self.key or None):
-                for entry in page:
-                    yield entry["path"][len(self.key) :].lstrip("/"), entry["size"]
+            while True:
+                try:
+                    for page in self.client.list(self.key or None, offset=last):
+                        for entry in page:
+                            yield entry["path"][len(self.key) :].lstrip("/"), entry["size"]
+                            last, is_repeated = entry["path"], False
+                    return
+                except BaseError as error:
+                    if is_repeated or not _is_cut(error):
+                        raise
+                    is_repeated = True  # the list goes on after the last key that came
 
     def _child_names(self) -> list[str]:
         with translate_errors(self):
-            listing = self.client.list_with_delimiter(self.key or None)
+            listing = _ask_twice(lambda: self.client.list_with_delimiter(self.key or None))
         paths = [*listing["common_prefixes"], *(entry["path"] for entry in listing["objects"])]
         return sorted(path.rpartition("/")[2] for path in paths)
 
@@ -209,10 +222,22 @@ class ObjectPath:
 
     def read_with_version(self) -> tuple[bytes, ObjectVersion] | None:
         """Return the object and the tag of what it holds; None where there is none."""
-        with translate_errors(self), suppress(FileNotFoundError):
+
+        def ask() -> tuple[bytes, ObjectVersion]:
             response = self.client.get(self.key)
             return bytes(response.bytes()), _object_version(response.meta)
+
+        with translate_errors(self), suppress(FileNotFoundError):
+            return _ask_twice(ask)
         return None
+
+    def refuse_cut(self, content: bytes) -> None:
+        """Raise ObjectStoreError if an answer with this content lacks a part of the object.
+
+        A proxy may announce the part of a body that it has as the whole of it.
+        """
+        if len(content) < self.size():
+            raise ObjectStoreError(errno.EIO, _cut_in_words(self.bucket_url), str(self))
 
     def put_if_unchanged(
         self, content: bytes, expected_version: ObjectVersion | None
@@ -225,6 +250,23 @@ class ObjectPath:
         with translate_errors(self), suppress(*conflict_errors):
             return _object_version(self.client.put(self.key, content, mode=mode))
         return None
+
+
+def _ask_twice(ask: Callable[[], Result]) -> Result:
+    """Return what an object store answers, asked once more where the answer is cut."""
+    from obstore.exceptions import BaseError
+
+    try:
+        return ask()
+    except BaseError as error:
+        if not _is_cut(error):
+            raise
+        return ask()
+
+
+def _is_cut(error: Exception) -> bool:
+    """Tell whether the body of an answer, or the document of a list in it, was cut short."""
+    return any(words in str(error) for words in _CUT)
 
 
 def _object_version(meta: Any) -> ObjectVersion:
@@ -242,6 +284,14 @@ def _connect(bucket_url: str, retry_config: Any) -> Any:
         "allow_http": allow_http or _s3_endpoint().startswith("http:"),
     }
     return from_url(bucket_url, client_options=options, retry_config=retry_config)
+
+
+def _cut_in_words(bucket_url: str) -> str:
+    return f"{_service(bucket_url)} cuts its answers short: try again, or look at the network"
+
+
+def _service(bucket_url: str) -> str:
+    return _s3_endpoint() or f"the service of {bucket_url.split(':')[0]}://"
 
 
 def _s3_endpoint() -> str:
@@ -272,10 +322,7 @@ def to_readable_error(error: Exception) -> Exception:
 
 def classify_error_text(error_text: str, bucket_url: str) -> tuple[int, str]:
     """Return the number and words of what an object store's library says, of a kind and bucket."""
-    bucket, service = (
-        bucket_url.partition("://")[2],
-        _s3_endpoint() or f"the service of {bucket_url.split(':')[0]}://",
-    )
+    bucket, service = bucket_url.partition("://")[2], _service(bucket_url)
     error_summary = error_text.partition("\n\nDebug source")[0]
     status_match = re.search(
         r"status code: (\d+ [A-Za-z ]+)|\b([45]\d\d [A-Z][a-z ]+)", error_summary
@@ -302,8 +349,8 @@ def classify_error_text(error_text: str, bucket_url: str) -> tuple[int, str]:
             errno.ETIMEDOUT,
             f"{service} does not answer in time: try again, or look at the network",
         )
-    if "body error" in error_text:
-        return errno.EIO, f"{service} cuts its answers short: try again, or look at the network"
+    if any(words in error_text for words in _CUT):
+        return errno.EIO, _cut_in_words(bucket_url)
     if "error sending request" in error_text or "onnect" in error_summary:
         return errno.ECONNREFUSED, (
             f"{service} can't be reached: is it up, and are AWS_ENDPOINT_URL and the network right?"

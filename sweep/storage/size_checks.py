@@ -20,6 +20,7 @@ from zarr.abc.store import OffsetByteRequest, RangeByteRequest, SuffixByteReques
 from zarr.core.buffer import default_buffer_prototype
 from zarr.storage import LocalStore, ObjectStore
 
+from sweep.messages import suggestion
 from sweep.regular_files import RefusedFileError, check_size, read_below
 
 #: Bytes of the document of a group or an array at most.
@@ -235,7 +236,7 @@ class SizeCheckedLocalStore(LocalStore):
             return None
         except RefusedFileError as error:
             problem_and_remedy = (
-                f"{error.strerror}: `sweep verify {self.root}` names what is damaged"
+                f"{error.strerror}: {suggestion('verify', self.root)} names what is damaged"
             )
             raise RefusedFileError(error.errno, problem_and_remedy, error.filename) from None
         return content

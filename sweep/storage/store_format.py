@@ -740,8 +740,12 @@ def _iter_log_objects(path: ObjectPath, object_names: list[str]) -> Iterator[tup
 
 def _read_log_object(log_object: ObjectPath) -> bytes:
     """Read an object of a log; once more where its last line is cut, as an answer may have been."""
-    content = log_object.read_bytes()
-    return content if content.endswith(b"\n") else log_object.read_bytes()
+    for _ in range(2):
+        content = log_object.read_bytes()
+        if content.endswith(b"\n"):
+            return content
+    log_object.refuse_cut(content)  # else lines would count as damaged that are not
+    return content
 
 
 def iter_raw_lines(path: Location) -> Iterator[bytes]:
@@ -749,7 +753,7 @@ def iter_raw_lines(path: Location) -> Iterator[bytes]:
     if isinstance(path, ObjectPath):
         object_names = list_log_objects(path)
         if not object_names and path.size() > 0:
-            yield from path.read_bytes().splitlines(keepends=True)
+            yield from _read_log_object(path).splitlines(keepends=True)
         for _, content in _iter_log_objects(path, object_names):
             yield from content.splitlines(keepends=True)
     else:

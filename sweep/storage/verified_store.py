@@ -21,8 +21,16 @@ import zarr
 from zarr.core.buffer import default_buffer_prototype
 from zarr.storage import StorePath, WrapperStore
 
+from sweep.messages import STORE_PLACEHOLDER, suggestion
 from sweep.storage import store_format
-from sweep.storage.locations import JOURNAL_DIR, PACKED_ATTRIBUTE, Location, to_readable_error
+from sweep.storage.locations import (
+    JOURNAL_DIR,
+    PACKED_ATTRIBUTE,
+    Location,
+    ObjectPath,
+    to_readable_error,
+    translate_errors,
+)
 from sweep.storage.store_format import (
     MANIFEST_FILE,
     iter_records,
@@ -177,7 +185,8 @@ class VerifiedStore(WrapperStore[Any]):
         """Return the bytes of a file, or of a part of it; DamagedChunkError for a damaged chunk."""
         prototype = prototype or default_buffer_prototype()
         try:
-            return await self._get_verified(key, prototype, byte_range)
+            with translate_errors(self._location):
+                return await self._get_verified(key, prototype, byte_range)
         except Exception:
             _loops_with_failed_reads.add(asyncio.get_running_loop())
             raise
@@ -190,10 +199,13 @@ class VerifiedStore(WrapperStore[Any]):
         ):
             return content
         # Once more: the body of an answer may be cut, and another process may just have written it.
-        complete_content = await self._store.get(key, prototype)
+        complete_content = await self._fetch(key, prototype, None)
         if damage := self._find_damage(name, complete_content, None):
+            if isinstance(self._location, ObjectPath) and complete_content is not None:
+                refuse_cut = (self._location / name).refuse_cut
+                await asyncio.to_thread(refuse_cut, complete_content.to_bytes())
             raise DamagedChunkError(self._damage_message(name, damage))
-        return await self._store.get(key, prototype, byte_range)
+        return await self._fetch(key, prototype, byte_range)
 
     async def _fetch(self, key: str, prototype: Any, byte_range: Any) -> Any:
         """Return the bytes of a file, asked for twice where the body of the first answer is cut."""
@@ -237,15 +249,20 @@ class VerifiedStore(WrapperStore[Any]):
         block = block_map.block_of_chunk(name)
         chunk_text = f"{location}: block {block}: {name}" if block >= 0 else f"{location}: {name}"
         if block_map.is_packed:
-            remedy = f"`sweep verify {location}` names all that is damaged; copy the store anew"
+            remedy = (
+                f"{suggestion('verify', location)} names all that is damaged; copy the store anew"
+            )
         elif name in block_map.template_objects:
-            remedy = f"`sweep verify {location} --repair` puts it back"
+            remedy = f"{suggestion('verify', location, repair=True)} puts it back"
         elif block_map.kind == "eyepoints":
-            remedy = "`sweep verify` and `sweep resume` of the study that uses them mend it"
+            remedy = (
+                f"{suggestion('verify', STORE_PLACEHOLDER)} and "
+                f"{suggestion('resume', STORE_PLACEHOLDER)} of the study that uses them mend it"
+            )
         else:
             remedy = (
-                f"`sweep verify {location}` marks what is damaged, "
-                f"and `sweep resume {location}` computes it again"
+                f"{suggestion('verify', location)} marks what is damaged, "
+                f"and {suggestion('resume', location)} computes it again"
             )
         return f"{chunk_text} {damage}: {remedy}"
 

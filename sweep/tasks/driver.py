@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from sweep.messages import option_text, suggestion
+from sweep.messages import counted, option_text, suggestion
 from sweep.spec import GridSpec, SceneSpec
 from sweep.storage.locations import (
     PACKED_ATTRIBUTE,
@@ -324,8 +324,8 @@ def _refuse_existing_store(store_path: Location, study: GridStudy | FlightStudy)
         refuse_other_study(store_path, attributes, stored_study.spec, study.spec)
         n_blocks_done = int(np.count_nonzero(blocks_with_receipt(store_path, study)))
         problem = (
-            f"{store_path} holds this study already, {n_blocks_done} of {study.n_blocks} blocks "
-            "done"
+            f"{store_path} holds this study already, {n_blocks_done} of "
+            f"{counted(study.n_blocks, 'block')} done"
         )
         if n_blocks_done == study.n_blocks:
             remedy = f"{suggestion('status', store_path)} tells about it"

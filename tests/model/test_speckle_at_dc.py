@@ -5,6 +5,7 @@ Compared with drawn records of scatterers, which share the mean echo power, nois
 
 import numpy as np
 import pytest
+import validate_speckle
 from scatterer_shots import (
     COMPARED_EFFECTS,
     LANDER_PARAMETERS,
@@ -16,6 +17,9 @@ from scatterer_shots import (
 from sweep.model.constants import SPEED_OF_LIGHT
 from sweep.model.effects.catalogue import DEFAULTS
 from sweep.model.hoyt import hoyt_pair
+from sweep.model.look_speckle import turned_matrices
+from sweep.model.looks import Looks
+from sweep.model.quadratures import faded_looks
 from sweep.model.sampling import simulate
 from sweep.model.shot import find, statistics
 
@@ -132,7 +136,8 @@ def test_looks_near_dc_detect_as_often_as_drawn_ones(combine, speckle, place, ta
     power = float(find(shots)[1, 2, 0]) ** 2 / (line**2 + image**2)
     amplitude = rng.normal(size=(draws, looks, 2)) @ [1, 1j] * np.sqrt(power / 2)
     if speckle == "common":
-        amplitude[:] = amplitude[:, :1]
+        cycles = place * BIN_WIDTH * np.ravel(shots.look_period)[0] * np.arange(looks)
+        amplitude = amplitude[:, :1] * np.exp(2j * np.pi * cycles)
     pseudo = (w**2 * np.cos(4 * np.pi * k * time)).sum() / (w**2).sum()
     noise = rng.normal(size=(draws, looks, 2)) * np.sqrt([1 + pseudo, 1 - pseudo])
     noise = float(shots.bin_deviation[0]) * (noise @ [1, 1j])
@@ -168,3 +173,47 @@ def test_draws_in_noise_detect_slow_echoes_as_often(rule, place, table_4_1):
     drawn = counts["n_detected_doppler"][0, 0] / draws
     expected = float(statistics(prepare_single_category(p))["pd_doppler"][0])
     assert abs(drawn - expected) < 0.004 + 4 * np.sqrt(expected * (1 - expected) / draws)
+
+
+@pytest.mark.parametrize("combine", ["power", "binary"])
+@pytest.mark.parametrize("cycles", [0.0, 0.13, 0.5])
+@pytest.mark.parametrize("memory", [0.0, 0.8, 1.0])
+def test_looks_whose_phase_turns_are_detected_as_gaussian_numbers(combine, cycles, memory):
+    """Complex numbers with an image each, drawn look by look, against the law of their looks."""
+    rng, number, draws = np.random.default_rng(5), 4, 100_000
+    signal, level, q = 5.0, 4.3, 0.8
+    looks = Looks(number, combine, 2)
+    by_lag = (memory ** np.arange(number)).astype(complex)[None]
+    covariance = turned_matrices(by_lag, np.ones((1, number)), np.array([cycles]))
+    columns = (np.array([value]) for value in (signal, level, q, 0.0))
+    pd, miss = faded_looks(looks, *columns, covariance)
+    amplitude = np.empty((draws, number), complex)
+    innovation = [complex_normal(rng, draws) for _ in range(number)]
+    amplitude[:, 0] = innovation[0]
+    for k in range(1, number):
+        amplitude[:, k] = memory * amplitude[:, k - 1] + np.sqrt(1 - memory**2) * innovation[k]
+    turned = amplitude * np.exp(2j * np.pi * cycles * np.arange(number))
+    # A line and its image of amplitudes a and b: a^2 + b^2 = signal^2, 2 a b = q signal^2.
+    line, image = (0.5 * (np.sqrt(1 + q) + sign * np.sqrt(1 - q)) * signal for sign in (1, -1))
+    noise = np.sqrt(2) * np.stack([complex_normal(rng, draws) for _ in range(number)], axis=1)
+    power = np.abs(line * turned + image * np.conj(turned) + noise) ** 2
+    is_detected = (power >= level**2).sum(axis=1) >= 2
+    if combine == "power":
+        is_detected = power.mean(axis=1) >= level**2
+    lattice_error = 0.004 if combine == "binary" else 0.0
+    assert abs(is_detected.mean() - pd[0]) < 4 * np.sqrt(0.25 / draws) + lattice_error
+    assert pd[0] + miss[0] == pytest.approx(1, abs=1e-9)
+
+
+def complex_normal(rng, draws):
+    """Circular complex Gaussian numbers of mean power 1."""
+    return (rng.normal(size=draws) + 1j * rng.normal(size=draws)) / np.sqrt(2)
+
+
+@pytest.mark.parametrize(("seed", "number"), [(3, 72), (7, 56)])
+def test_looks_with_a_beat_at_dc_are_detected_as_drawn_ones(seed, number):
+    """Two of the specs of ``make validate-speckle``: five looks of a turning phase, four votes."""
+    row = validate_speckle.compare_spec(seed, number)
+    for comparison in row.comparisons:
+        if comparison.quantity != "shot":
+            assert abs(comparison.difference) < 4 * comparison.drawn_deviation + 0.002, comparison

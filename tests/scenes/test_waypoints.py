@@ -91,7 +91,11 @@ def test_remarks_blank_lines_and_a_byte_order_mark_are_passed_over(table):
         ("time [s],x [m],y [m],z [m],qw,roll [deg]\n0,0,0,1,1,0\n1,0,0,1,1,0\n", "both"),
         (
             "time [s],x [m],y [m],z [m],qw,qx,qy,qz\n0,0,0,1,1,1,0,0\n1,0,0,1,1,0,0,0\n",
-            "length other than 1",
+            "quaternion of the length 1.41421 on line 2, which has to be 1; divide it",
+        ),
+        (
+            "time [s],x [m],y [m],z [m],qw,qx,qy,qz\n0,0,0,1,1,0,0,0\n# note\n1,0,0,1,0,0,0,0\n",
+            "quaternion of the length 0 on line 4, which has to be 1; write 1, 0, 0, 0",
         ),
         ("time [s],x [m],y [m],z [m],qw [m]\n0,0,0,1,1\n1,0,0,1,1\n", "quaternions have none"),
     ],

@@ -47,6 +47,10 @@ FIELDS = [
     ("instrument.processing.tnr", "10 sigma",
      "takes no unit: threshold over the standard deviation of a noise-only bin's magnitude (you "
      "wrote '10 sigma'); write 10"),
+    ("target.reflectance", "-10 dBm", "(you wrote '-10 dBm'); write e.g. '"),
+    ("target.reflectance", "-10 m", "(you wrote '-10 m'); write e.g. '"),
+    ("target.reflectance", "0.1 m", "(you wrote '0.1 m'); write 0.1"),
+    ("instrument.processing.fft_size", "-8 samples", "(you wrote '-8 samples'); write e.g. '"),
     ("target.reflectance", "1/4", "is a pure number and takes no unit: "),
     ("instrument.processing.fft_size", "1,024", "has a comma; numbers are written like 1234.5"),
     ("instrument.processing.fft_size", "131 072", "write '131072'"),

@@ -4,6 +4,7 @@ import pickle
 import shutil
 import subprocess
 import sys
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -13,6 +14,8 @@ from small_studies import run_serially, small_spec
 
 import sweep
 from sweep.cli import main
+from sweep.messages import suggest_shell_commands
+from sweep.regular_files import RefusedFileError
 from sweep.report import study_report
 from sweep.storage.locations import eyepoints_path, parse_location
 from sweep.storage.verified_store import (
@@ -80,10 +83,30 @@ def test_a_damaged_chunk_is_told_as_it_is_read(copy, damage):
     with pytest.raises(DamagedChunkError) as raised:
         dataset.pd_shot.compute()
     assert str(raised.value) == (
-        f"{copy}: block 0: pd_shot/c/0/0/0 {words}: `sweep verify {copy}` marks what is damaged, "
-        f"and `sweep resume {copy}` computes it again"
+        f"{copy}: block 0: pd_shot/c/0/0/0 {words}: `sweep.verify('{copy}')` marks what is "
+        f"damaged, and `sweep.resume('{copy}')` computes it again"
     )
     assert np.isfinite(dataset.pd_up.compute()).all()
+
+
+@pytest.mark.parametrize("as_what", ["command", "program"])
+def test_remedies_are_quoted_as_they_are_to_be_typed(grid, tmp_path, as_what):
+    copy = shutil.copytree(grid, tmp_path / "q p" / "grid.zarr")
+    flip(copy / "pd_shot/c/0/0/0")
+    (copy / "pd_up/c/0/0/0").write_bytes(bytes(10**6))  # larger than it can be
+    dataset = sweep.open(copy)
+    with suggest_shell_commands() if as_what == "command" else nullcontext():
+        with pytest.raises(DamagedChunkError) as damaged:
+            dataset.pd_shot.compute()
+        with pytest.raises(RefusedFileError) as unfit:
+            dataset.pd_up.compute()
+    if as_what == "command":
+        verify, resume = f"`sweep verify '{copy}'`", f"`sweep resume '{copy}'`"
+    else:
+        verify, resume = f"`sweep.verify('{copy}')`", f"`sweep.resume('{copy}')`"
+    assert f"{verify} marks what is damaged" in str(damaged.value)
+    assert f"{resume} computes it again" in str(damaged.value)
+    assert f"{verify} names what is damaged" in str(unfit.value)
 
 
 COMMANDS = [
@@ -100,7 +123,7 @@ def test_commands_tell_of_a_damaged_chunk_in_words(copy, command, damage):
     done = CliRunner().invoke(main, [word.format(copy) for word in command])
     assert done.exit_code == 2, done.output
     if (command[0], damage) == ("finalize", "missing"):
-        assert "lacks 1 blocks: resume it" in done.output  # it counts chunks before it copies
+        assert "lacks 1 block: resume it" in done.output  # it counts chunks before it copies
     else:
         assert "block 1: pd_" in done.output and f"/c/0/1/0 {words}: `sweep ver" in done.output
     assert "Traceback" not in done.output
@@ -196,6 +219,7 @@ def test_a_store_that_is_opened_goes_to_other_processes(grid):
 
 READER = """
 import sys
+from contextlib import nullcontext
 import sweep
 from sweep.storage.store_format import StoreReplacedError
 from sweep.storage.verified_store import DamagedChunkError

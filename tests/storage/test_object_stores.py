@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import Counter
 from contextlib import suppress
 from dataclasses import asdict, replace
 from datetime import timedelta
@@ -32,7 +33,7 @@ from small_studies import file_digests, logged_blocks, make_logging_evaluate, ru
 import sweep
 from sweep.cli import main
 from sweep.storage import locations, store_format
-from sweep.storage.locations import JOURNAL_DIR, parse_location
+from sweep.storage.locations import JOURNAL_DIR, ObjectStoreError, parse_location
 from sweep.storage.store_format import decode_record, encode_record, iter_records
 from sweep.tasks.driver import extend, resume, run
 from sweep.tasks.engine.journal import LOCK_FILE, LockHolder, StoreLock, read_lock_holder
@@ -373,3 +374,127 @@ def test_a_body_that_is_cut_each_time_is_told(faults, read_only_place, fate):
     done = CliRunner().invoke(main, ["status", read_only_place])
     assert done.exit_code == 2 and "Traceback" not in done.output
     assert ("is damaged" if fate == HALVE_BODY else "cuts its answers short") in done.output
+
+
+def one_in(period, fate, is_one):
+    """Fate of one in so many requests for the same, the first among them; the others pass."""
+    seen = Counter()  # requests come from several threads
+
+    def of(number, method, path):
+        if method != "GET" or not is_one(path):
+            return PASS_ON
+        seen[path] += 1
+        return fate if seen[path] % period == 1 % period else PASS_ON
+
+    return of
+
+
+def is_lock(path):
+    return path.partition("?")[0].endswith("/lock") and "list-type" not in path
+
+
+def is_listing(path):
+    return "list-type" in path
+
+
+@pytest.mark.parametrize("fate", [CUT_BODY, HALVE_BODY])
+def test_a_lock_whose_answers_are_cut_is_read_once_more(faults, place, fate):
+    faults.fate = one_in(3, fate, is_lock)
+    outcome = run_serially(six_block_spec(), place)
+    assert faults.seen[fate] > 2
+    assert outcome.complete and not outcome.stopped
+
+
+@pytest.mark.parametrize("fate", [CUT_BODY, HALVE_BODY])
+def test_a_lock_that_is_cut_twice_is_no_strangers(faults, place, fate):
+    with StoreLock(parse_location(place)) as lock:
+        faults.fate = one_in(1, fate, is_lock)
+        with pytest.raises(ObjectStoreError, match="cuts its answers short: try again"):
+            lock.is_held()
+        faults.fate = lambda *_: PASS_ON
+        assert lock.is_held()
+
+
+def test_a_lock_that_is_damaged_as_a_whole_is_nobodys(faults, place):
+    path = parse_location(place) / JOURNAL_DIR / "lock"
+    path.write_bytes(b'{"host":"elsewhe')
+    assert read_lock_holder(parse_location(place)) == LockHolder()
+
+
+@pytest.mark.parametrize("fate", [CUT_BODY, HALVE_BODY])
+def test_a_listing_that_is_cut_is_asked_for_once_more(faults, read_only_place, fate):
+    if not parse_location(read_only_place).exists():
+        assert run_serially(six_block_spec(), read_only_place).complete
+    listed = sorted(parse_location(read_only_place).iter_objects_below())
+    names = [key for key in listed if "sessions" not in key[0]]
+    faults.fate = one_in(2, fate, is_listing)
+    for command in ("status", "verify"):
+        done = CliRunner().invoke(main, [command, read_only_place])
+        assert done.exit_code == 0, done.output
+    assert np.isfinite(sweep.open(read_only_place).pd_shot.compute()).all()
+    assert resume(read_only_place, scheduler="none", progress=False).complete
+    listed = sorted(parse_location(read_only_place).iter_objects_below())
+    assert [key for key in listed if "sessions" not in key[0]] == names
+    locations._clients.clear()
+    assert parse_location(read_only_place).exists()  # at first contact too
+    assert faults.seen[fate] > 4
+
+
+def test_a_listing_of_several_pages_goes_on_where_it_was_cut(faults, place):
+    names = [f"{number:04d}" for number in range(1100)]  # a page of S3's has 1000
+    locations.map_concurrently(
+        parse_location(place), lambda name: (parse_location(place) / name).write_bytes(b"x"), names
+    )
+    listings = [0]
+
+    def second(number, method, path):
+        listings[0] += is_listing(path)
+        return CUT_BODY if is_listing(path) and listings[0] == 2 else PASS_ON
+
+    faults.fate = second
+    assert [name for name, _ in parse_location(place).iter_objects_below()] == names
+    assert listings[0] == 3
+
+
+@pytest.mark.parametrize("fate", [CUT_BODY, HALVE_BODY])
+def test_a_listing_that_is_cut_twice_is_told_in_words(faults, read_only_place, fate):
+    if not parse_location(read_only_place).exists():
+        assert run_serially(six_block_spec(), read_only_place).complete
+    faults.fate = one_in(1, fate, is_listing)
+    for command in ("status", "verify"):
+        done = CliRunner().invoke(main, [command, read_only_place])
+        assert done.exit_code == 2
+        assert "cuts its answers short: try again" in done.output
+        assert "Generic" not in done.output and "Traceback" not in done.output
+
+
+@pytest.mark.parametrize("fate", [CUT_BODY, HALVE_BODY])
+def test_chunks_that_are_cut_twice_are_not_damaged(faults, read_only_place, fate):
+    if not parse_location(read_only_place).exists():
+        assert run_serially(six_block_spec(), read_only_place).complete
+    done = receipts(read_only_place)
+    faults.fate = one_in(1, fate, lambda path: "pd_shot/c/" in path)
+    with pytest.raises(
+        ObjectStoreError, match=r"pd_shot.*cuts its answers short|small.zarr: .*cuts"
+    ):
+        sweep.open(read_only_place).pd_shot.compute()
+    checked = CliRunner().invoke(main, ["verify", read_only_place])
+    assert checked.exit_code == 2
+    assert "cuts its answers short" in checked.output
+    assert "damaged" not in checked.output and "checksum" not in checked.output
+    faults.fate = lambda *_: PASS_ON
+    assert receipts(read_only_place) == done
+
+
+def test_lines_of_a_log_that_are_cut_twice_are_not_dropped(faults, place):
+    assert run_serially(six_block_spec(), place).complete
+    done = receipts(place)
+    faults.fate = one_in(
+        1, HALVE_BODY, lambda path: "receipts.jsonl/" in path and "list-type" not in path
+    )
+    with pytest.raises(ObjectStoreError, match="cuts its answers short"):
+        store_format.open_log(
+            parse_location(place) / JOURNAL_DIR / "receipts.jsonl"
+        ).remove_damaged_lines(lambda line: decode_record(line) is not None)
+    faults.fate = lambda *_: PASS_ON
+    assert receipts(place) == done

@@ -15,6 +15,7 @@ from sweep.messages import EXIT_INCOMPLETE
 from sweep.tasks.engine import interrupts
 from sweep.tasks.engine.interrupts import InterruptHandler
 from sweep.tasks.engine.progress import Progress
+from sweep.tasks.engine.session import ComputeBackend
 
 RUN = """
 import os, sys, time
@@ -219,3 +220,21 @@ def test_signals_of_others_leave_a_run_alone(tmp_path):
     finally:
         signal.signal(signal.SIGUSR1, before)
     assert len(heard) == 3 and not asked.is_stopping
+
+
+def test_sigterm_while_workers_start_has_a_deadline_too(tmp_path, monkeypatch):
+    """As of a worker whose imports hang, which its nanny starts again and again."""
+    monkeypatch.setattr(interrupts, "TERMINATION_SECONDS_MAX", 0.5)
+
+    def hang(backend, *_):
+        os.kill(os.getpid(), signal.SIGTERM)
+        for _ in range(200):
+            time.sleep(0.05)
+        raise AssertionError("not stopped")
+
+    monkeypatch.setattr(ComputeBackend, "iter_results", hang)
+    outcome = run_serially(small_spec(), tmp_path / "s.zarr")
+    assert outcome.stopped == "stopped at once" and not outcome.complete
+    assert outcome.seconds < 8
+    monkeypatch.undo()
+    assert sweep.resume(outcome.store, scheduler="none", progress=False).complete

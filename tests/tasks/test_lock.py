@@ -437,3 +437,55 @@ def test_what_a_living_process_makes_is_not_cleared_up_after_the_clock_was_set(t
     reused.mkdir()
     locations.recover_interrupted_replace(tmp_path / "other.zarr")
     assert made.exists() and not dead.exists() and not reused.exists()
+
+
+def test_many_stores_on_one_file_system_are_warned_of_once(tmp_path, monkeypatch):
+    """A flight has a lock for each of its eyepoints' stores, and an extension has two."""
+    monkeypatch.setattr(fcntl, "flock", fails(errno.ENOSYS))
+    monkeypatch.setattr(os, "link", fails(errno.EPERM))
+    monkeypatch.setattr(journal, "_issued_warnings", set())
+    said = []
+    for name in ("one.zarr", "two.zarr", "three.zarr"):
+        (tmp_path / name).mkdir()
+        StoreLock(tmp_path / name, said.append).release()
+    assert ["flock" in text for text in said] == [True, False]
+
+
+def test_a_heartbeat_that_fails_is_warned_of_once(tmp_path, monkeypatch):
+    monkeypatch.setattr(journal, "HEARTBEAT_INTERVAL", 0.02)
+    monkeypatch.setattr(journal, "_issued_warnings", set())
+    beats, beat = [], journal._FileLock.send_heartbeat
+
+    def fails_twice(self):
+        beats.append(None)
+        if len(beats) < 3:
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+        beat(self)
+
+    monkeypatch.setattr(journal._FileLock, "send_heartbeat", fails_twice)
+    said = []
+    with StoreLock(tmp_path, said.append):
+        end = time.monotonic() + 20
+        while len(beats) < 5 and time.monotonic() < end:
+            time.sleep(0.01)
+    (warning,) = said
+    assert "heartbeat" in warning and "Permission denied" in warning and "other hosts" in warning
+    assert len(beats) >= 5  # it goes on
+
+
+def test_a_lock_that_a_full_disk_cuts_is_taken_away(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "link", fails(errno.EPERM))
+    monkeypatch.setattr(journal, "_issued_warnings", set())
+    sync, path = os.fsync, tmp_path / JOURNAL_DIR / journal.LOCK_FILE
+
+    def full(opened):
+        if path.exists():
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        sync(opened)
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(StoreError, match="No space left"):
+        StoreLock(tmp_path, lambda text: None)
+    assert sorted(os.listdir(tmp_path / JOURNAL_DIR)) == ["lock.guard"]
+    monkeypatch.setattr(os, "fsync", sync)
+    StoreLock(tmp_path, lambda text: None).release()

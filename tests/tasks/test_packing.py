@@ -78,7 +78,7 @@ def test_what_is_not_complete_or_in_the_way_is_refused(undisturbed, packed, tmp_
 
     store = copy_store(undisturbed, tmp_path)
     (store / "pd_up" / "c" / "0" / "5" / "0").unlink()
-    with pytest.raises(StoreError, match="lacks 1 blocks"):
+    with pytest.raises(StoreError, match="lacks 1 block"):
         pack_store(store, tmp_path / "final.zarr")
     assert not (tmp_path / "final.zarr").exists()
     with pytest.raises(StoreError, match="is there already"):

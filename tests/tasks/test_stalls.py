@@ -50,7 +50,7 @@ def test_a_run_that_stalls_shows_its_tasks_and_workers_and_then_goes_on(
     first, second = (line for line in told.lines if line.startswith("no block has come back for "))
     (address,) = impatient.nthreads()
     assert re.search(r"task of block [0-3] and \d+ more: sent .* ago, .*pending", first)
-    assert f"worker {address}: 1 threads, last answer " in first
+    assert f"worker {address}: 1 thread, last answer " in first
     assert "\n" not in second
     assert sum("nothing came back" in record.message for record in caplog.records) == 2
 
@@ -65,3 +65,30 @@ def test_a_run_is_quiet_by_default_and_logs_its_steps_where_asked(tmp_path, capl
     assert f"{tmp_path / 's.zarr'}: study " in words[0] and " of 12 blocks, 0 done" in words[0]
     assert "blocks are computed in this process, one after the other" in words
     assert words[-1].startswith(f"{tmp_path / 's.zarr'}: 12 blocks computed in ")
+
+
+def blocked_at_first(study, block):
+    """Compute a block once it is released."""
+    assert RELEASED.wait(60)
+    return study.evaluate(block)
+
+
+def test_workers_that_have_yet_to_answer_are_said_to_compile(tmp_path, impatient, monkeypatch):
+    monkeypatch.setattr(dispatcher, "COMPILATION_SECONDS_MAX", 1.2)
+
+    class Releasing(Told):
+        def say(self, text):
+            self.lines.append(text)
+            if "last answer never" in text:
+                RELEASED.set()
+
+    told = Releasing(lambda: None)
+    outcome = run(
+        small_spec(), store=tmp_path / "s.zarr", client=impatient, progress=told,
+        evaluate=blocked_at_first,
+    )  # fmt: skip
+    assert outcome.complete
+    *early, late = (line for line in told.lines if line.startswith("no block has come back for "))
+    assert early and all("workers load the model, or compile it" in line for line in early)
+    assert not any("last answer" in line for line in early)
+    assert "last answer never" in late  # beyond the time that compiling takes

@@ -438,8 +438,8 @@ def describe_common_shots(differences: xr.Dataset) -> str:
         differences.attrs["other_shots"],
     )
     if n_common == n_ours == n_other:
-        return f"all {labels.format_count(n_common, 'shot')}"
-    return f"{labels.format_count(n_common, 'shot')} that both have, of {n_ours:,} and {n_other:,}"
+        return f"all {labels.counted(n_common, 'shot')}"
+    return f"{labels.counted(n_common, 'shot')} that both have, of {n_ours:,} and {n_other:,}"
 
 
 def agreement_verdict(compared_groups: Iterable[xr.Dataset]) -> tuple[str, str]:
@@ -457,9 +457,9 @@ def agreement_verdict(compared_groups: Iterable[xr.Dataset]) -> tuple[str, str]:
     if not n_points:
         return "nothing", "Nothing that both stores have is computed yet."
     if not n_different:
-        phrase = f"agree at {labels.format_count(n_points, noun)}"
+        phrase = f"agree at {labels.counted(n_points, noun)}"
         return "same", f"Probabilities of detection {phrase}{count_note}."
-    phrase = f"differ at {n_different:,} of {labels.format_count(n_points, noun)}"
+    phrase = f"differ at {n_different:,} of {labels.counted(n_points, noun)}"
     return "different", f"Probabilities of detection {phrase}{count_note}."
 
 

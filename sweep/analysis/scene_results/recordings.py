@@ -335,7 +335,7 @@ class ThinnedRows:
     def describe_count(self, noun: str, qualifier: str = "") -> str:
         """Return the number of all rows in words, and how many of them are kept."""
         kept_note = f", one in {self.step} of them shown" if self.step > 1 else ""
-        return labels.format_count(self.n_total, noun) + qualifier + kept_note
+        return labels.counted(self.n_total, noun) + qualifier + kept_note
 
     def to_columns(self) -> ColumnArrays:
         """Return the rows kept; empty where none were added."""
@@ -494,7 +494,7 @@ class PointCloud:
             count_texts.append(self.thinned_dropouts.describe_count("shot", " without a point"))
         if self.n_outside:
             count_texts.append(
-                f"{labels.format_count(self.n_outside, 'false point')} outside of the picture"
+                f"{labels.counted(self.n_outside, 'false point')} outside of the picture"
             )
         return count_texts
 

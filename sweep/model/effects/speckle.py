@@ -244,11 +244,13 @@ def _fade_in_looks(shots: Shots, ground: "GroundSpread") -> Shots:
     Looks that are added coherently get a smaller amplitude (``beat_scale``) instead.
     """
     looks = shots.looks
-    if not looks.moving:
-        return shots
     number, size = looks.number, shots.size
     frequencies, _ = _echo_frequencies(shots)
     turns = [np.broadcast_to(f * shots.look_period, size) for f in frequencies]
+    if looks.several:
+        shots = replace(shots, look_turns=np.stack(turns) * shots.beta)
+    if not looks.moving:
+        return shots
     nothing = np.zeros(size)
     by_lag = np.ones((3, size, number), complex)
     for segment in map(int, np.flatnonzero(shots.segments)):

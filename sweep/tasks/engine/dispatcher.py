@@ -18,6 +18,7 @@ from dataclasses import dataclass, field, replace
 from itertools import chain, takewhile
 from typing import TYPE_CHECKING, Any
 
+from sweep.messages import counted, option_name
 from sweep.storage.store_format import NotAStoreError
 from sweep.tasks.engine.journal import Receipt
 from sweep.tasks.engine.progress import SchedulerLostError, StoreError, duration_text
@@ -56,6 +57,9 @@ FILE_VISIBILITY_DELAY_MAX = 60.0
 
 #: Time without an answer after which a run is told to stall [s]; longer where tasks take longer.
 STALL_SECONDS = 60.0
+
+#: Time in which the first answer of a run may be that late, as workers compile the model [s].
+COMPILATION_SECONDS_MAX = 600.0
 
 #: Times that a task should take after which a run is told to stall.
 STALL_TASK_TIMES = 5.0
@@ -194,16 +198,17 @@ class TaskDispatcher:
         now = time.monotonic()
         tasks = set(self._in_flight.values())
         lines = [
-            f"{self._block_queue.n_unassigned:,} blocks not yet sent, "
+            f"{counted(self._block_queue.n_unassigned, 'block')} not yet sent, "
             f"{len(self._block_queue.failed):,} failed once, "
             f"{len(self._unverified_receipts):,} written but not yet found in the store",
-            f"{len(tasks):,} tasks in flight, {len(self._superseded):,} superseded; "
-            f"{self._throughput.n_blocks:,} blocks came back in "
+            f"{counted(len(tasks), 'task')} in flight, {len(self._superseded):,} superseded; "
+            f"{counted(self._throughput.n_blocks, 'block')} came back in "
             f"{duration_text(self._throughput.seconds)} of work",
         ]
         lines += [
             f"task of block {task.blocks[0]} and {len(task.blocks) - 1} more: sent "
-            f"{duration_text(now - task.last_sent_at)} ago, {len(task.futures)} times; Dask says "
+            f"{duration_text(now - task.last_sent_at)} ago, "
+            f"{counted(len(task.futures), 'time')}; Dask says "
             f"{', '.join(sorted({str(future.status) for future in task.futures.values()}))}"
             for task in sorted(tasks, key=lambda task: task.last_sent_at)[:TASKS_SHOWN_MAX]
         ]
@@ -214,7 +219,7 @@ class TaskDispatcher:
             )
             excluded_text = ", left out" if worker in self._excluded_workers else ""
             lines.append(
-                f"worker {worker}: {threads} threads, last answer "
+                f"worker {worker}: {counted(threads, 'thread')}, last answer "
                 f"{last_response_text}{excluded_text}"
             )
         return "\n".join(lines)
@@ -228,11 +233,18 @@ class TaskDispatcher:
         seconds_waited = time.monotonic() - self._last_progress_at
         if seconds_waited < self._stall_patience:
             return
-        is_first = not self._has_reported_stall
-        self._stall_patience, self._has_reported_stall = 2 * seconds_waited, True
         summary = self.state_summary()
         _logger.info("nothing came back for %s:\n%s", duration_text(seconds_waited), summary)
         stall_text = f"no block has come back for {duration_text(seconds_waited)}"
+        if not self._last_response and seconds_waited < COMPILATION_SECONDS_MAX:
+            self._stall_patience = min(2 * seconds_waited, COMPILATION_SECONDS_MAX)
+            self._say(
+                f"{stall_text}: workers load the model, or compile it once, which takes minutes "
+                "where the machine is busy"
+            )
+            return
+        is_first = not self._has_reported_stall
+        self._stall_patience, self._has_reported_stall = 2 * seconds_waited, True
         self._say(f"{stall_text}:\n{textwrap.indent(summary, '  ')}" if is_first else stall_text)
 
     def _usable_workers(self) -> list[str]:
@@ -470,7 +482,7 @@ def _failed_task_result(error: BaseException, blocks: list[int]) -> TaskResult:
         n_deaths = error.allowed_failures + 1
         message = (
             f"KilledWorker: {n_deaths} worker{'s' if n_deaths > 1 else ''} died at it: "
-            "out of memory, stuck beyond --block-timeout, or killed"
+            f"out of memory, stuck beyond {option_name('block_timeout')}, or killed"
         )
         failures = [replace(failure, error=message) for failure in failures]
     return TaskResult(failures=failures)

@@ -63,7 +63,7 @@ class InterruptHandler:
 
     def __init__(self, listener: Progress | None = None) -> None:
         self.is_stopping = False
-        self.is_computing = False  # blocks run, and lose nothing but themselves if stopped
+        self.is_computing = False  # workers start or blocks run: stopped, only these are lost
         self._deadline: float | None = None  # time at which the process has to end
         self._listener = listener or Progress()
         self._previous_handlers: dict[signal.Signals, Any] = {}

@@ -53,6 +53,7 @@ from sweep.storage.locations import (
     ObjectStoreError,
     ObjectVersion,
     atomic_write,
+    os_error_reason,
     process_start_id,
     read_object,
 )
@@ -498,7 +499,7 @@ _released_tokens: set[str] = set()
 """Tokens of locks that this process has given up, which a store out of reach may not know."""
 
 _issued_warnings: set[str] = set()
-"""Warnings about file systems that this process has given."""
+"""Kinds of warnings about locks that this process has given: a study may have many locks."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -670,9 +671,9 @@ class _FileLock:
                     raise
                 _warn_once(
                     say,
+                    "flock",
                     f"the file system of {self._lock_path} has no flock ({error.strerror}): start "
-                    "no "
-                    "two runs of one store within the same second",
+                    "no two runs of one store within the same second",
                 )
             yield
         finally:
@@ -706,16 +707,19 @@ class _FileLock:
             reason = error.strerror
         _warn_once(
             say,
+            "links",
             f"the file system of {self._lock_path} has no hard links ({reason}): its lock is a "
-            "file that "
-            "is made if none is there, which not every file server does in one step",
+            "file that is made if none is there, which not every file server does in one step",
         )
         descriptor = os.open(self._lock_path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
         try:
-            os.write(descriptor, holder_json.encode())
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+            with open(descriptor, "wb") as file:
+                file.write(holder_json.encode())
+                file.flush()
+                os.fsync(descriptor)
+        except OSError:
+            self._lock_path.unlink(missing_ok=True)  # part of a lock would look alive
+            raise
 
     def send_heartbeat(self) -> None:
         """Say that the holder lives."""
@@ -735,9 +739,10 @@ def _read_lock_file(lock_path: Path) -> str | None:
         return file.read(LOCK_BYTES_MAX).decode("utf-8", "replace")
 
 
-def _warn_once(say: Callable[[str], None], warning: str) -> None:
-    if warning not in _issued_warnings:
-        _issued_warnings.add(warning)
+def _warn_once(say: Callable[[str], None], kind: str, warning: str) -> None:
+    """Give the first warning of a kind in this process."""
+    if kind not in _issued_warnings:
+        _issued_warnings.add(kind)
         say(f"warning: {warning}")
 
 
@@ -751,12 +756,25 @@ class _ObjectLock:
 
     def read_holder_json(self) -> str | None:
         """Text of its holder; None where nobody holds it."""
-        tagged = self._lock_path.read_with_version()
+        tagged = self._read_tagged()
         return _first_line(tagged[0]) if tagged and tagged[0] else None
+
+    def _read_tagged(self) -> tuple[bytes, ObjectVersion] | None:
+        """Return the lock and its tag, read once more if cut; ObjectStoreError if cut twice.
+
+        Part of a lock would look like a stranger's.
+        """
+        for _ in range(2):
+            tagged = self._lock_path.read_with_version()
+            if tagged is None or tagged[0].count(b"\n") == 2 or not tagged[0]:
+                return tagged
+        if tagged:
+            self._lock_path.refuse_cut(tagged[0])
+        return tagged
 
     def heartbeat_mark(self) -> object:
         """Mark of the last heartbeat, another one after each."""
-        tagged = self._lock_path.read_with_version()
+        tagged = self._read_tagged()
         return tagged and tagged[0]
 
     def acquire(
@@ -764,7 +782,7 @@ class _ObjectLock:
     ) -> None:
         """Take it, unless `judge` raises."""
         for _ in range(LOCK_ATTEMPTS_MAX):
-            tagged = self._lock_path.read_with_version()
+            tagged = self._read_tagged()
             if tagged and _first_line(tagged[0]) == holder_json:  # put, though its answer was lost
                 self._holder_json, self._tag = holder_json, tagged[1]
                 return
@@ -790,7 +808,7 @@ class _ObjectLock:
         """Put something in the place of what was last put; of what is there, where that is ours."""
         tag = self._lock_path.put_if_unchanged(content.encode(), self._tag)
         if tag is None:
-            tagged = self._lock_path.read_with_version()
+            tagged = self._read_tagged()
             if tagged and _first_line(tagged[0]) == self._holder_json:
                 tag = self._lock_path.put_if_unchanged(content.encode(), tagged[1])
         if tag is not None:
@@ -855,7 +873,7 @@ class StoreLock:
     """
 
     def __init__(self, store_path: Location, say: Callable[[str], None] = warnings.warn) -> None:
-        self._store_path, self._lock = store_path, _lock_of_store(store_path)
+        self._store_path, self._lock, self._say = store_path, _lock_of_store(store_path), say
         self._own_holder = LockHolder.of_this_process()
         self._is_released = threading.Event()
         with raise_as_store_error(f"{store_path} can't be locked"):
@@ -913,9 +931,21 @@ class StoreLock:
 
     def _send_heartbeats(self) -> None:
         while not self._is_released.wait(HEARTBEAT_INTERVAL):
-            with suppress(OSError):
+            try:
                 if self.is_held():
                     self._lock.send_heartbeat()
+            except FileNotFoundError:
+                pass  # the store was taken away
+            except OSError as error:
+                with suppress(Warning):  # that is to be an error: the next heartbeat may succeed
+                    _warn_once(
+                        self._say,
+                        "heartbeat",
+                        f"the heartbeat of the lock of {self._store_path} can't be written "
+                        f"({os_error_reason(error, self._store_path)}): to other hosts this run "
+                        f"looks dead after {HEARTBEAT_AGE_MAX:g} s, so start none of this store "
+                        "there",
+                    )
 
     def is_held(self) -> bool:
         """Tell whether the lock is still this driver's."""

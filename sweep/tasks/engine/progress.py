@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import IO, TYPE_CHECKING, Any, cast
 
-from sweep.messages import PrintableError, escape_unprintable
+from sweep.messages import PrintableError, counted, escape_unprintable
 from sweep.regular_files import RefusedFileError
 from sweep.storage.store_format import StoreError as StoreError
 from sweep.tasks.engine.text_streams import PatientStream, is_terminal
@@ -214,7 +214,7 @@ class _CountingProgress(Progress):
             "done": amount_text(self._points_done),
             "rate": f"{amount_text(self._rate)} {self._points_noun}/s" if self._rate > 0 else "",
             "work": self._workers_text,
-            "failures": f"{self._n_failed} blocks failed" if self._n_failed else "",
+            "failures": f"{counted(self._n_failed, 'block')} failed" if self._n_failed else "",
         }
 
 

@@ -615,6 +615,7 @@ class Session:
         points_before = self._study.count_points(is_done) + self._receipt_totals["points"]
         with ExitStack() as stack:
             try:
+                self._interrupts.is_computing = True  # a start loses nothing either
                 compile_thread = threading.Thread(target=self._compile_kernels, daemon=True)
                 activity = "loading the model" + (
                     "" if self._backend.is_serial else ", reaching workers"
@@ -635,7 +636,6 @@ class Session:
                     unit=self._study.points_noun,
                 )
                 stack.callback(self._progress.end)
-                self._interrupts.is_computing = True
                 return self._consume_results(task_results, block_queue)
             except SchedulerLostError as error:
                 return f"the scheduler is gone ({error})"

@@ -37,6 +37,7 @@ from sweep.storage.locations import (
     JOURNAL_DIR,
     Location,
     ObjectPath,
+    ObjectStoreError,
     atomic_path,
     atomic_write,
     file_sizes_below,
@@ -504,13 +505,18 @@ def refuse_damaged_template(store_path: Location) -> None:
 
 
 def damage_or_read_error(read_damage: Callable[[], str]) -> str:
-    """Damage of an object in words, as a function says that reads it; empty if there is none."""
+    """Damage of an object in words, as a function says that reads it; empty if there is none.
+
+    ObjectStoreError where an object store does not give it.
+    """
     try:
         return read_damage()
     except (FileNotFoundError, NotADirectoryError):
         return "is missing"
     except RefusedFileError as error:
         return str(error.strerror)
+    except ObjectStoreError:
+        raise  # its service's fault, of which the object says nothing
     except OSError as error:
         return f"can't be read: {error.strerror}"
 
@@ -586,8 +592,7 @@ def refuse_foreign_files(store_path: Location) -> None:
         )
         raise StoreError(
             f"{store_path} has files in it that are not sweep's ({names_text}): move them "
-            "elsewhere, as "
-            "--overwrite replaces the whole folder"
+            f"elsewhere, as {option_text('overwrite')} replaces the whole folder"
         )
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from sweep.messages import counted
 from sweep.scenes.scene_files import SceneError
 from sweep.tasks.studies.eyepoint_study import EyepointStudy, build_world
 
@@ -94,7 +95,7 @@ def refuse_flight_without_hits(spec: SceneSpec) -> None:
         return
     n_shots = sum(scanner.n_shots for scanner in flight_coverage.scanners)
     rule = (
-        f"leads nowhere that a beam hits anything, of {n_shots:,} shots: "
+        f"leads nowhere that a beam hits anything, of {counted(n_shots, 'shot')}: "
         f"{flight_coverage.extents_text()}"
     )
     remedy = (

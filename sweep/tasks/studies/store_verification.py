@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import zarr
 
-from sweep.messages import suggestion
+from sweep.messages import counted, suggestion
 from sweep.storage import store_format
 from sweep.storage.foreign_files import list_foreign_files
 from sweep.storage.locations import (
@@ -277,7 +277,13 @@ def _damages_of_block(
             partial(_damage_of_chunk, store_path, name, bytes_max(name))
         ):
             damages.append(Damage(name, problem, block))
-    description = f"one of its {len(chunk_paths)} chunks"
+    if (
+        not damages
+        and isinstance(store_path, ObjectPath)
+        and has_digest(store_path, chunk_paths, expected_digest.decode(), bytes_max)
+    ):
+        return []  # answers were cut before
+    description = f"one of its {counted(len(chunk_paths), 'chunk')}"
     return damages or [Damage(description, "is whole but not the one that was committed", block)]
 
 
@@ -285,7 +291,9 @@ def _damage_of_chunk(store_path: Location, chunk_path: str, bytes_max: int) -> s
     """Damage of a chunk in words; read once more from an object store, as an answer may be cut."""
     problem = chunk_damage(read_object(store_path, chunk_path, bytes_max))
     if problem and isinstance(store_path, ObjectPath):
-        return chunk_damage(read_object(store_path, chunk_path, bytes_max))
+        content = read_object(store_path, chunk_path, bytes_max)
+        if problem := chunk_damage(content):
+            (store_path / chunk_path).refuse_cut(content)
     return problem
 
 
@@ -416,7 +424,7 @@ def pack_store(
         reason = (
             "is packed already"
             if attributes.get(PACKED_ATTRIBUTE)
-            else f"lacks {n_missing:,} blocks: resume it"
+            else f"lacks {counted(n_missing, 'block')}: resume it"
         )
         raise StoreError(f"{store_path} {reason}")
     if not is_free(output):
