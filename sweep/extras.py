@@ -16,7 +16,7 @@ def install_hint(error: BaseException) -> str:
 
     Examples
     --------
-    >>> remedy(ModuleNotFoundError("No module named 'trimesh'", name="trimesh.exchange"))
+    >>> install_hint(ModuleNotFoundError("No module named 'trimesh'", name="trimesh.exchange"))
     "trimesh is not installed: pip install 'sweep[scenes]'"
     """
     module = (getattr(error, "name", None) or "").split(".")[0]

@@ -33,7 +33,7 @@ class RefusedFileError(OSError):
 def file_type(mode: int) -> str:
     """Return the name of a file type, from the mode of its stat result.
 
-    >>> kind_of(stat.S_IFIFO)
+    >>> file_type(stat.S_IFIFO)
     'a named pipe'
     """
     return _FILE_TYPE_NAMES.get(stat.S_IFMT(mode), "a plain file")

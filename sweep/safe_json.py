@@ -48,7 +48,7 @@ def _refuse_unsafe_values(parsed: Any, allow_non_utf8: bool) -> None:
 def is_utf8_encodable(text: str) -> bool:
     """Tell whether a string can be written as UTF-8: it has no half of a surrogate pair.
 
-    >>> is_text("Gale"), is_text("Gale" + chr(0xD800))
+    >>> is_utf8_encodable("Gale"), is_utf8_encodable("Gale" + chr(0xD800))
     (True, False)
     """
     try:

@@ -91,14 +91,15 @@ def _show_log(ctx: click.Context, _: click.Parameter, verbosity: int) -> None:
         return
     log, handler = logging.getLogger("sweep"), _StandardError()
     handler.setFormatter(logging.Formatter("%(asctime)s %(name)s: %(message)s", "%H:%M:%S"))
-    before = log.level, log.propagate
+    level, propagates = log.level, log.propagate
     log.addHandler(handler)
     log.setLevel(logging.INFO if verbosity == 1 else logging.DEBUG)
     log.propagate = False
 
     def restore() -> None:
         log.removeHandler(handler)
-        log.level, log.propagate = before
+        log.setLevel(level)  # which also clears what loggers below have cached of it
+        log.propagate = propagates
 
     ctx.call_on_close(restore)
 

@@ -147,7 +147,7 @@ def remove_fields_on_axes(raw_spec: Mapping[str, Any]) -> dict[str, Any]:
     in the place of a field.
 
     >>> study = {"target": {"range": "2 km", "reflectance": 0.1}}
-    >>> without_fields_on_axes({**study, "axes": {"target.range": ["1 km", "3 km"]}})
+    >>> remove_fields_on_axes({**study, "axes": {"target.range": ["1 km", "3 km"]}})
     {'target': {'reflectance': 0.1}, 'axes': {'target.range': ['1 km', '3 km']}}
     """
     result = copy.deepcopy(dict(raw_spec))

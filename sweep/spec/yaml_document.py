@@ -580,7 +580,7 @@ def library_instruments() -> dict[str, Path]:
 
     Each file also names its publication, and the numbers that it must reproduce.
 
-    >>> "settembrini_2026" in library()
+    >>> "settembrini_2026" in library_instruments()
     True
     """
     return {file.stem: file for file in sorted(_LIBRARY_FOLDER.glob("*.yaml"))}

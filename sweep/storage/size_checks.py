@@ -43,8 +43,8 @@ _ZSTD_CODEC = Zstd()
 def compressed_bytes_max(raw_bytes: int) -> int:
     """Bytes that so many can come to as a chunk: zstd's own bound, and the checksum's.
 
-    >>> packed_bytes_max(1_000_000)
-    1003970
+    >>> compressed_bytes_max(1_000_000)
+    1003974
     """
     return raw_bytes + (raw_bytes >> 8) + 64 + _CHECKSUM_BYTES
 
@@ -150,7 +150,7 @@ def zstd_content_bytes(frame: bytes) -> int | None:
 
     The header is that of RFC 8878, section 3.1.1.1.
 
-    >>> declared_bytes(bytes(Zstd().encode(b"x" * 1000)))
+    >>> zstd_content_bytes(bytes(Zstd().encode(b"x" * 1000)))
     1000
     """
     if len(frame) < 5:

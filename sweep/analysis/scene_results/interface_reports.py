@@ -188,7 +188,7 @@ def quantise(
     Limits are clipped to their nearest whole quantum, so that what lies within them is off by half
     a quantum at the most.
 
-    >>> values, beyond = quantised(np.array([0.3, 2.6, 9.0]), 0.5, None, 4.0)
+    >>> values, beyond = quantise(np.array([0.3, 2.6, 9.0]), 0.5, None, 4.0)
     >>> values.tolist(), beyond.tolist()
     ([0.5, 2.5, 4.0], [False, False, True])
     """

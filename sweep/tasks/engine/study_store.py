@@ -367,8 +367,8 @@ def chunk_size_limits(study: BlockStudy) -> Callable[[str], int]:
 def array_of_chunk(chunk_path: str) -> str:
     """Path, inside the store, of the array that an object is a chunk of; empty if of none.
 
-    >>> array_of("tile/pd_up/c/0/3"), array_of("weight/c"), array_of("pd_up/zarr.json")
-    ('tile/pd_up', 'weight', '')
+    >>> [array_of_chunk(name) for name in ("tile/pd_up/c/0/3", "weight/c", "pd_up/zarr.json")]
+    ['tile/pd_up', 'weight', '']
     """
     match = CHUNK_NAME.fullmatch(chunk_path)
     return match[1] if match else ""
