@@ -40,7 +40,7 @@ def spec_of_size(gigabytes, block_points=BLOCK_POINTS, powers=100, figures=()):
 
 
 def make_store(path, spec):
-    """The store, every block written with the closed form of `deviate`; its size [B]."""
+    """The store, every block written with the closed form of `pd_deviate`; its size [B]."""
     from sweep.tasks.engine import study_store
     from sweep.tasks.studies.grid_study import GridStudy
 

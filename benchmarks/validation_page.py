@@ -366,7 +366,7 @@ def angle_finding(cut, names, thesis_words):
 
 
 def typical_reach(cut):
-    """First range [m] at which the median pd of 100 m is below `SEEN`; inf where it never is."""
+    """First range [m] where the median pd of 100 m is below `SEEN_PD_MIN`; inf if it never is."""
     order = np.argsort(cut.range.values)
     pd, ranges = cut.pd_shot.values[order], cut.range.values[order]
     is_below = np.median(pd[: pd.size // 100 * 100].reshape(-1, 100), axis=1) < SEEN_PD_MIN

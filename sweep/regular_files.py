@@ -44,7 +44,7 @@ def open_regular(path: str | Path, *, follow_links: bool = True) -> int:
 
     Raises
     ------
-    UnfitFileError
+    RefusedFileError
         The path is a pipe, a device, a socket, or (unless ``follow_links``) a symbolic link.
     OSError
         As of `os.open`.
@@ -155,14 +155,14 @@ def stream_below(
 
 
 def checked_size(descriptor: int, bytes_max: int, path_in_messages: str) -> int:
-    """Return the size of an open file; raise UnfitFileError if it exceeds ``bytes_max``."""
+    """Return the size of an open file; raise RefusedFileError if it exceeds ``bytes_max``."""
     size = os.fstat(descriptor).st_size
     check_size(size, bytes_max, path_in_messages)
     return size
 
 
 def check_size(size: int, bytes_max: int, path_in_messages: str) -> None:
-    """Raise UnfitFileError if the size of a file or object exceeds ``bytes_max``."""
+    """Raise RefusedFileError if the size of a file or object exceeds ``bytes_max``."""
     if size > bytes_max:
         problem = f"has {size:,} bytes, and can have no more than {bytes_max:,}"
         raise RefusedFileError(errno.EFBIG, problem, path_in_messages)

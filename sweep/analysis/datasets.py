@@ -90,7 +90,7 @@ def open(
     ------
     NotAStoreError
         Where there is no store of a study, or one whose coordinates are lost or damaged.
-    ReplacedError
+    StoreReplacedError
         Later, where values are read that are not read yet, and another study's store is in the
         place by then: the store was extended, or run anew.
     ValueError

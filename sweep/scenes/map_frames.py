@@ -183,7 +183,7 @@ def make_map_frame(
     """MapFrame of a raster of a reference system (WKT, '' for none), over the bounds that are read.
 
     `cell` is the smaller side of a cell, in the raster's coordinates. SceneError where the size of
-    a unit on the ground is not known, or differs over the bounds by more than `SCALE_ERROR`.
+    a unit on the ground is not known, or differs over the bounds by more than `SCALE_ERROR_MAX`.
     """
     per_degree, per_unit = stated.metres_per_degree, stated.metres_per_unit
     for name, sizes in (("degree", per_degree), ("unit", per_unit)):

@@ -54,7 +54,7 @@ class Triangulation(NamedTuple):
     n_concave: int
     """Of these, polygons that are not convex."""
     n_bent: int
-    """Of these, polygons that depart from their mean plane by more than `BENT`."""
+    """Of these, polygons that depart from their mean plane by more than `BEND_REPORTED_MIN`."""
     largest_bend: float
     """Largest departure of these, in the unit of the vertices."""
 
@@ -82,7 +82,7 @@ def triangulate(polygons: Polygons) -> Triangulation:
 
     A polygon without area, or with a corner that is not finite, becomes triangles of the same
     kind, which :func:`sweep.scenes.meshes.clean_mesh` drops and counts. PolygonError for one that
-    crosses itself, is bent by more than `BENT_MAX`, or names a vertex that does not exist.
+    crosses itself, is bent by more than `BEND_MAX`, or names a vertex that does not exist.
     """
     vertices, corners, counts = polygons
     first_corner = np.cumsum(counts) - counts

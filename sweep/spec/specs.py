@@ -673,7 +673,7 @@ class SceneSpec(BaseSpec):
     def _line_drift_bins(self) -> float:
         """Largest drift of a speckled line within a record by acceleration [bins].
 
-        0 below `DRIFT_MIN`, and for ground whose echoes have no developed speckle.
+        0 below `DRIFT_BINS_MIN`, and for ground whose echoes have no developed speckle.
         """
         p = self.parameters()
         if p["footprint.speckle"] != "developed":
@@ -854,7 +854,7 @@ def _contradiction_findings(
 
 
 def from_stored(json_text: str, base: Path | str | None = None) -> GridSpec | SceneSpec:
-    """Study from the JSON that its `to_json` gave, as `Study.from_stored`."""
+    """Study from the JSON that its `to_json` gave, as `BaseSpec.from_stored`."""
     return _spec_class(parse_json(json_text)).from_stored(json_text, base)
 
 

@@ -165,7 +165,7 @@ class ObjectPath:
     def read_bytes(self, bytes_max: int | None = None) -> bytes:
         """Return the object whole; once more where the body of the answer is cut.
 
-        UnfitFileError where it is larger than so many bytes.
+        RefusedFileError where it is larger than so many bytes.
         """
         from obstore.exceptions import BaseError
 
@@ -414,7 +414,7 @@ def _request_pool() -> ThreadPoolExecutor:
 
 
 def read_object(location: Location, object_name: str, bytes_max: int) -> bytes:
-    """Read a file below a place whole; UnfitFileError where it is none, or larger than that."""
+    """Read a file below a place whole; RefusedFileError where it is none, or larger than that."""
     if isinstance(location, ObjectPath):
         return (location / object_name).read_bytes(bytes_max)
     return read_below(location, object_name, bytes_max)
@@ -520,7 +520,7 @@ def process_start_id(pid: int) -> int:
     """Start of a process, which tells it from others that had its number; no clock changes it.
 
     In clock ticks since the machine was started on Linux, in hundredths of a second since the
-    epoch elsewhere. 0 where no such process runs, `HIDDEN` where it can't be seen.
+    epoch elsewhere. 0 where no such process runs, `HIDDEN_PROCESS` where it can't be seen.
     """
     import psutil
 

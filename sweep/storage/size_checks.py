@@ -90,7 +90,7 @@ class ArrayFileLayout(NamedTuple):
         )
 
     def check_file(self, content: bytes, path_in_messages: str) -> None:
-        """Refuse a file with a chunk that would not decode to its size; UnfitFileError."""
+        """Refuse a file with a chunk that would not decode to its size; RefusedFileError."""
         for chunk in self._iter_chunks(content):
             self.check_chunk(chunk, path_in_messages)
 
@@ -109,7 +109,7 @@ class ArrayFileLayout(NamedTuple):
             yield content[offset : offset + bytes_needed]
 
     def check_chunk(self, content: bytes, path_in_messages: str) -> None:
-        """Refuse a packed chunk that would not decode to its size; UnfitFileError.
+        """Refuse a packed chunk that would not decode to its size; RefusedFileError.
 
         One that is no zstd frame is left to the codecs, which refuse it.
         """

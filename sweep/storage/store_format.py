@@ -581,7 +581,7 @@ def stored_objects_digest(
 ) -> str:
     """blake2b-128 of names and bytes of stored objects, in hex.
 
-    OSError where one can't be read; UnfitFileError where it is no plain file, or larger than
+    OSError where one can't be read; RefusedFileError where it is no plain file, or larger than
     ``bytes_max`` of its name.
     """
     if isinstance(path, ObjectPath):
@@ -654,7 +654,10 @@ class ObjectLog:
         self._pending_lines.append(lines)
 
     def flush(self, *, force: bool = False) -> bool:
-        """Put what was appended as an object, now or `WAVE` s after the last; True if none left."""
+        """Put what was appended as an object, now or `LOG_OBJECT_INTERVAL` s after the last.
+
+        True if none is left.
+        """
         if not self._pending_lines:
             return True
         if time.monotonic() - self._last_put_time < LOG_OBJECT_INTERVAL and not force:

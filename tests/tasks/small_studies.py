@@ -135,7 +135,7 @@ def make_logging_evaluate(log: Path, delay: float = 0.0):
 
 
 def logged_blocks(log: Path) -> list[int]:
-    """Blocks noted by `logged`, in order."""
+    """Blocks noted by `make_logging_evaluate`, in order."""
     return [int(line.split()[0]) for line in log.read_text().splitlines()] if log.exists() else []
 
 

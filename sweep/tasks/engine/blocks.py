@@ -204,7 +204,7 @@ class BlockGrid:
         return blocks, local_indices
 
     def grid_indices(self, block: int, local_indices: np.ndarray) -> np.ndarray:
-        """Points at some places of a block, in C order over the grid: the inverse of `locate`."""
+        """Points at places of a block, in C order over the grid: inverse of `locate_points`."""
         if not self.shape:
             return np.zeros(local_indices.size, np.int64)
         axis_offsets = np.unravel_index(local_indices, self.block_extent(block))
@@ -283,8 +283,9 @@ TOLERANCE_PARAMETER = "accuracy.tolerance"
 #: Shots of a flight that are planned together.
 SHOTS_PER_TILE = 256
 
-#: Seconds that a block takes at the most, as :func:`seconds_a_point` has it: what is lost where a
-#: worker dies. It also bounds the counts of draws, one a point and batch, to some 100 MB.
+#: Seconds that a block takes at the most, as :func:`worst_cpu_seconds_per_point` has it: what is
+#: lost where a worker dies. It also bounds the counts of draws, one a point and batch, to some
+#: 100 MB.
 BLOCK_CPU_SECONDS_MAX = 60.0
 
 #: Points of a block at the most, and blocks beyond which it grows: a block is some 25 files, and

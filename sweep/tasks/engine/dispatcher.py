@@ -167,10 +167,10 @@ class TaskDispatcher:
         self._has_reported_stall = False  # since then
 
     def iter_results(self, is_stopping: Callable[[], bool]) -> Iterator[TaskResult]:
-        """Answers as they arrive; an empty one every `TICK` while none does.
+        """Answers as they arrive; an empty one every `IDLE_POLL_SECONDS` while none does.
 
-        Once `stopping` says so nothing more is sent, and the iteration ends with what is
-        out, or at once where there is no worker to do it. SchedulerLost where the scheduler
+        Once `is_stopping` says so nothing more is sent, and the iteration ends with what is
+        out, or at once where there is no worker to do it. SchedulerLostError where the scheduler
         is gone; StoreError, OSError where no worker can write to the store.
         """
         try:

@@ -508,7 +508,7 @@ class LockHolder:
 
     host: str = "unknown"
     pid: int = 0
-    start: int = 0  # of the process, as `process_start` has it: a number is used again
+    start: int = 0  # of the process, as `process_start_id` has it: a number is used again
     token: str = ""
     machine: str = ""  # hosts of one name may be many, where a store is seen from everywhere
 
@@ -633,7 +633,7 @@ class _FileLock:
     def acquire(
         self, holder_json: str, check_holder: Callable[[], None], say: Callable[[str], None]
     ) -> None:
-        """Take it, unless `judge`, asked while no other process judges, raises."""
+        """Take it, unless `check_holder`, asked while no other process judges, raises."""
         self._lock_path.parent.mkdir(exist_ok=True)
         with self._acquisition_guard(say):  # one process at a time judges and takes
             stale_json = self.read_holder_json()
@@ -780,7 +780,7 @@ class _ObjectLock:
     def acquire(
         self, holder_json: str, check_holder: Callable[[], None], say: Callable[[str], None]
     ) -> None:
-        """Take it, unless `judge` raises."""
+        """Take it, unless `check_holder` raises."""
         for _ in range(LOCK_ATTEMPTS_MAX):
             tagged = self._read_tagged()
             if tagged and _first_line(tagged[0]) == holder_json:  # put, though its answer was lost

@@ -112,9 +112,9 @@ class PatientStream(ForgivingStream):
     """Text stream whose reader may stop for a while, as a terminal does after Ctrl-S.
 
     A thread writes to the descriptor of the stream inside. Whoever writes waits for it for
-    `PATIENCE_SECONDS` at the most, and from then on not at all until the reader goes on. Beyond
-    `WAITING_TEXTS_MAX` waiting texts, further ones are dropped. A stream without a
-    descriptor is written to at once.
+    `READER_PATIENCE_SECONDS` at the most, and from then on not at all until the reader
+    goes on. Beyond `WAITING_TEXTS_MAX` waiting texts, further ones are dropped. A stream without
+    a descriptor is written to at once.
     """
 
     def __init__(self, stream: Any) -> None:

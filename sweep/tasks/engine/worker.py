@@ -251,7 +251,8 @@ def run_with_timeout(
     """Call a function; BlockTimeoutError if it takes longer than the timeout less what was spent.
 
     It is done in a thread, in which Python code is interrupted. A worker process whose thread is
-    still in compiled code `GRACE` seconds later ends itself; any other waits for it to return.
+    still in compiled code `INTERRUPT_GRACE_SECONDS` later ends itself; any other waits for it to
+    return.
     """
     if timeout is None:
         return function()

@@ -68,7 +68,7 @@ class FlightCoverage(NamedTuple):
         )
 
     def warnings(self) -> Iterator[str]:
-        """Sentences on scanners of which more than `MISSED_SHARE` of the shots hit nothing."""
+        """Sentences on scanners, more than `MISSED_FRACTION_MAX` of whose shots hit nothing."""
         mostly_missing = [
             scanner for scanner in self.scanners if scanner.hit_fraction < 1 - MISSED_FRACTION_MAX
         ]
