@@ -5,5 +5,5 @@ number of optimisation passes depends on what was compiled before and what came 
 liberties, so would its last bits. They would buy 5 % of speed.
 """
 
-VERSION = "44"
+VERSION = "45"
 """Version of the physics: part of a study's identity, raised when any result can change."""
