@@ -117,7 +117,9 @@ def look_at_results(spec: Spec, study: GridStudy, results: Results, block: int) 
             _beamlets_error(given, values)
         elif name in FINITE:
             there = values[values != -np.inf] if name in NO_BIN_LEFT else values
-            there = values[results["snr_up"] > 0] if name in WITHOUT_ECHO else there
+            if name in WITHOUT_ECHO:  # told by all segments together
+                snr = np.stack([results[f"snr_{segment}"] for segment in ("up", "doppler", "down")])
+                there = values[np.where(np.isnan(snr), 1.0, snr).min(axis=0) > 0]
             if name in WITHOUT_ECHO and ENDS[0] in given:  # nothing is told of echoes outside
                 there = there[~np.isnan(there)]
             assert np.isfinite(there).all(), f"{name} is not finite"
