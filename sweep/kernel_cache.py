@@ -39,6 +39,7 @@ from numba import types
 from numba.core.caching import FunctionCache
 from numba.core.dispatcher import Dispatcher
 from numba.core.sigutils import normalize_signature
+from numba.extending import intrinsic
 from platformdirs import user_cache_dir
 
 #: Time without any use after which the kernels of another fingerprint are removed [s].
@@ -336,3 +337,18 @@ def _log_uncached(reason: str) -> None:
         "NUMBA_CACHE_DIR names another folder for them, of your own and with room",
         reason,
     )
+
+
+@intrinsic
+def high_word(typing_context, a, b):
+    """Return the upper 64 bits of the product of two 64-bit numbers, one instruction."""
+
+    def generate(context, builder, signature, factors):
+        from llvmlite import ir
+
+        wide, word = ir.IntType(128), ir.IntType(64)
+        one, other = (builder.zext(factor, wide) for factor in factors)
+        shifted = builder.lshr(builder.mul(one, other), ir.Constant(wide, 64))
+        return builder.trunc(shifted, word)
+
+    return types.uint64(types.uint64, types.uint64), generate

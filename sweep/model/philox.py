@@ -13,10 +13,8 @@ import hashlib
 import math
 
 import numpy as np
-from numba.core import types
-from numba.extending import intrinsic
 
-from sweep.kernel_cache import njit
+from sweep.kernel_cache import high_word, njit
 
 # Streams, one per physical cause; of those of a segment three: up, Doppler, down. The numbers are
 # part of every stored draw: add, never change.
@@ -62,21 +60,6 @@ def _round(x0, x1, x2, x3, key0, key1):
     return product1 ^ x1 ^ key0, _M1 * x2, product0 ^ x3 ^ key1, _M0 * x0
 
 
-@intrinsic
-def _high_word(typing_context, a, b):
-    """Return the upper 64 bits of the product of two 64-bit numbers, one instruction."""
-
-    def generate(context, builder, signature, factors):
-        from llvmlite import ir
-
-        wide, word = ir.IntType(128), ir.IntType(64)
-        one, other = (builder.zext(factor, wide) for factor in factors)
-        shifted = builder.lshr(builder.mul(one, other), ir.Constant(wide, 64))
-        return builder.trunc(shifted, word)
-
-    return types.uint64(types.uint64, types.uint64), generate
-
-
 @njit(cache=True)
 def words4(key0, key1, draw, stream, block):
     """Four words of indices 4 block .. 4 block + 3, for the price of one."""
@@ -84,7 +67,7 @@ def words4(key0, key1, draw, stream, block):
     x0, x1, x2, x3 = np.uint64(block), np.uint64(0), np.uint64(draw), np.uint64(stream)
     for _ in range(10):
         x0, x1, x2, x3 = (
-            _high_word(_M1, x2) ^ x1 ^ k0, _M1 * x2, _high_word(_M0, x0) ^ x3 ^ k1, _M0 * x0,
+            high_word(_M1, x2) ^ x1 ^ k0, _M1 * x2, high_word(_M0, x0) ^ x3 ^ k1, _M0 * x0,
         )  # fmt: skip
         k0, k1 = k0 + _WEYL_0, k1 + _WEYL_1
     return x0, x1, x2, x3

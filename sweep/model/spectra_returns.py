@@ -134,8 +134,11 @@ def peaks_of(
     power, flags = (unrolled(shots, each, signal.strongest) for each in (whole, flags))
     half = power.size - 1
     if view.shots.real_ends and signal.last >= signal.first:  # an echo on DC or Nyquist
-        flags[1] |= flags[0] and signal.first == 0
-        flags[-2] |= flags[-1] and signal.last == half
+        # No group holds these bins: where they are flagged, the next one stands for them.
+        for end, beside in ((0, 1), (half, half - 1)):
+            if flags[end] and end in (signal.first, signal.last):
+                flags[beside] = True
+                echoes = np.where(echoes == end, beside, echoes)
     flags[[0, -1]] = False
     assert signal.exempt is not None
     exempt = unrolled(shots, signal.exempt, signal.strongest)

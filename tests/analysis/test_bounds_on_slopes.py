@@ -57,8 +57,9 @@ def test_bounds_of_grids_on_slopes_hold_the_wander_that_is_drawn(rule, tmp_path)
         ratio = bound / drawn.range_rmse
         # At 5 degrees the footprint is half a bin, and the largest bin often a neighbour.
         assert ratio[0] == pytest.approx(1.0, abs=0.25)
-        # Speckle of the bins beside the strongest one adds up to a tenth to what is drawn.
-        np.testing.assert_allclose(ratio[1:], 1.0, atol=0.12)
+        # Speckle of the bins beside the strongest one adds up to a tenth to what is drawn. Echoes
+        # that must be detected in the strongest bin wander less, by up to a sixth.
+        assert (np.abs(ratio[1:] - 1.0) < (0.12 if rule == "any_bin" else 0.2)).all()
     for bound in (speed.bound, drawn.radial_velocity_bound):
         # With the wander by speckle it is an estimate as well: up to a tenth above what is drawn.
         assert (bound < 1.1 * drawn.radial_velocity_rmse).all()

@@ -123,9 +123,9 @@ def check_results(spec: GridSpec, study: GridStudy, results: Results, block: int
             _check_beamlets_error(parameters, values)
         elif name in FINITE_OUTPUTS:
             present_values = values[values != -np.inf] if name in OUTPUTS_WITHOUT_BINS else values
-            present_values = (
-                values[results["snr_up"] > 0] if name in WITHOUT_ECHO else present_values
-            )
+            if name in WITHOUT_ECHO:  # told by all segments together
+                snr = np.stack([results[f"snr_{segment}"] for segment in ("up", "doppler", "down")])
+                present_values = values[np.where(np.isnan(snr), 1.0, snr).min(axis=0) > 0]
             if name in WITHOUT_ECHO and ENDS[0] in parameters:  # nothing is told of echoes outside
                 present_values = present_values[~np.isnan(present_values)]
             assert np.isfinite(present_values).all(), f"{name} is not finite"

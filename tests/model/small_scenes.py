@@ -37,7 +37,7 @@ def observe_shots(
 ):
     """Eyepoints of shots over plates, 19 beamlets of 50 urad unless said otherwise."""
     meshes = [level_plate()] if bodies is None else bodies
-    body_motion = keywords.pop("motion", None)
+    body_motion = keywords.pop("body_motion", None)
     return observe(
         np.asarray(index),
         flight=flight,

@@ -170,7 +170,7 @@ def test_the_grounds_slope_and_relief_are_passed_on():
     tilted = Rotation.from_euler("y", 0.2)
     path = straight_flight((0.0, 0.0, 900.0), (0.0, 0.0, 0.0))
     rest = straight_flight((0.0, 0.0, 0.0), attitude=Fixed(tilted.as_quat(scalar_first=True)))
-    seen = _seen(FOUR, path=path, bodies=[level_plate()], motion=[rest])
+    seen = _seen(FOUR, path=path, bodies=[level_plate()], body_motion=[rest])
     points = _points(seen)
     free, usual, held, contradicted = (
         _solved(seen, points, FOUR, ground_slope=slope, relief=relief)

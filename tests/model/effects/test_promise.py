@@ -20,13 +20,13 @@ def promise_instruments():
 
 @pytest.mark.parametrize("asked", ["nothing", "leakage", "jitter"])
 def test_random_instruments_keep_each_tolerance(promise_instruments, asked):
-    studies = promise_instruments.studies(36, np.random.default_rng(6))
+    studies = promise_instruments.random_study_mappings(36, np.random.default_rng(6))
     chosen = [study for study in studies if study["title"].endswith(asked)]
     for study in chosen:
         for tolerance, off in zip(
-            TOLERANCES, promise_instruments.off(study, TOLERANCES), strict=True
+            TOLERANCES, promise_instruments.errors_at_tolerances(study, TOLERANCES), strict=True
         ):
             for errors in (off.pd, off.magnitude, off.leakage):
                 there = errors[np.isfinite(errors)]
                 assert (there <= tolerance).all(), (study["title"], tolerance, there.max())
-            assert (off.told <= tolerance).all()
+            assert (off.error_bound <= tolerance).all()
