@@ -65,5 +65,5 @@ def _check_message(file: Path, corrupted: CorruptedSpec, stderr: str) -> tuple[s
 
 
 def _is_related_path(mistake_path: str, changed_path: str) -> bool:
-    """Whether a mistake's path is that of what was changed, or lies around it or in it."""
+    """Tell whether a mistake's path is that of what was changed, or lies around it or in it."""
     return mistake_path.startswith(changed_path) or changed_path.startswith(mistake_path)

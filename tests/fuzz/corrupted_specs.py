@@ -21,7 +21,7 @@ class CorruptedSpec(NamedTuple):
     changed_path: str = ""
     """Dotted path of what was changed; empty where the text itself was."""
     is_surely_invalid: bool = False
-    """Whether it is surely invalid now; else it may still be valid."""
+    """True where it is surely invalid; else it may still be valid."""
 
 
 FieldPath = tuple[str | int, ...]

@@ -77,7 +77,7 @@ class SectionStrategies:
         return section_strategy()
 
     def _is_costly_default(self, model: type[BaseModel], name: str) -> bool:
-        """Whether a field is to be written, as its default costs too much."""
+        """Tell whether a field is to be written, as its default costs too much."""
         return f"{model.__name__}.{name}" in self.costly_defaults
 
     @cache  # noqa: B019

@@ -254,7 +254,7 @@ def axis_generator(draw: st.DrawFn, rule: NumericRule, kind: str, decades: float
 
 
 def _all_distinct(rule: NumericRule, raw_values: list[Any]) -> bool:
-    """Whether a mixed list holds no value twice."""
+    """Tell whether a mixed list holds no value twice."""
     from sweep.spec.axes import read_pieces
     from sweep.spec.rules import FindingsError
 

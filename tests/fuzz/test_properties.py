@@ -78,7 +78,7 @@ def results_of(written):
 
 
 def falls(values, rounding=ROUNDING):
-    """Whether values fall anywhere by more than rounding."""
+    """Tell whether values fall anywhere by more than rounding."""
     low, high = values[:-1], values[1:]
     return bool((high < low * (1 - rounding) - 1e-300).any())
 

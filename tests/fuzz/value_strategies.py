@@ -54,7 +54,7 @@ def parse_unit(rule: NumericRule, unit_text: str) -> Unit:
 
 
 def is_within_bounds(rule: NumericRule, values: list[float]) -> bool:
-    """Whether SI values keep a rule's bounds."""
+    """Tell whether SI values keep a rule's bounds."""
     return rule.first_out_of_bounds(np.array(values, float)) is None
 
 
@@ -164,7 +164,7 @@ def number_strategy(
 
 
 def _is_valid_number(rule: NumericRule, text: str, unit: str) -> bool:
-    """Whether a number in a unit keeps a rule's bounds and is not rounded to nothing."""
+    """Tell whether a number in a unit keeps a rule's bounds and is not rounded to nothing."""
     value = parse_unit(rule, unit).to_si(Fraction(text))
     return math.isfinite(value) and is_within_bounds(rule, [value])
 

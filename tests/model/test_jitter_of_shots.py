@@ -31,7 +31,7 @@ def _seen(beams, jitter=JITTER, **keywords):
 
 
 def _alike(values, deviation):
-    """Whether values are normal with mean 0 and a standard deviation."""
+    """Tell whether values are normal with mean 0 and a standard deviation."""
     return stats.kstest(values / deviation, stats.norm.cdf).pvalue > 1e-6
 
 

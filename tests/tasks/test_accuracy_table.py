@@ -61,7 +61,7 @@ def test_the_worst_point_is_told_with_its_own_tolerance(store):
 
 
 def names_the_place(where, dataset, over):
-    """Whether some words name the place of the largest excess."""
+    """Tell whether some words name the place of the largest excess."""
     i, _, k = np.unravel_index(np.argmax(over.values), over.shape)
     expected = f"range {dataset.range.values[i]:.4g} km, tolerance 0, "
     return where == expected + f"confidence {dataset.confidence.values[k]:.4g}"

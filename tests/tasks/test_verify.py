@@ -74,7 +74,7 @@ def flips(store: Path, places):
 
 
 def found_where(store: Path, file: Path) -> bool:
-    """Whether the one damaged file is found, and nothing else."""
+    """Tell whether the one damaged file is found, and nothing else."""
     name = str(file.relative_to(store))
     found = unmarked(store)
     return len(found) >= 1 and all(f.startswith(name) for f in found)
